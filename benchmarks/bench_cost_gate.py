@@ -13,7 +13,7 @@ predicted for the whole graph. Under two CPU minutes; exporting needs torch.
 
 import argparse
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from pathlib import Path
 from random import Random
 
@@ -26,11 +26,12 @@ from me2e_compress.graph import static_shape
 from me2e_compress.graph.nodes import constant_values
 from me2e_compress.passes import Context
 from me2e_compress.passes.quantize_int8 import QuantizeInt8
+from me2e_compress.quantization.costs import Costs
 from me2e_compress.shipped.drivers import shipped
 from me2e_compress.targets import Target
 from me2e_compress.targets.onnxruntime import OnnxRuntime
 from me2e_compress.targets.onnxruntime.costs import costs_of
-from me2e_compress.targets.onnxruntime.kernels import end_of, has_kernel
+from me2e_compress.targets.onnxruntime.region import end_of, objection
 from me2e_compress.targets.weights import biased_end
 from me2e_compress.workflows.prepare_int8 import PreparedGraph
 from models.export import export
@@ -78,7 +79,7 @@ def layers_of(model: ir.Model) -> Iterator[Layer]:
     """Yield the weighted layers that have an int8 kernel, cut out of a graph."""
     constants = constant_values(model)
     for node in model.graph:
-        if node.op_type not in ("Conv", "Gemm", "MatMul") or not has_kernel(node):
+        if objection(node) is not None:
             continue
         read, weight = static_shape(node.inputs[0]), static_shape(node.inputs[1])
         fixed = node.inputs[1] in constants and node.inputs[0] not in constants
@@ -109,11 +110,17 @@ def attributes(node: ir.Node) -> str:
     return ", ".join(found)
 
 
+def net_s(costs: Costs, int8: Collection[ir.Node]) -> float:
+    """Return the seconds saved in all if exactly these layers are int8."""
+    paid = sum(border.paid_s(int8) for border in costs.borders)
+    return sum(costs.saved_s.get(each, 0.0) for each in int8) - paid
+
+
 def predicted_s(layer: Layer) -> float:
     """Return what int8 of a layer alone should save, seconds."""
     model = layer.graph()
     nodes = [node for node in model.graph if node.op_type == layer.op]
-    return costs_of(model, nodes).net_s(frozenset(nodes))
+    return net_s(costs_of(model, nodes), frozenset(nodes))
 
 
 def signs(rows: list[tuple[str, Layer]]) -> None:
@@ -177,7 +184,7 @@ def by_module(ready: PreparedGraph, target: Target) -> dict[str, str]:
         macs = sum(graph.macs(each) or 0 for each in kept)
         cells[module] = (
             f"{len(layers)}, {len(layers) - len(kept)}, {macs / 1e9:.2f},"
-            f" {saved * 1e3:.2f}, {(saved - costs.net_s(kept)) * 1e3:.2f}"
+            f" {saved * 1e3:.2f}, {(saved - net_s(costs, kept)) * 1e3:.2f}"
         )
     return cells
 

@@ -85,8 +85,8 @@ def _rows(
         )
         rows = zip(found.windows, found.taken_j, found.mean_j, strict=True)
         for windows, taken, mean in rows:
-            by = estimate(windows, counter.step_s)
-            yield by.low, by.j_per_frame, by.high, taken, mean
+            j_per_frame, low, high = estimate(windows, counter.step_s)
+            yield low, j_per_frame, high, taken, mean
 
 
 def conditions(

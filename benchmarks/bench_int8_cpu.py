@@ -31,6 +31,7 @@ import onnx_ir as ir
 
 from benchmarks import subjects
 from benchmarks.bench_calibration import watch
+from benchmarks.layer_timing import time_interleaved
 from benchmarks.peer import peak_mb
 from benchmarks.processes import answer, has_modelopt
 from me2e_compress import graph
@@ -43,7 +44,6 @@ from me2e_compress.passes import Context, Pass
 from me2e_compress.passes.convert_float32 import ConvertFloat32
 from me2e_compress.passes.lower_int8 import LowerInt8
 from me2e_compress.passes.quantize_int8 import QuantizeInt8
-from me2e_compress.runtime.profile import time_interleaved
 from me2e_compress.runtime.session import Session
 from me2e_compress.targets.onnxruntime import int8_layers
 

@@ -22,7 +22,7 @@ from benchmarks import bench_int8_cpu as quantizers
 from benchmarks import simplifiers, subjects
 from benchmarks.model_kinds import KINDS, expected
 from me2e_compress import graph
-from me2e_compress.runtime.opening import REFUSALS
+from me2e_compress.runtime.session import REFUSALS
 
 FAILED: tuple[type[BaseException], ...] = (SystemExit, *REFUSALS)
 SIMPLIFIERS = ("ours", "onnxsim", "onnxslim")

@@ -23,10 +23,9 @@ import onnxruntime as ort
 from benchmarks.processes import in_turn
 from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.runtime.frames import Array
-from me2e_compress.runtime.opening import REFUSALS
 from me2e_compress.runtime.profile import processor
 from me2e_compress.runtime.providers import CPU, SLOW_FUSIONS
-from me2e_compress.runtime.session import DTYPES, Session
+from me2e_compress.runtime.session import DTYPES, REFUSALS, Session
 
 Feeds = Mapping[str, Array]
 Run = Callable[[], object]

@@ -24,6 +24,7 @@ from time import process_time
 
 import onnx_ir as ir
 
+from benchmarks.layer_timing import time_interleaved
 from benchmarks.processes import has_modelopt
 from benchmarks.subjects import Subject, make
 from benchmarks.synthetic import synthetic
@@ -44,9 +45,8 @@ from me2e_compress.quantization.plan import (
     QuantPlan,
     make_plan,
 )
-from me2e_compress.quantization.rules.safe_rules import SafeRules
+from me2e_compress.quantization.rules.rule_sets import SafeRules
 from me2e_compress.quantization.scheme import QuantScheme
-from me2e_compress.runtime.profile import time_interleaved
 from me2e_compress.runtime.session import Session
 from me2e_compress.targets.tensorrt import TensorRT
 from me2e_compress.targets.weights import evaluate_constants

@@ -16,10 +16,9 @@ from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_typ
 from me2e_compress.calibration.ranges import Ranges
 from me2e_compress.calibration.review import RangeFinding
 from me2e_compress.driving.adapter.outputs import PortUse
-from me2e_compress.fidelity.compare import Fidelity
+from me2e_compress.fidelity.compare import Fidelity, SetFidelity
 from me2e_compress.fidelity.first_difference import FirstDifference
 from me2e_compress.fidelity.liveness import Liveness
-from me2e_compress.fidelity.matched_sets import SetFidelity
 from me2e_compress.fidelity.sensitivity import Candidate, Sensitivity
 from me2e_compress.manager import Step, Verification
 from me2e_compress.quantization.plan import Decision, QuantPlan
@@ -27,7 +26,7 @@ from me2e_compress.registry.registry import Entry
 from me2e_compress.runtime.atomic import write_bytes
 from me2e_compress.runtime.energy import EnergyResult
 from me2e_compress.runtime.latency_trace import TimeShare
-from me2e_compress.targets.base import LintFinding
+from me2e_compress.targets import LintFinding
 from me2e_compress.workflows.check_model import ModelCheck
 from me2e_compress.workflows.compare_dump import DumpResult
 from me2e_compress.workflows.doctor import Checkup

@@ -1,7 +1,9 @@
 """One layer, or a chain of equal ones, timed in float and in int8 on onnxruntime."""
 
 import dataclasses
+from collections.abc import Mapping, Sequence
 from statistics import median
+from time import perf_counter, process_time
 
 import numpy as np
 import onnx
@@ -16,8 +18,7 @@ from me2e_compress.quantization.plan import QuantPlan, make_plan
 from me2e_compress.quantization.rules import RULE_SETS
 from me2e_compress.quantization.scheme import QuantScheme
 from me2e_compress.runtime.frames import Frame
-from me2e_compress.runtime.profile import time_interleaved
-from me2e_compress.runtime.session import Session
+from me2e_compress.runtime.session import Session, replay
 from me2e_compress.targets.onnxruntime import OnnxRuntime
 
 WHOLE = ModuleMap.whole()
@@ -112,6 +113,36 @@ def plan_of(model: ir.Model) -> QuantPlan:
     """Plan int8 for a layer, whatever it costs."""
     rules = RULE_SETS.parse("paper{without=[gemv]}")
     return make_plan(model, QuantScheme.of(WHOLE.names(), WHOLE), rules)
+
+
+@dataclasses.dataclass(frozen=True)
+class RunTimes:
+    """Times of one model, one for each round; CPU time adds up all threads."""
+
+    wall_s: tuple[float, ...]
+    cpu_s: tuple[float, ...]
+
+
+def time_interleaved(
+    sessions: Mapping[str, Session], frames: Sequence[Frame], rounds: int
+) -> dict[str, RunTimes]:
+    """Time one frame of every model in turn, A B C A B C, after one uncounted round.
+
+    All models should have the same number of threads. Only the first frame is run, with
+    recurrent state at zeros.
+    """
+    wall: dict[str, list[float]] = {name: [] for name in sessions}
+    cpu: dict[str, list[float]] = {name: [] for name in sessions}
+    for turn in range(rounds + 1):
+        for name, session in sessions.items():
+            start, used = perf_counter(), process_time()
+            for _ in replay(session, frames[:1]):
+                pass
+            # The first round only warms up.
+            if turn:
+                wall[name].append(perf_counter() - start)
+                cpu[name].append(process_time() - used)
+    return {name: RunTimes(tuple(wall[name]), tuple(cpu[name])) for name in sessions}
 
 
 def time_both(layer: Layer) -> tuple[float, float]:

@@ -12,7 +12,7 @@ from me2e_compress import graph
 from me2e_compress.calibration.calibrator import CalibrationCheckpoint, CalibrationState
 from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.calibration.recording import write_recording
-from me2e_compress.fidelity.sensitivity.analysis import Int8Choice, write_recipe
+from me2e_compress.fidelity.sensitivity import Int8Choice, write_recipe
 from me2e_compress.registry.drafts import BYTES, MARK, is_marked
 from me2e_compress.runtime.atomic import write_document
 from me2e_compress.runtime.frames import Frame

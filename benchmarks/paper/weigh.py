@@ -18,7 +18,7 @@ from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.errors import StudyError
 from me2e_compress.graph import WEIGHTED
 from me2e_compress.quantization.plan import plan_of
-from me2e_compress.runtime.energy.models import measure_energy
+from me2e_compress.runtime.energy.meter import measure_energy
 from me2e_compress.runtime.profile import record_traces
 from me2e_compress.runtime.providers import CPU
 from me2e_compress.study.definition import Study

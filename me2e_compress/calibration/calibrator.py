@@ -2,7 +2,7 @@
 
 import dataclasses
 import json
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TypeAlias
 
@@ -134,7 +134,6 @@ class CalibrationCheckpoint:
 
     path: Path | None
     key: Mapping[str, object]
-    every: int = 8
 
     def read(self) -> CalibrationState:
         """Read the progress; an empty one if there is no file."""
@@ -147,7 +146,16 @@ class CalibrationCheckpoint:
         except (ValueError, KeyError) as error:
             raise FramesError(f"{self.path}: not a checkpoint ({error})") from error
         # A checkpoint of another calibration is refused.
-        self._check(key)
+        wanted = json.loads(json.dumps(self.key))
+        if not isinstance(key, dict) or key.keys() != wanted.keys():
+            raise FramesError(
+                f"{self.path}: a checkpoint of another version; remove it"
+            )
+        if stale := [name for name in wanted if key[name] != wanted[name]]:
+            raise FramesError(
+                f"{self.path}: stale: a checkpoint of another {stale[0]}; remove it to"
+                " begin again"
+            )
         return CalibrationState(
             done,
             {name: a for name, a in found.items() if not name.startswith(_STATE)},
@@ -166,27 +174,6 @@ class CalibrationCheckpoint:
         # The state shares the archive, under a prefix.
         head = {"key": np.array(json.dumps(self.key)), "done": np.array(progress.done)}
         write_bytes(self.path, archive_of({**head, **progress.results, **state}))
-
-    def due(self, done: int, total: int) -> bool:
-        """Return whether it is time to write."""
-        return self.path is not None and (done % self.every == 0 or done == total)
-
-    def clear(self) -> None:
-        """Remove the file of a finished calibration."""
-        if self.path is not None:
-            self.path.unlink(missing_ok=True)
-
-    def _check(self, key: object) -> None:
-        wanted = json.loads(json.dumps(self.key))
-        if not isinstance(key, dict) or key.keys() != wanted.keys():
-            raise FramesError(
-                f"{self.path}: a checkpoint of another version; remove it"
-            )
-        if stale := [name for name in wanted if key[name] != wanted[name]]:
-            raise FramesError(
-                f"{self.path}: stale: a checkpoint of another {stale[0]}; remove it to"
-                " begin again"
-            )
 
 
 Progress: TypeAlias = Callable[[int, int], None]
@@ -272,7 +259,8 @@ class Calibrator:
         job.extremes()
         if counting:
             job.counts()
-        job.checkpoint.clear()
+        if self.checkpoint is not None:
+            self.checkpoint.unlink(missing_ok=True)
         return job.seen
 
 
@@ -304,9 +292,7 @@ class _Job:
             "provider": settings.provider.name,
             "kind of statistics": "counts" if passes == 2 else "extremes",
         }
-        self.checkpoint = CalibrationCheckpoint(
-            settings.checkpoint, key, settings.every
-        )
+        self.checkpoint = CalibrationCheckpoint(settings.checkpoint, key)
         self.begun = self.checkpoint.read()
         # Continue from the checkpoint, if there is one.
         measured = self.begun.results.get("measured", blank.measured)
@@ -324,8 +310,7 @@ class _Job:
         """Measure minimum, maximum and mean square of every tensor and frame."""
         rows, sums = list(self.seen.measured), self.seen.checksums.tolist()
         ports = (*self.seen.inputs, *self.seen.outputs)
-
-        def take(readings: Readings, held: Mapping[str, Array], place: int) -> None:
+        for readings, held, place in self._pass(Extremes(), 0):
             check_finite(readings, self.seen.tensors, place)
             rows.append(readings)
             sums.append([checksum(held[name]) for name in ports])
@@ -333,26 +318,22 @@ class _Job:
                 self.seen, measured=np.stack(rows), checksums=np.array(sums, np.int64)
             )
 
-        self._pass(Extremes(), 0, take)
-
     def counts(self) -> None:
         """Count the magnitudes of every tensor over all frames."""
         blank = np.zeros((len(self.seen.tensors), BINS), np.int64)
         total = blank if self.seen.counts is None else self.seen.counts
         self.seen = dataclasses.replace(self.seen, counts=total)
-
-        def take(readings: Readings, _held: Mapping[str, Array], _place: int) -> None:
+        probe = Counts(self.seen.exponents)
+        for readings, _, _ in self._pass(probe, len(self.frames)):
             np.add(total, readings.astype(np.int64), out=total)
 
-        self._pass(Counts(self.seen.exponents), len(self.frames), take)
-
     def _pass(
-        self,
-        probe: Probe,
-        before: int,
-        take: Callable[[Readings, Mapping[str, Array], int], None],
-    ) -> None:
-        """Run the rest of a pass; ``before`` frames belong to earlier passes."""
+        self, probe: Probe, before: int
+    ) -> Iterator[tuple[Readings, Mapping[str, Array], int]]:
+        """Run the rest of a pass; ``before`` frames belong to earlier passes.
+
+        Yields the readings of each frame, its inputs and outputs, and its index.
+        """
         # Skip what an interrupted run has done.
         begin = max(self.begun.done - before, 0)
         if begin >= len(self.frames):
@@ -369,21 +350,19 @@ class _Job:
         readings = stream(session, self.frames, probe.width, begin, state)
         # Store the progress from time to time.
         for at, (numbers, held, after) in enumerate(readings, begin):
-            take(numbers, held, self.seen.frames[at])
+            yield numbers, held, self.seen.frames[at]
             done = before + at + 1
-            if self.checkpoint.due(done, self.total):
-                self.checkpoint.write(CalibrationState(done, self._results(), after))
+            every = self.settings.every
+            if self.settings.checkpoint and (done % every == 0 or done == self.total):
+                results: dict[str, Array] = {
+                    "measured": self.seen.measured,
+                    "checksums": self.seen.checksums,
+                }
+                if self.seen.counts is not None:
+                    results["counts"] = self.seen.counts
+                self.checkpoint.write(CalibrationState(done, results, after))
             if self.progress:
                 self.progress(done, self.total)
-
-    def _results(self) -> dict[str, Array]:
-        results: dict[str, Array] = {
-            "measured": self.seen.measured,
-            "checksums": self.seen.checksums,
-        }
-        if self.seen.counts is not None:
-            results["counts"] = self.seen.counts
-        return results
 
 
 def _ports(values: Iterable[ir.Value]) -> tuple[str, ...]:

@@ -22,7 +22,7 @@ import math
 import zipfile
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from typing import IO, Annotated, Any, Literal, Self, TypeAlias, TypeVar
+from typing import IO, Annotated, Literal, TypeAlias, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -36,23 +36,6 @@ from me2e_compress.graph.recurrence import not_fed_back, recurrent_inputs, sides
 from me2e_compress.registry import documents, drafts
 from me2e_compress.registry.documents import UNREADABLE, check_regular
 from me2e_compress.runtime.frames import Array, Frame
-
-__all__ = [
-    "CHANNELS",
-    "LARGEST_BYTES",
-    "CalibrationSet",
-    "Declared",
-    "Frame",
-    "PixelInput",
-    "PixelInputs",
-    "Spread",
-    "Triple",
-    "archive_of",
-    "declared",
-    "load_arrays",
-    "synthetic",
-]
-
 
 # Write ``.npz`` files, and read them, checking their sizes first.
 
@@ -74,23 +57,33 @@ def declared(path: Path, what: str = "a readable .npz") -> Mapping[str, Declared
 
     The message calls the expected content ``what``.
     """
+    arrays, total = dict[str, Declared](), 0
     try:
         check_regular(path)
         with path.open("rb") as source, zipfile.ZipFile(source) as archive:
-            found = [_member(archive, each) for each in archive.infolist()]
+            for entry in archive.infolist():
+                with archive.open(entry) as stream:
+                    about = _header(stream)
+                    begin = stream.tell()
+                size = math.prod(about.shape) * about.dtype.itemsize
+                if entry.file_size != begin + size:
+                    raise ValueError(
+                        f"{entry.filename} has {entry.file_size} bytes, its header says"
+                        f" {begin + size}"
+                    )
+                name = entry.filename.removesuffix(".npy")
+                if name in arrays:
+                    raise ValueError("an array is there twice")
+                arrays[name], total = about, total + size
     except UNREADABLE as error:
         raise FramesError(f"{path}: not {what} ({reason(error)})") from error
-    # A name may occur once only.
-    if len(dict(found)) < len(found):
-        raise FramesError(f"{path}: not {what} (an array is there twice)")
     # A header could claim any size: check before reading.
-    total = sum(_bytes(each) for _, each in found)
     if total > LARGEST_BYTES:
         raise FramesError(
             f"{path}: not {what}: its arrays have {total:,} bytes, more than"
             f" {LARGEST_BYTES:,}"
         )
-    return dict(found)
+    return arrays
 
 
 def load_arrays(path: Path, what: str = "a readable .npz") -> dict[str, Array]:
@@ -103,27 +96,19 @@ def load_arrays(path: Path, what: str = "a readable .npz") -> dict[str, Array]:
         raise FramesError(f"{path}: not {what} ({reason(error)})") from error
 
 
-def archive_of(arrays: Mapping[str, Array]) -> bytes:
+def archive_of(
+    arrays: Mapping[str, Array], compression: int = zipfile.ZIP_STORED
+) -> bytes:
     """Return an ``.npz`` of arrays; equal arrays give equal bytes."""
     content = io.BytesIO()
-    with zipfile.ZipFile(content, "w") as archive:
+    with zipfile.ZipFile(content, "w", compression) as archive:
         archive.comment = drafts.BYTES
         for name, array in arrays.items():
             with archive.open(f"{name}.npy", "w", force_zip64=True) as entry:
-                np.lib.format.write_array(entry, np.asanyarray(array))
+                np.lib.format.write_array(
+                    entry, np.asanyarray(array), allow_pickle=False
+                )
     return content.getvalue()
-
-
-def _member(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> tuple[str, Declared]:
-    with archive.open(entry) as stream:
-        about = _header(stream)
-        begin = stream.tell()
-    if entry.file_size != begin + _bytes(about):
-        raise ValueError(
-            f"{entry.filename} has {entry.file_size} bytes, its header says"
-            f" {begin + _bytes(about)}"
-        )
-    return entry.filename.removesuffix(".npy"), about
 
 
 def _header(stream: IO[bytes]) -> Declared:
@@ -142,12 +127,7 @@ def _header(stream: IO[bytes]) -> Declared:
     return Declared(tuple(shape), dtype)
 
 
-def _bytes(about: Declared) -> int:
-    return math.prod(about.shape) * about.dtype.itemsize
-
-
-Triple: TypeAlias = tuple[FiniteFloat, FiniteFloat, FiniteFloat]
-Spread: TypeAlias = Annotated[FiniteFloat, Field(gt=0)]
+_Spread: TypeAlias = Annotated[FiniteFloat, Field(gt=0)]
 
 CHANNELS = 3
 
@@ -169,8 +149,8 @@ class PixelInput(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    mean: Triple
-    std: tuple[Spread, Spread, Spread]
+    mean: tuple[FiniteFloat, FiniteFloat, FiniteFloat]
+    std: tuple[_Spread, _Spread, _Spread]
     order: Literal["rgb", "bgr"]
     rows: PositiveInt
     columns: PositiveInt
@@ -220,12 +200,6 @@ class PixelInputs(BaseModel):
     version: Literal[1] = 1
     inputs: dict[str, PixelInput] = {}
 
-    @classmethod
-    def of(cls, index: Mapping[str, object]) -> Self:
-        """Read the entry from the content of ``scenes.json``; old ones have none."""
-        found = index.get("pixels")
-        return cls() if found is None else cls.model_validate(found)
-
 
 T = TypeVar("T", Array, Declared)
 
@@ -251,9 +225,27 @@ class CalibrationSet:
         if odd := [each for each in self.files if not each.is_file()]:
             raise FramesError(f"{odd[0]}: not a regular file")
         # The index tells where scenes begin, and what is pixels.
-        index = _index(folder / "scenes.json")
-        self.scenes = _scenes(folder / "scenes.json", index, len(self.files))
-        self.pixels = _pixels(folder / "scenes.json", index).inputs
+        path = folder / "scenes.json"
+        if not path.is_file():
+            raise FramesError(
+                f'{path}: missing; {{"scenes": [0]}} if the frames are one scene'
+            )
+        with documents.reading(path, FramesError, "not JSON"):
+            content = documents.from_json(documents.content(path))
+        index = content if isinstance(content, dict) else {}
+        self.scenes = _scenes(path, index, len(self.files))
+        # Old recordings, and those without pixels, have no such entry.
+        pixels = index.get("pixels")
+        version = pixels.get("version") if isinstance(pixels, dict) else None
+        if isinstance(version, int) and version > 1:
+            raise FramesError(
+                f"{path}: pixels of version {version}: a later me2e-compress wrote them"
+            )
+        with documents.reading(path, FramesError, "pixels"):
+            entry = (
+                PixelInputs() if pixels is None else PixelInputs.model_validate(pixels)
+            )
+        self.pixels = entry.inputs
 
     def __len__(self) -> int:
         return len(self.files)
@@ -328,7 +320,12 @@ class CalibrationSet:
             asked = {name: held[name] for name in held if name not in frozen}
             _check_frame(asked, model, str(path))
             for name, array in load_arrays(path).items():
-                _check_finite(array, f"{path}: {name}")
+                if array.dtype.kind == "f" and not np.isfinite(array).all():
+                    kind = "NaN" if np.isnan(array).any() else "infinite"
+                    at = np.argwhere(~np.isfinite(array))[0].tolist()
+                    raise FramesError(
+                        f"{path}: {name} is {kind} at {at}, expected finite numbers"
+                    )
                 if name in frozen and digest_of(array) != frozen[name]:
                     line = "is not the one that the graph was made for (freeze-inputs)"
                     raise FramesError(f"{path}: {name} {line}")
@@ -379,13 +376,6 @@ def check_array(array: Declared | Array, value: ir.Value, where: str) -> None:
         )
 
 
-def _check_finite(array: Array, where: str) -> None:
-    if array.dtype.kind == "f" and not np.isfinite(array).all():
-        kind = "NaN" if np.isnan(array).any() else "infinite"
-        at = np.argwhere(~np.isfinite(array))[0].tolist()
-        raise FramesError(f"{where} is {kind} at {at}, expected finite numbers")
-
-
 def _fits(found: tuple[int, ...], expected: ir.Shape) -> bool:
     return len(found) == len(expected) and all(
         not isinstance(want, int) or have == want
@@ -419,41 +409,18 @@ def synthetic(model: ir.Model, *, seed: int, count: int) -> Iterator[Frame]:
             )
     # Frames are drawn lazily, all from one generator.
     generator = np.random.default_rng(seed)
+
+    def drawn(value: ir.Value) -> Array:
+        shape = static_shape(value) or ()
+        dtype = np.dtype(np.float32) if value.dtype is None else value.dtype.numpy()
+        if dtype.kind == "f":
+            return np.asarray(generator.standard_normal(shape)).astype(dtype)
+        return np.asarray(generator.integers(0, 2, shape)).astype(dtype)
+
     return (
-        Frame(index, index == 0, {str(v.name): _draw(v, generator) for v in ports})
+        Frame(index, index == 0, {str(v.name): drawn(v) for v in ports})
         for index in range(count)
     )
-
-
-def _draw(value: ir.Value, generator: np.random.Generator) -> Array:
-    shape = static_shape(value) or ()
-    dtype = np.dtype(np.float32) if value.dtype is None else value.dtype.numpy()
-    if dtype.kind == "f":
-        return np.asarray(generator.standard_normal(shape)).astype(dtype)
-    return np.asarray(generator.integers(0, 2, shape)).astype(dtype)
-
-
-def _index(path: Path) -> dict[str, Any]:
-    """Read the index of a recording."""
-    if not path.is_file():
-        raise FramesError(
-            f'{path}: missing; {{"scenes": [0]}} if the frames are one scene'
-        )
-    with documents.reading(path, FramesError, "not JSON"):
-        content = documents.from_json(documents.content(path))
-    return content if isinstance(content, dict) else {}
-
-
-def _pixels(path: Path, index: Mapping[str, object]) -> PixelInputs:
-    """Read which inputs are pixels."""
-    found = index.get("pixels")
-    version = found.get("version") if isinstance(found, dict) else None
-    if isinstance(version, int) and version > 1:
-        raise FramesError(
-            f"{path}: pixels of version {version}: a later me2e-compress wrote them"
-        )
-    with documents.reading(path, FramesError, "pixels"):
-        return PixelInputs.of(index)
 
 
 def _scenes(path: Path, index: Mapping[str, object], count: int) -> tuple[int, ...]:

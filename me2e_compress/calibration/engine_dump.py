@@ -16,7 +16,12 @@ from typing import Any
 
 import numpy as np
 
-from me2e_compress.calibration.dataset import CalibrationSet, declared, load_arrays
+from me2e_compress.calibration.dataset import (
+    CalibrationSet,
+    Declared,
+    declared,
+    load_arrays,
+)
 from me2e_compress.display import counted, reason
 from me2e_compress.errors import FramesError
 from me2e_compress.registry import documents
@@ -87,32 +92,27 @@ class EngineDump:
                 f"{self.path}: {unknown[0]} is answered and is no frame of"
                 f" {frames.folder}, whose first is {frames.files[0].stem}"
             )
-        for index in range(len(self)):
-            self._check_names(index)
-
-    def _check_names(self, index: int) -> None:
-        found = self._read(index) if not self._is_npz else declared(self._file(index))
-        if lacking := [each for each in self.names if each not in found]:
-            raise FramesError(
-                f"{self.where(index)}: {lacking[0]} is missing; other frames have it"
+        is_npz = self.path.is_dir() and (self.path / f"{self.stems[0]}{_NPZ}").is_file()
+        for index, stem in enumerate(self.stems):
+            tensors: Mapping[str, Array | Declared]
+            tensors = (
+                declared(self.path / f"{stem}{_NPZ}") if is_npz else self._read(index)
             )
-        if more := [each for each in found if each not in self.names]:
-            raise FramesError(
-                f"{self.where(0)}: {more[0]} is missing; other frames have it"
-            )
-        for name, each in found.items():
-            if each.dtype.kind not in "fiub":
+            if lacking := [each for each in self.names if each not in tensors]:
+                where = self.where(index)
                 raise FramesError(
-                    f"{self.where(index)}: {name} is {each.dtype}, which is no number;"
-                    " write bfloat16 as float32"
+                    f"{where}: {lacking[0]} is missing; other frames have it"
                 )
-
-    @property
-    def _is_npz(self) -> bool:
-        return self.path.is_dir() and self._file(0).is_file()
-
-    def _file(self, index: int) -> Path:
-        return self.path / f"{self.stems[index]}{_NPZ}"
+            if more := [each for each in tensors if each not in self.names]:
+                raise FramesError(
+                    f"{self.where(0)}: {more[0]} is missing; other frames have it"
+                )
+            for name, each in tensors.items():
+                if each.dtype.kind not in "fiub":
+                    raise FramesError(
+                        f"{self.where(index)}: {name} is {each.dtype}, which is no"
+                        " number; write bfloat16 as float32"
+                    )
 
 
 def _opened(
@@ -122,7 +122,8 @@ def _opened(
     if not path.exists():
         raise FramesError(f"{path}: no such folder or file")
     if path.is_dir():
-        files = sorted(each for each in path.iterdir() if _is_answer(each))
+        answers = (each for each in path.iterdir() if each.suffix in (_NPZ, _JSON))
+        files = sorted(each for each in answers if each.name != "scenes.json")
         kinds = {each.suffix for each in files}
         if len(kinds) != 1:
             held = "both .npz and .json" if kinds else "no .npz and no .json"
@@ -141,22 +142,14 @@ def _opened(
     return (lambda index: _exported(files[index])), names, True
 
 
-def _is_answer(path: Path) -> bool:
-    return path.suffix in (_NPZ, _JSON) and path.name != "scenes.json"
-
-
 def _document(path: Path) -> Any:
     with documents.reading(path, FramesError, "not the JSON of an engine's answers"):
         text = documents.content(path, documents.LARGEST_LOG_BYTES)
         if b"nan" in text or b"inf" in text:
-            text = _NOT_JSON.sub(_as_python, text)
+            text = _NOT_JSON.sub(  # as Python spells them
+                lambda m: b"NaN" if m[2].lower() == b"nan" else m[1] + b"Infinity", text
+            )
         return documents.from_json(text, finite=False)
-
-
-def _as_python(found: re.Match[bytes]) -> bytes:
-    if found[2].lower() == b"nan":
-        return b"NaN"
-    return found[1] + b"Infinity"
 
 
 def _exported(path: Path) -> Mapping[str, Array]:
@@ -187,12 +180,24 @@ def _values(each: Mapping[str, Any]) -> Array:
 
 def _run_results(path: Path, document: Mapping[str, Any]) -> list[Mapping[str, Array]]:
     """Read polygraphy's RunResults: the iterations of its one runner."""
+
+    def array(name: str, lazy: Mapping[str, Any]) -> Array:
+        values = lazy["values"]
+        kind = values.get("polygraphy_class")
+        if kind != "ndarray":
+            raise ValueError(f"{name} is a {kind}, not an ndarray")
+        try:
+            content = base64.b64decode(values["array"], validate=True)
+        except binascii.Error as error:
+            raise ValueError(f"{name}: {error}") from error
+        return np.asarray(np.load(io.BytesIO(content), allow_pickle=False))
+
     try:
         runners: Sequence[Any] = document["lst"]
         if len(runners) != 1:
             raise ValueError(f"{len(runners)} runners, expected one: save each alone")
         found: list[Mapping[str, Array]] = [
-            {name: _array(name, each) for name, each in iteration["outputs"].items()}
+            {name: array(name, each) for name, each in iteration["outputs"].items()}
             for iteration in runners[0][1]
         ]
     except (*_UNFIT, EOFError) as error:
@@ -203,14 +208,3 @@ def _run_results(path: Path, document: Mapping[str, Any]) -> list[Mapping[str, A
     if not found:
         raise FramesError(f"{path}: holds no iteration")
     return found
-
-
-def _array(name: str, lazy: Mapping[str, Any]) -> Array:
-    held = lazy["values"]
-    if held.get("polygraphy_class") != "ndarray":
-        raise ValueError(f"{name} is a {held.get('polygraphy_class')}, not an ndarray")
-    try:
-        content = base64.b64decode(held["array"], validate=True)
-    except binascii.Error as error:
-        raise ValueError(f"{name}: {error}") from error
-    return np.asarray(np.load(io.BytesIO(content), allow_pickle=False))

@@ -15,8 +15,7 @@ import onnx_ir as ir
 from onnxruntime.quantization.calibrate import TensorData
 from onnxruntime.quantization.quant_utils import write_calibration_table
 
-from me2e_compress.calibration.observers import QUANT_MAX, scale_of
-from me2e_compress.calibration.observers.base import MaxMin
+from me2e_compress.calibration.observers import QUANT_MAX, MaxMin, scale_of
 from me2e_compress.calibration.ranges import IMPORTED, LARGEST, Ranges
 from me2e_compress.display import counted
 from me2e_compress.errors import FramesError
@@ -60,7 +59,11 @@ def write_onnxruntime_table(ranges: Ranges, folder: Path) -> None:
     as ``calibration.json`` and ``calibration.cache`` (a line ``name reach`` per
     tensor).
     """
-    table = {name: _entry(*bounds) for name, bounds in ranges.tensors.items()}
+    # The table keeps the larger bound, not the magnitude: bounds are symmetric.
+    table = dict[str, TensorData]()
+    for name, (low, high) in ranges.tensors.items():
+        reach = np.array(max(abs(low), abs(high)), np.float32)
+        table[name] = TensorData(lowest=-reach, highest=reach)
     folder.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=folder, prefix=".table-") as draft:
         write_calibration_table(table, draft)
@@ -85,7 +88,12 @@ def read_cache(path: Path) -> Ranges:
     # The head tells the two formats apart.
     head = _HEAD.fullmatch(lines[0]) if lines else None
     if lines and lines[0].startswith("TRT-"):
-        reach = _parse(path, lines, 1, ": ", _hexadecimal)
+
+        def number(text: str) -> float:
+            (scale,) = struct.unpack("!f", bytes.fromhex(text))
+            return float(scale) * QUANT_MAX
+
+        reach = _parse(path, lines, 1, ": ", number)
     else:
         reach = _parse(path, lines, 0, " ", float)
     if not reach:
@@ -105,7 +113,13 @@ def taken_from(
     Raises:
         FramesError: the cache is of another graph: it has less than half of them.
     """
-    known = cache.tensors.keys() - _merged_outputs(model)
+    merged = {
+        str(value.name)
+        for node in model.graph
+        if (past := provenance.read(node)) is not None and len(past.origins) > 1
+        for value in node.outputs
+    }
+    known = cache.tensors.keys() - merged
     bounds = {name: cache.tensors[name] for name in tensors if name in known}
     if len(bounds) < _LEAST * len(tensors):
         missing = [name for name in tensors if name not in bounds]
@@ -115,17 +129,6 @@ def taken_from(
             f" {next(iter(cache.tensors))}"
         )
     return dataclasses.replace(cache, tensors=bounds, model=digest(model))
-
-
-def _merged_outputs(model: ir.Model) -> set[str]:
-    """Return the outputs of nodes that stand for several of the source file."""
-    pasts = {node: provenance.read(node) for node in model.graph}
-    return {
-        str(value.name)
-        for node, past in pasts.items()
-        if past is not None and len(past.origins) > 1
-        for value in node.outputs
-    }
 
 
 def _parse(
@@ -145,14 +148,3 @@ def _parse(
         if not parted or not 0 <= found[name] <= LARGEST:
             raise FramesError(f"{path}: line {number} is not a range: {line[:60]!r}")
     return found
-
-
-def _hexadecimal(text: str) -> float:
-    (scale,) = struct.unpack("!f", bytes.fromhex(text))
-    return float(scale) * QUANT_MAX
-
-
-def _entry(low: float, high: float) -> TensorData:
-    """Return symmetric bounds: the table keeps the larger bound, not the magnitude."""
-    reach = np.array(max(abs(low), abs(high)), np.float32)
-    return TensorData(lowest=-reach, highest=reach)

@@ -38,7 +38,15 @@ def token_means(
     """
     if not values:
         return {}
-    session = Session(_exposed(model, values), threads=threads, provider=provider)
+    # A copy of the graph has the values as further outputs.
+    copy = model.clone()
+    made = {value.name: value for node in copy.graph for value in node.outputs}
+    if missing := [name for name in values if name not in made]:
+        raise GraphError(f"the graph has no value {missing[0]}")
+    shown = {value.name for value in copy.graph.outputs}
+    more = (made[name] for name in dict.fromkeys(values) if name not in shown)
+    copy.graph.outputs.extend(more)
+    session = Session(copy, threads=threads, provider=provider)
     # One pass: the averages are updated frame by frame.
     averages = {name: _Average(name) for name in values}
     for index, found in enumerate(replay(session, frames, list(values))):
@@ -56,19 +64,6 @@ def load_means(path: Path, values: Sequence[str]) -> dict[str, Array]:
             f" {', '.join(found) or 'none'}"
         )
     return {name: found[name] for name in values}
-
-
-def _exposed(model: ir.Model, values: Sequence[str]) -> ir.Model:
-    """Return a copy of a graph with further values as outputs."""
-    copy = model.clone()
-    made = {value.name: value for node in copy.graph for value in node.outputs}
-    if missing := [name for name in values if name not in made]:
-        raise GraphError(f"the graph has no value {missing[0]}")
-    exposed = {value.name for value in copy.graph.outputs}
-    copy.graph.outputs.extend(
-        made[name] for name in dict.fromkeys(values) if name not in exposed
-    )
-    return copy
 
 
 @dataclasses.dataclass

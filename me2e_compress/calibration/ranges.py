@@ -7,11 +7,9 @@ from pathlib import Path
 from typing import Literal, Self, TypeAlias
 
 import numpy as np
-import numpy.typing as npt
 import pydantic
 
-from me2e_compress.calibration.observers import OBSERVERS, Observer
-from me2e_compress.calibration.observers.base import MaxMin
+from me2e_compress.calibration.observers import OBSERVERS, MaxMin, Observer
 from me2e_compress.calibration.statistics import ALL_ZERO, NOT_FINITE, Statistics
 from me2e_compress.display import counted
 from me2e_compress.errors import FramesError
@@ -227,13 +225,12 @@ def _activities(
     seen: Statistics, names: Sequence[str], begin: int
 ) -> dict[str, Activity]:
     """Return what inputs or outputs did, from their checksums from column ``begin``."""
-    columns = seen.checksums.T[begin : begin + len(names)]
-    return {name: _activity(each) for name, each in zip(names, columns, strict=True)}
-
-
-def _activity(checksums: npt.NDArray[np.int64]) -> Activity:
-    if (checksums == NOT_FINITE).any():
-        return "not finite"
-    if (checksums != checksums[0]).any():
-        return "varies"
-    return "zero" if checksums[0] == ALL_ZERO else "constant"
+    activities = dict[str, Activity]()
+    for name, column in zip(names, seen.checksums.T[begin:], strict=False):
+        if (column == NOT_FINITE).any():
+            activities[name] = "not finite"
+        elif (column != column[0]).any():
+            activities[name] = "varies"
+        else:
+            activities[name] = "zero" if column[0] == ALL_ZERO else "constant"
+    return activities

@@ -10,13 +10,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar, TypeAlias
 
-import numpy as np
-
-from me2e_compress.calibration.dataset import PixelInput, PixelInputs
+from me2e_compress.calibration.dataset import PixelInput, PixelInputs, archive_of
 from me2e_compress.errors import FramesError
 from me2e_compress.registry import Registry, documents, drafts
 from me2e_compress.runtime.atomic import write_document
-from me2e_compress.runtime.frames import Array, Frame
+from me2e_compress.runtime.frames import Frame
 from me2e_compress.runtime.providers import CPU, Provider
 
 INDEX = "scenes.json"
@@ -64,19 +62,29 @@ def write_recording(
     # Write into a hidden folder first; it may hold an earlier run.
     partial = partial_of(folder)
     _check_replaceable(partial, PROGRESS)
-    draft = _Draft(partial, _with_pixels(about, pixels or {}), key)
+    described = dict[str, object](about)
+    if pixels:
+        entry = PixelInputs(inputs=dict(pixels))
+        described["pixels"] = entry.model_dump(mode="json")
+    draft = _Draft(partial, described, key)
     try:
         # Resume at the first scene that is not complete.
         for frame in source(draft.resume()):
             draft.write(frame)
         if not draft.scenes:
             raise FramesError(f"{folder}: there are no frames to write")
-        draft.finish()
-        drafts.put(draft.folder, folder)
+        # The index makes the folder a recording; a kill may have left drafts.
+        for left in partial.glob(f".{PROGRESS}.*"):
+            left.unlink()
+        count = {"count": draft.count}
+        index = {**drafts.IN_JSON, "scenes": draft.scenes, **described, **count}
+        with drafts.naming(partial / INDEX):
+            (partial / INDEX).write_text(json.dumps(index, indent=1) + "\n")
+        drafts.put(partial, folder)
         (folder / PROGRESS).unlink()
     finally:
         if len(draft.scenes) < 2:  # nothing to go on from
-            shutil.rmtree(draft.folder, ignore_errors=True)
+            shutil.rmtree(partial, ignore_errors=True)
     return folder
 
 
@@ -85,49 +93,33 @@ def partial_of(folder: Path) -> Path:
     return folder.with_name(f".{folder.name}.partial")
 
 
-def _with_pixels(
-    about: Mapping[str, str | int], pixels: Mapping[str, PixelInput]
-) -> dict[str, object]:
-    """Return the index entries, with the inputs stored as bytes if there are any."""
-    if not pixels:
-        return dict(about)
-    return {**about, "pixels": PixelInputs(inputs=dict(pixels)).model_dump(mode="json")}
-
-
 class _Draft:
     """A recording in progress; see :func:`write_recording`."""
 
     def __init__(self, folder: Path, about: Mapping[str, object], key: str) -> None:
-        self.folder, self.about = folder, dict(about)
-        self.key = [key, self.about]
+        self.folder, self.key = folder, [key, dict(about)]
         self.scenes: list[int] = []
         self.places: list[int] = []
         self.count = 0
 
     def resume(self) -> Begin:
         """Keep the complete scenes of an earlier run of the same frames, if any."""
-        kept = self._kept()
-        if kept is None:
-            self.folder.mkdir(exist_ok=True)  # it stays, because it may be locked
-            for each in self.folder.iterdir():
-                each.unlink()
-            (self.folder / PROGRESS).touch()  # from now on it is known as ours
-            return Begin()
-        scenes, places = kept
-        self.scenes, self.places = scenes[:-1], places[:-1]
-        self.count = scenes[-1]
-        return Begin(scenes[-1], places[-1])
-
-    def _kept(self) -> tuple[list[int], list[int]] | None:
         try:
             found = documents.from_json((self.folder / PROGRESS).read_bytes())
         except (OSError, documents.MalformedError):
-            return None
-        if not isinstance(found, dict) or found.get("key") != self.key:
-            return None
-        scenes, places = list(found["scenes"]), list(found["places"])
-        whole = all(self._frame(index).is_file() for index in range(scenes[-1]))
-        return (scenes, places) if whole else None
+            found = None
+        if isinstance(found, dict) and found.get("key") == self.key:
+            scenes, places = list(found["scenes"]), list(found["places"])
+            if all(self._frame(index).is_file() for index in range(scenes[-1])):
+                self.scenes, self.places = scenes[:-1], places[:-1]
+                self.count = scenes[-1]
+                return Begin(scenes[-1], places[-1])
+        # Begin anew.
+        self.folder.mkdir(exist_ok=True)  # it stays, because it may be locked
+        for each in self.folder.iterdir():
+            each.unlink()
+        (self.folder / PROGRESS).touch()  # from now on it is known as ours
+        return Begin()
 
     def write(self, frame: Frame) -> None:
         """Write a frame; where a scene begins, the ones before it are complete."""
@@ -138,17 +130,8 @@ class _Draft:
             write_document(self.folder / PROGRESS, {"key": self.key, **record})
         path = self._frame(self.count)
         with drafts.naming(path):
-            _write_npz(path, frame.arrays)
+            path.write_bytes(archive_of(frame.arrays, zipfile.ZIP_DEFLATED))
         self.count += 1
-
-    def finish(self) -> None:
-        """Write the index, which makes the folder a recording."""
-        for left in self.folder.glob(f".{PROGRESS}.*"):  # by a kill
-            left.unlink()
-        about = {**self.about, "count": self.count}
-        index = {**drafts.IN_JSON, "scenes": self.scenes, **about}
-        with drafts.naming(self.folder / INDEX):
-            (self.folder / INDEX).write_text(json.dumps(index, indent=1) + "\n")
 
     def _frame(self, index: int) -> Path:
         return self.folder / f"{index:06d}.npz"
@@ -174,17 +157,6 @@ def _check_replaceable(folder: Path, mark: str = INDEX) -> None:
         ours = name in (INDEX, PROGRESS) or name.startswith(f".{PROGRESS}.")
         if not ours and not (number != name and number.isdigit()):
             raise FramesError(f"{folder} holds frames but also {name}: not replaced")
-
-
-def _write_npz(path: Path, arrays: Mapping[str, Array]) -> None:
-    """Write like numpy.savez_compressed, reproducibly."""
-    with zipfile.ZipFile(path, "w") as archive:
-        archive.comment = drafts.BYTES
-        for name, value in arrays.items():
-            entry = zipfile.ZipInfo(f"{name}.npy")
-            entry.compress_type = zipfile.ZIP_DEFLATED
-            with archive.open(entry, "w", force_zip64=True) as file:
-                np.lib.format.write_array(file, value, allow_pickle=False)
 
 
 # Recorded driving, which other packages read (docs/writing-logs.md).

@@ -68,7 +68,7 @@ class RangeFinding:
 
 def review(ranges: Ranges) -> tuple[RangeFinding, ...]:
     """Judge ranges by what they say themselves; warnings first."""
-    found = [*_scales(ranges), *_inputs(ranges), *_outputs(ranges)]
+    found = [*_scales(ranges), *_ports(ranges)]
     if ranges.scenes is not None and ranges.scenes < FEW_SCENES:
         said = f"{counted(ranges.frames, 'frame')} in {counted(ranges.scenes, 'scene')}"
         advice = (
@@ -186,8 +186,8 @@ def _scales(ranges: Ranges) -> Iterable[RangeFinding]:
     )
 
 
-def _inputs(ranges: Ranges) -> Iterable[RangeFinding]:
-    """Name the inputs that never changed, unless there is one frame only."""
+def _ports(ranges: Ranges) -> Iterable[RangeFinding]:
+    """Name inputs and outputs that never changed, unless there is one frame only."""
     yield from _named(
         "unfed input",
         "warning",
@@ -206,9 +206,6 @@ def _inputs(ranges: Ranges) -> Iterable[RangeFinding]:
             "The ranges hold for these values alone: record other commands and speeds;"
             " camera matrices of one vehicle fit that vehicle only",
         )
-
-
-def _outputs(ranges: Ranges) -> Iterable[RangeFinding]:
     yield from _named(
         "not finite",
         "warning",

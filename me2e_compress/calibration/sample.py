@@ -55,7 +55,8 @@ def draw(whole: CalibrationSet, count: int, seed: int) -> FrameSubset:
     """
     if count < 1:
         raise FramesError(f"{count} frames were asked for; at least 1 is needed")
-    scenes = _scenes(whole)
+    ends = [*whole.scenes, len(whole)]
+    scenes = [range(start, end) for start, end in itertools.pairwise(ends)]
     order = np.random.default_rng(seed).permutation(len(scenes)).tolist()
     drawn = [place for at in order for place in scenes[at]]
     return FrameSubset(whole, tuple(sorted(drawn[:count])))
@@ -81,8 +82,3 @@ def hold_out(whole: CalibrationSet, most: int) -> tuple[FrameSubset, FrameSubset
         FrameSubset(whole, tuple(range(cut))),
         FrameSubset(whole, tuple(range(cut, cut + count))),
     )
-
-
-def _scenes(whole: CalibrationSet) -> list[range]:
-    ends = [*whole.scenes, len(whole)]
-    return [range(start, end) for start, end in itertools.pairwise(ends)]

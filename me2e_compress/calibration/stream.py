@@ -12,7 +12,7 @@ import onnx_ir as ir
 import onnx_ir.passes.common as common
 
 from me2e_compress.graph.nodes import makers_of, reads_of
-from me2e_compress.runtime.frames import Array, Frame
+from me2e_compress.runtime.frames import Array, Frame, Frames
 from me2e_compress.runtime.probing import READINGS, Probe, insert_probes
 from me2e_compress.runtime.providers import CPU, Provider
 from me2e_compress.runtime.session import DTYPES, Session, replay
@@ -21,7 +21,7 @@ Readings: TypeAlias = npt.NDArray[np.float32]
 """Readings of the probes in one frame: float32 [tensors, width of the probe]."""
 
 
-class Recording(Protocol):
+class Recording(Frames, Protocol):
     """Recorded frames, readable from any index on: all of a folder, or some."""
 
     @property
@@ -39,16 +39,8 @@ class Recording(Protocol):
         """Positions among these frames where a scene begins."""
         ...
 
-    def __len__(self) -> int:
-        """Count the frames."""
-        ...
-
     def __getitem__(self, index: int) -> Frame:
         """Read one frame."""
-        ...
-
-    def __iter__(self) -> Iterator[Frame]:
-        """Read the frames in order, one in memory at a time."""
         ...
 
 
@@ -121,7 +113,13 @@ def schedule_probes(model: ir.Model) -> None:
     # What the model's own outputs need keeps its order; the rest waits for its inputs.
     nodes = list(model.graph)
     own = makers_of([v for v in model.graph.outputs if v.name != READINGS])
-    waiting = {node: _sources(node) for node in nodes if node not in own}
+    waiting = {
+        node: {
+            v for v in reads_of(node) if v.producer() is not None or v.is_graph_input()
+        }
+        for node in nodes
+        if node not in own
+    }
     order: list[ir.Node] = []
 
     def ready(value: ir.Value) -> Iterator[ir.Node]:
@@ -149,8 +147,3 @@ def schedule_probes(model: ir.Model) -> None:
     order += [node for node in nodes if node not in placed]
     model.graph.remove(nodes)
     model.graph.extend(order)
-
-
-def _sources(node: ir.Node) -> set[ir.Value]:
-    """Return the values that a node needs before it can run."""
-    return {v for v in reads_of(node) if v.producer() is not None or v.is_graph_input()}

@@ -32,8 +32,8 @@ import numpy.typing as npt
 from me2e_compress.errors import EvaluationError
 from me2e_compress.metrics.episode import Episode
 from me2e_compress.runtime.frames import Array
+from me2e_compress.runtime.plan_adapter import Trajectory
 from me2e_compress.runtime.session import DTYPES, SessionPort
-from me2e_compress.runtime.trajectory import Trajectory
 
 __all__ = [
     "CAN_BUS_SIZE",

@@ -8,7 +8,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from me2e_compress.driving.contract import PedalsAndWheel, Plan, timed
 from me2e_compress.errors import EvaluationError
-from me2e_compress.runtime.trajectory import Trajectory
+from me2e_compress.runtime.plan_adapter import Trajectory
 
 Place = tuple[float, float]
 """A position: metres to the right and forward."""

@@ -3,13 +3,16 @@
 import dataclasses
 import itertools
 import math
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Self, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
+import pydantic
 
-from me2e_compress.errors import EvaluationError
+from me2e_compress.errors import EvaluationError, GraphError
+from me2e_compress.registry import documents
 from me2e_compress.runtime.frames import Array, Frame, Frames
 from me2e_compress.runtime.plan_adapter import PLAN, PlanAdapter
 from me2e_compress.runtime.session import Session, detached, replay
@@ -97,7 +100,7 @@ class Reference:
     def compare(
         self,
         other: Session,
-        frames: Frames | None = None,
+        frames: Iterable[Frame] | None = None,
         watch: Watch | None = None,
     ) -> Fidelity:
         """Compare another model with it, as :func:`compare` does.
@@ -106,33 +109,27 @@ class Reference:
         change, pass the reference model itself.
         """
         shown = self.frames if frames is None else frames
-        return _compare(self.session, iter(self.answers), other, shown, watch)
+        return compare(self.session, other, shown, watch, iter(self.answers))
 
 
 def compare(
-    a: Session, b: Session, frames: Iterable[Frame], watch: Watch | None = None
+    a: Session,
+    b: Session,
+    frames: Iterable[Frame],
+    watch: Watch | None = None,
+    answers: Iterator[dict[str, Array]] | None = None,
 ) -> Fidelity:
     """Run two models over the same frames, each with its own recurrent state.
 
-    All arithmetic is float64. One frame is in memory at a time. ``a`` is the reference;
-    ``watch`` is shown the outputs of both on every frame, states included.
+    All arithmetic is float64. One frame is in memory at a time. ``a`` is the reference,
+    and ``answers`` what it answered if it has run already; ``watch`` is shown the
+    outputs of both on every frame, states included.
 
     Raises:
         EvaluationError: no common output, no frame, or an output that changes its shape
             or is not finite.
         FramesError: a frame does not fit one of the models.
     """
-    here, there = itertools.tee(frames)
-    return _compare(a, replay(a, here), b, there, watch)
-
-
-def _compare(
-    a: Session,
-    answers: Iterator[dict[str, Array]],
-    b: Session,
-    frames: Iterable[Frame],
-    watch: Watch | None = None,
-) -> Fidelity:
     shared = [name for name in a.outputs if name in b.outputs]
     if not shared:
         raise EvaluationError(
@@ -144,7 +141,10 @@ def _compare(
     moved, chosen = list[Float64](), list[bool]()
     count = 0
     # frame by frame, with one frame in memory
-    there, along = itertools.tee(frames)
+    here, there, along = itertools.tee(frames, 3)
+    if answers is None:
+        answers = replay(a, here)
+    del here  # what nobody reads must not be kept
     wanted = list(dict.fromkeys([*shared, *b.recurrent.values()]))
     runs = zip(answers, replay(b, there, wanted), along, strict=True)
     for left, right, frame in runs:
@@ -226,12 +226,8 @@ class Tally:
     def result(self) -> OutputFidelity:
         """Return the output's fidelity over the frames so far."""
         error = self.gap / self.reach if self.reach else math.inf if self.gap else 0.0
-        sqnr, apart = decibels(self.signal, self.noise), len(self.frames_db) > 1
-        least, most = (
-            min(self.frames_db, default=sqnr),
-            max(self.frames_db, default=sqnr),
-        )
-        spread = (least, most) if apart else (None, None)
+        sqnr, by_frame = decibels(self.signal, self.noise), self.frames_db
+        spread = (min(by_frame), max(by_frame)) if len(by_frame) > 1 else (None, None)
         return OutputFidelity(self.name, sqnr, error, self.discrete, *spread)
 
     def _wide(self, value: Array, which: str, frame: int) -> Float64:
@@ -249,3 +245,120 @@ def decibels(signal: float, noise: float) -> float:
     if noise == 0:
         return math.inf
     return 10 * math.log10(signal / noise) if signal else -math.inf
+
+
+# Outputs that are sets of agents: each agent is compared with the other's nearest.
+#
+# A detector that sorts its agents by strength swaps two of nearly the same strength
+# after rounding, so a comparison slot by slot compares different cars.
+
+
+SETS = "me2e.sets"
+"""Metadata key: JSON of :class:`SetOutputs`."""
+
+SURE = 0.5
+"""Score from which an agent counts: more likely there than not."""
+
+SAME_M = 2.0
+"""Centres farther apart are two agents: the largest distance at which nuScenes'
+detection benchmark matches them."""
+
+
+class SetOutputs(pydantic.BaseModel):
+    """Outputs [1, agents, ...] whose rows belong together, in no order.
+
+    Rows of ``boxes`` begin with x and y, metres; ``scores`` are probabilities [1,
+    agents].
+    """
+
+    model_config = pydantic.ConfigDict(frozen=True, extra="forbid")
+
+    boxes: str
+    scores: str
+    others: tuple[str, ...] = ()
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The names of all outputs of the set."""
+        return (self.boxes, self.scores, *self.others)
+
+    @classmethod
+    def of(
+        cls, metadata: Mapping[str, str], shapes: Mapping[str, Sequence[object]]
+    ) -> Self | None:
+        """Read it from a model's metadata; None without.
+
+        Raises:
+            GraphError: it is malformed, or an output lacks a row for every agent.
+        """
+        text = metadata.get(SETS)
+        if text is None:
+            return None
+        try:
+            outputs = cls.model_validate(documents.from_json(text))
+        except (documents.MalformedError, pydantic.ValidationError) as error:
+            first = str(error).splitlines()[0]
+            raise GraphError(f"metadata {SETS} names no outputs: {first}") from error
+        rows = tuple(shapes.get(outputs.boxes, ()))[:2]
+        for name in outputs.names:
+            shape = tuple(shapes.get(name, ()))
+            if len(shape) < 2 or shape[:2] != rows:
+                raise GraphError(f"metadata {SETS}: {name} has no row for every agent")
+        return outputs
+
+
+@dataclass(frozen=True)
+class SetFidelity:
+    """Sure agents of the first model against those of the second, all frames pooled.
+
+    Attributes:
+        agents: that the first model is sure of.
+        matched: with one of the second within 2 m.
+        sqnr_db: over those matched, by output.
+    """
+
+    agents: int
+    matched: int
+    sqnr_db: Mapping[str, float]
+
+
+@dataclass
+class SetTally:
+    """Sums over frames of one set of outputs."""
+
+    outputs: SetOutputs
+    agents: int = 0
+    matched: int = 0
+    power: dict[str, list[float]] = field(default_factory=dict)
+
+    def add(
+        self, left: Mapping[str, Array], right: Mapping[str, Array], frame: Frame
+    ) -> None:
+        """Match one frame: the assignment with the smallest sum of distances."""
+        from scipy.optimize import linear_sum_assignment  # takes long to import
+
+        outputs = self.outputs
+        places, others = (each[outputs.boxes][0, :, :2] for each in (left, right))
+        rows = np.flatnonzero(left[outputs.scores][0] >= SURE)
+        gaps = places[rows, None].astype(np.float64) - others.astype(np.float64)
+        distances = np.linalg.norm(gaps, axis=2)
+        picked, columns = linear_sum_assignment(np.minimum(distances, SAME_M))
+        near = distances[picked, columns] < SAME_M
+        mine, theirs = rows[picked][near], columns[near]
+        self.agents += len(rows)
+        self.matched += len(mine)
+        # signal and noise of matched rows
+        for name in outputs.names:
+            one = np.asarray(left[name][0][mine], np.float64)
+            gap = one - np.asarray(right[name][0][theirs], np.float64)
+            sums = self.power.setdefault(name, [0.0, 0.0])
+            sums[0] += float(np.vdot(one, one))
+            sums[1] += float(np.vdot(gap, gap))
+
+    def result(self) -> SetFidelity:
+        """Return the figures of all frames."""
+        return SetFidelity(
+            self.agents,
+            self.matched,
+            {name: decibels(*p) for name, p in self.power.items() if self.matched},
+        )

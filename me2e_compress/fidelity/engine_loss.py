@@ -3,11 +3,14 @@
 import dataclasses
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import Protocol, TypeAlias, TypeVar
+from typing import TypeAlias
 
 import numpy as np
 
+from me2e_compress.calibration.dataset import CalibrationSet
+from me2e_compress.calibration.engine_dump import EngineDump
 from me2e_compress.errors import EvaluationError
+from me2e_compress.fidelity.compare import decibels
 from me2e_compress.fidelity.floor import ALIVE
 from me2e_compress.fidelity.liveness import OutputTally
 from me2e_compress.runtime.frames import Array, Frame
@@ -17,19 +20,8 @@ from me2e_compress.runtime.session import DTYPES, Session
 
 
 Arrays: TypeAlias = Mapping[str, Array]
-T_co = TypeVar("T_co", covariant=True)
-
-
-class Indexed(Protocol[T_co]):
-    """A recording that is read by index."""
-
-    def __len__(self) -> int:
-        """Count the frames."""
-        ...
-
-    def __getitem__(self, index: int, /) -> T_co:
-        """Read one frame."""
-        ...
+Frames: TypeAlias = CalibrationSet | Sequence[Frame]
+Dump: TypeAlias = EngineDump | Sequence[Arrays]
 
 
 class EngineRun:
@@ -42,9 +34,7 @@ class EngineRun:
         names: The outputs that both have.
     """
 
-    def __init__(
-        self, session: Session, frames: Indexed[Frame], dump: Indexed[Arrays]
-    ) -> None:
+    def __init__(self, session: Session, frames: Frames, dump: Dump) -> None:
         self.session, self.frames, self.dump = session, frames, dump
         self.names = [name for name in session.outputs if name in dump[0]]
 
@@ -124,29 +114,23 @@ class OutputLoss:
 
 
 class _Sums:
-    """Signal and noise of one comparison of one output."""
+    """Signal and noise of one comparison of one output; ``decibels`` None: unknown."""
 
     def __init__(self) -> None:
         self.signal = self.noise = 0.0
-        self.known = False
+        self.decibels: float | None = None
 
     def add(self, truth: Array, value: Array) -> None:
+        """Take a frame; another shape makes the noise NaN."""
         if value.shape != truth.shape:
             self.noise = math.nan
-            return
-        wide = np.asarray(truth, np.float64)
-        gap = wide - np.asarray(value, np.float64)
-        self.known = True
-        self.signal += float(np.vdot(wide, wide))
-        self.noise += float(np.vdot(gap, gap))
-
-    @property
-    def decibels(self) -> float | None:
-        if not self.known or not math.isfinite(self.noise):
-            return None
-        if self.noise == 0:
-            return math.inf
-        return 10 * math.log10(self.signal / self.noise) if self.signal else -math.inf
+        else:
+            wide = np.asarray(truth, np.float64)
+            gap = wide - np.asarray(value, np.float64)
+            self.signal += float(np.vdot(wide, wide))
+            self.noise += float(np.vdot(gap, gap))
+        known = math.isfinite(self.noise)
+        self.decibels = decibels(self.signal, self.noise) if known else None
 
 
 def losses(
@@ -187,14 +171,11 @@ def losses(
         OutputLoss(
             name,
             parted["quantization"].decibels,
-            _known(parted["compilation"].decibels),
+            LOWEST_DB if compiled is None else compiled,
             parted["all"].decibels,
             moved[name].moves,
             str(moved[name]) if moved[name].is_dead else "",
         )
         for name, parted in sums.items()
+        for compiled in (parted["compilation"].decibels,)
     )
-
-
-def _known(decibels: float | None) -> float:
-    return LOWEST_DB if decibels is None else decibels

@@ -93,8 +93,18 @@ def find_first_difference(
     feeds = _feeds_of_last(source, frames, provider)
     expected = _compute(source, shared, feeds, provider)
     values = _compute(candidate, shared, feeds, provider)
-    lossy = _is_lossy(source) or _is_lossy(candidate)
-    floor_db = SQNR_FLOOR_DB if lossy else ROUNDING_DB
+    # A few casts to float16 in a float32 graph are what is looked for; not so where a
+    # graph holds int8, or narrow floats more than others.
+    floor_db = ROUNDING_DB
+    for each in (source, candidate):
+        wide = narrow = 0
+        for node in nodes_of(each):
+            if node.op_type in ("QuantizeLinear", "DynamicQuantizeLinear"):
+                floor_db = SQNR_FLOOR_DB
+            narrow += sum(value.dtype in NARROW for value in node.outputs)
+            wide += sum(value.dtype == ir.DataType.FLOAT for value in node.outputs)
+        if narrow > wide:
+            floor_db = SQNR_FLOOR_DB
     return _compared(candidate, expected, values, floor_db, len(borders) - len(shared))
 
 
@@ -120,13 +130,27 @@ def _compared(
     unknown: int,
 ) -> FirstDifference:
     """Compare arrays of the same name, in the order in which a graph computes them."""
+
+    def sqnr(one: Array, other: Array) -> float:
+        # What is infinite or NaN in both is no difference.
+        if one.shape != other.shape:
+            return -np.inf
+        x, y = (np.asarray(each, np.float64) for each in (one, other))
+        equal = (x == y) | (np.isnan(x) & np.isnan(y))
+        with np.errstate(invalid="ignore"):
+            noise = np.where(equal, 0.0, x - y)
+        if not np.isfinite(noise).all():
+            return -np.inf
+        signal = x[np.isfinite(x)]
+        return decibels(float(np.vdot(signal, signal)), float(np.vdot(noise, noise)))
+
     outputs = {value.name for value in model.graph.outputs}
     compared = tuple(
         BorderValue(
             module_of(node),
             name,
             f"{node.name or 'a node'} ({node.op_type})",
-            _sqnr(expected[name], values[name]),
+            sqnr(expected[name], values[name]),
         )
         for name, node in _values_by_name(model).items()
         if name in expected
@@ -142,11 +166,12 @@ def _border_values(model: ir.Model) -> Iterator[str]:
     for node in model.graph:
         for value in reads_of(node):
             readers.setdefault(value, set()).add(module_of(node))
-    for name, node in _values_by_name(model).items():
-        value = next(each for each in node.outputs if each.name == name)
-        others = readers.get(value, set()) - {module_of(node)}
-        if value not in constant and (others or value.is_graph_output()):
-            yield name
+    for node in model.graph:
+        for value in node.outputs:
+            others = readers.get(value, set()) - {module_of(node)}
+            handed_on = others or value.is_graph_output()
+            if value.name and value not in constant and handed_on:
+                yield value.name
 
 
 def _values_by_name(model: ir.Model) -> dict[str, ir.Node]:
@@ -186,32 +211,3 @@ def _compute(
     shown.graph.outputs.extend(missing)
     session = Session(shown, optimize=False, release=True, provider=provider)
     return detached(session.run(feeds, wanted))
-
-
-def _sqnr(expected: Array, value: Array) -> float:
-    """Return the SQNR in dB; what is infinite or NaN in both is no difference."""
-    if expected.shape != value.shape:
-        return -np.inf
-    x, y = (np.asarray(each, np.float64) for each in (expected, value))
-    equal = (x == y) | (np.isnan(x) & np.isnan(y))
-    with np.errstate(invalid="ignore"):
-        noise = np.where(equal, 0.0, x - y)
-    if not np.isfinite(noise).all():
-        return -np.inf
-    signal = x[np.isfinite(x)]
-    return decibels(float(np.vdot(signal, signal)), float(np.vdot(noise, noise)))
-
-
-def _is_lossy(model: ir.Model) -> bool:
-    """Return whether a graph holds int8, or narrow floats more than others.
-
-    A few casts to float16 in a float32 graph are what is looked for.
-    """
-    wide = narrow = 0
-    for node in nodes_of(model):
-        if node.op_type in ("QuantizeLinear", "DynamicQuantizeLinear"):
-            return True
-        for value in node.outputs:
-            narrow += value.dtype in NARROW
-            wide += value.dtype == ir.DataType.FLOAT
-    return narrow > wide

@@ -1,13 +1,13 @@
 """The floor of fidelity: what falls below it, and which outputs it cannot judge."""
 
 import dataclasses
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Mapping
 from typing import Self
 
 import numpy as np
 import onnx_ir as ir
 
-from me2e_compress.fidelity.compare import Fidelity, OutputFidelity, Reference
+from me2e_compress.fidelity.compare import Fidelity, Reference
 from me2e_compress.graph.nodes import (
     FLOATS,
     makers_of,
@@ -15,7 +15,7 @@ from me2e_compress.graph.nodes import (
     nodes_inside,
     reads_of,
 )
-from me2e_compress.runtime.frames import Frame, Frames
+from me2e_compress.runtime.frames import Frame
 
 SQNR_FLOOR_DB = 20.0
 """Noise of a tenth of the signal's amplitude."""
@@ -71,20 +71,16 @@ class Floor:
         """List what is below the floor, the worst first, without unsteady outputs."""
         below = []
         for each in found.outputs:
-            excess = self._excess(found, each)
-            if excess <= 1 or each.discrete or each.name in unsteady:
-                continue
-            value, unit = each.sqnr_db, "dB"
+            # The noise over what is allowed: above 1 is too much.
             if found.plan is not None and each.name == found.plan_output:
                 value, unit = found.plan.mean_m, "m"
-            below.append(Shortfall(each.name, value, unit, excess))
+                excess = value / self.plan_m
+            else:
+                value, unit = each.sqnr_db, "dB"
+                excess = min(float(10 ** ((self.sqnr_db - value) / 20)), MOST_EXCESS)
+            if excess > 1 and not each.discrete and each.name not in unsteady:
+                below.append(Shortfall(each.name, value, unit, excess))
         return tuple(sorted(below, key=lambda each: -each.excess))
-
-    def _excess(self, found: Fidelity, output: OutputFidelity) -> float:
-        """Return an output's noise over what is allowed: above 1 is too much."""
-        if found.plan is not None and output.name == found.plan_output:
-            return found.plan.mean_m / self.plan_m
-        return float(min(10 ** ((self.sqnr_db - output.sqnr_db) / 20), MOST_EXCESS))
 
     def __str__(self) -> str:
         return f"{self.sqnr_db:g} dB, {self.plan_m:g} m of plan"
@@ -126,7 +122,10 @@ class Rounding:
         name = max(sizes, key=lambda each: sizes[each], default="")
         if not name:
             return cls("", {}, {})
-        rounded = reference.compare(session, _Rounded(reference.frames, name))
+        # Frames of which that input is rounded to int8's grid, one in memory at a time.
+        rounded = reference.compare(
+            session, (_rounded(frame, name) for frame in reference.frames)
+        )
         low = {each.output: each.value for each in floor.shortfalls(rounded)}
         choices = {each: choice_between(model, name, each) for each in low}
         return cls(name, low, {k: v for k, v in choices.items() if v})
@@ -150,44 +149,31 @@ CHOICES = frozenset(
 
 def choice_between(model: ir.Model, source: str, output: str) -> str:
     """Name the last node between an input and an output that chooses; empty if none."""
+
+    def chooses(node: ir.Node) -> bool:
+        if node.op_type == "Cast":
+            kinds = [v.dtype for v in (*node.inputs, *node.outputs) if v is not None]
+            return kinds[0] in FLOATS and kinds[-1] not in FLOATS
+        nearest = node.attributes.get_string("mode", "") == "nearest"
+        return node.op_type in CHOICES or (node.op_type == "GridSample" and nearest)
+
     reached = {value for value in model.graph.inputs if value.name == source}
     behind = makers_of(v for v in model.graph.outputs if v.name == output)
-    found = ""
+    choice = ""
     for node in model.graph:
         if node not in behind or reached.isdisjoint(reads_of(node)):
             continue
         reached.update(node.outputs)
         function = model.functions.get(node.op_identifier())
         inner = nodes_inside(node) if function is None else nodes_in(function)
-        if any(map(_chooses, (node, *inner))):
-            found = f"{node.name} ({node.op_type})"
-    return found
+        if any(map(chooses, (node, *inner))):
+            choice = f"{node.name} ({node.op_type})"
+    return choice
 
 
-def _chooses(node: ir.Node) -> bool:
-    if node.op_type == "Cast":
-        kinds = [v.dtype for v in (*node.inputs, *node.outputs) if v is not None]
-        return kinds[0] in FLOATS and kinds[-1] not in FLOATS
-    nearest = node.attributes.get_string("mode", "") == "nearest"
-    return node.op_type in CHOICES or (node.op_type == "GridSample" and nearest)
-
-
-@dataclasses.dataclass(frozen=True)
-class _Rounded:
-    """Frames of which one input is rounded to int8's grid."""
-
-    frames: Frames
-    name: str
-
-    def __len__(self) -> int:
-        return len(self.frames)
-
-    def __iter__(self) -> Iterator[Frame]:
-        return map(self._round, self.frames)
-
-    def _round(self, frame: Frame) -> Frame:
-        given = frame.arrays[self.name]
-        values = np.asarray(given, np.float64)
-        step = float(np.abs(values).max(initial=0.0)) / STEPS or 1.0
-        grid = (np.rint(values / step) * step).astype(given.dtype)
-        return dataclasses.replace(frame, arrays={**frame.arrays, self.name: grid})
+def _rounded(frame: Frame, name: str) -> Frame:
+    given = frame.arrays[name]
+    values = np.asarray(given, np.float64)
+    step = float(np.abs(values).max(initial=0.0)) / STEPS or 1.0
+    grid = (np.rint(values / step) * step).astype(given.dtype)
+    return dataclasses.replace(frame, arrays={**frame.arrays, name: grid})

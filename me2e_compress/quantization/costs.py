@@ -96,11 +96,6 @@ class Costs:
     borders: tuple[Border, ...]
     margin_s: float = 1e-6
 
-    def net_s(self, int8: Collection[ir.Node]) -> float:
-        """Return the seconds saved in all if exactly these layers are int8."""
-        paid = sum(border.paid_s(int8) for border in self.borders)
-        return sum(self.saved_s.get(each, 0.0) for each in int8) - paid
-
     def losses(self, int8: Iterable[ir.Node]) -> dict[ir.Node, Loss]:
         """Find the layers that are faster in float, among those that could be int8.
 
@@ -108,20 +103,15 @@ class Costs:
         neighbours are then looked at again. Then each connected int8 region goes if it
         does not pay as a whole. Not always the best choice, but near it, and linear.
         """
-        kept = dict.fromkeys(int8)
+        kept, saved_s = dict.fromkeys(int8), self.saved_s
         touching: dict[ir.Node, list[Border]] = {each: [] for each in kept}
         for border in self.borders:
             for each in dict.fromkeys(border.layers()):
                 if each in touching:
                     touching[each].append(border)
-        return self._alone(kept, touching) | self._together(kept, touching)
-
-    def _alone(
-        self, kept: dict[ir.Node, None], touching: Mapping[ir.Node, list[Border]]
-    ) -> dict[ir.Node, Loss]:
-        # a layer that goes changes the costs of its neighbours, which queue again
-        found: dict[ir.Node, Loss] = {}
-        waiting = deque(each for each in kept if each in self.saved_s)
+        # one by one: a layer that goes changes its neighbours' costs, which queue again
+        losses: dict[ir.Node, Loss] = {}
+        waiting = deque(each for each in kept if each in saved_s)
         while waiting:
             layer = waiting.popleft()
             if layer not in kept:
@@ -129,31 +119,22 @@ class Costs:
             before = sum(border.paid_s(kept) for border in touching[layer])
             del kept[layer]
             paid = before - sum(border.paid_s(kept) for border in touching[layer])
-            if self.saved_s[layer] + self.margin_s >= paid:
+            if saved_s[layer] + self.margin_s >= paid:
                 kept[layer] = None
                 continue
-            found[layer] = Loss(self.saved_s[layer], paid)
+            losses[layer] = Loss(saved_s[layer], paid)
             near = itertools.chain(*(border.layers() for border in touching[layer]))
-            waiting += [n for n in dict.fromkeys(near) if n in self.saved_s]
-        return found
-
-    def _together(
-        self, kept: dict[ir.Node, None], touching: Mapping[ir.Node, list[Border]]
-    ) -> dict[ir.Node, Loss]:
-        found: dict[ir.Node, Loss] = {}
-        seen: set[ir.Node] = set()
-        for first in kept:
-            island = _connected(first, kept, touching, seen)
-            if not island or any(each not in self.saved_s for each in island):
+            waiting += [n for n in dict.fromkeys(near) if n in saved_s]
+        # region by region: what one pays at all its borders, and saves
+        for island in _islands(kept, touching):
+            if any(each not in saved_s for each in island):
                 continue
-            # what the whole region pays at its borders, and saves
             borders = dict.fromkeys(b for each in island for b in touching[each])
             paid = sum(border.paid_s(kept) for border in borders)
-            saved = sum(self.saved_s[each] for each in island)
+            saved = sum(saved_s[each] for each in island)
             if saved + self.margin_s < paid:
-                loss = Loss(saved, paid, len(island))
-                found.update(dict.fromkeys(island, loss))
-        return found
+                losses.update(dict.fromkeys(island, Loss(saved, paid, len(island))))
+        return losses
 
 
 CostsOf: TypeAlias = Callable[[ir.Model, Collection[ir.Node]], Costs | None]
@@ -164,21 +145,20 @@ def _some(layers: Iterable[ir.Node], int8: Collection[ir.Node]) -> bool:
     return any(each in int8 for each in layers)
 
 
-def _connected(
-    first: ir.Node,
-    kept: Collection[ir.Node],
-    touching: Mapping[ir.Node, list[Border]],
-    seen: set[ir.Node],
-) -> list[ir.Node]:
-    """Return the layers that are joined to one by borders, unless it was seen."""
-    found: list[ir.Node] = []
-    waiting = [first]
-    while waiting:
-        layer = waiting.pop()
-        if layer in seen or layer not in kept:
-            continue
-        seen.add(layer)
-        found.append(layer)
-        for border in touching[layer]:
-            waiting += border.layers()
-    return found
+def _islands(
+    kept: Collection[ir.Node], touching: Mapping[ir.Node, list[Border]]
+) -> Iterator[list[ir.Node]]:
+    """Yield the layers that are joined by borders, directly or through others."""
+    seen: set[ir.Node] = set()
+    for first in kept:
+        island, waiting = list[ir.Node](), [first]
+        while waiting:
+            layer = waiting.pop()
+            if layer in seen or layer not in kept:
+                continue
+            seen.add(layer)
+            island.append(layer)
+            for border in touching[layer]:
+                waiting += border.layers()
+        if island:
+            yield island

@@ -105,13 +105,6 @@ class Attention:
     queries: int | None
     keys: int | None
 
-    @property
-    def length(self) -> int | None:
-        """The longer of the two."""
-        if self.queries is None or self.keys is None:
-            return None
-        return max(self.queries, self.keys)
-
 
 def find_attention(
     model: ir.Model, constants: Collection[ir.Value]
@@ -135,21 +128,35 @@ def find_attention(
     """
 
     def is_product(node: ir.Node) -> bool:
-        return _is_product(node, constants)
+        # The left operand may be constant: learned queries that saw no scene yet.
+        if node.op_type not in _PRODUCTS or not is_standard(node):
+            return False
+        right = input_at(node, 1)
+        if right is None:
+            return False
+        shape = static_shape(right) or ()
+        return right not in constants or math.prod(shape[:-2]) > 1
 
     # products behind the scores, and ahead of the weights, of every softmax
     scored = behind(model.graph, _SCORES, is_product)
     weighed = ahead(model.graph, _WEIGHTS, is_product)
-    found = _fused(model.graph)
+    found: dict[ir.Node, Attention] = {}
+    for node in model.graph:
+        if is_fused(node):  # tokens of [batch, (heads,) tokens, width]
+            shapes = [open_shape(value) or () for value in node.inputs[:2]]
+            tokens = [each[-2] if len(each) > 1 else None for each in shapes]
+            found[node] = Attention(tokens[0], tokens[-1])
     for weights, scores in _softmaxes(model.graph):
         # a mask may have products of its own, of another size
         queries_by_keys = [
-            node for node in _products(scored, scores) if _fits(node.outputs[0], scores)
+            node for _, node in scored.get(scores, ()) if _fits(node.outputs[0], scores)
         ]
         if not queries_by_keys:
             continue
-        attention = Attention(*_lengths(queries_by_keys[0].outputs[0]))
-        for product in (*queries_by_keys, *_products(weighed, weights)):
+        shape = open_shape(queries_by_keys[0].outputs[0]) or ()
+        attention = Attention(*(shape[-2:] if len(shape) > 1 else (None, None)))
+        by_values = [node for _, node in weighed.get(weights, ())]
+        for product in (*queries_by_keys, *by_values):
             found.setdefault(product, attention)
     return found
 
@@ -171,24 +178,6 @@ def find_attention_weights(
     return found
 
 
-def _products(nearest: Nearest, value: ir.Value) -> list[ir.Node]:
-    return [node for _, node in nearest.get(value, ())]
-
-
-def _is_product(node: ir.Node, constants: Collection[ir.Value]) -> bool:
-    """Return whether a node multiplies two values, neither of them a layer's weight.
-
-    The left one may be constant: learned queries that have not met the scene yet.
-    """
-    if node.op_type not in _PRODUCTS or not is_standard(node):
-        return False
-    right = input_at(node, 1)
-    if right is None:
-        return False
-    shape = static_shape(right) or ()
-    return right not in constants or math.prod(shape[:-2]) > 1
-
-
 def _fits(product: ir.Value, scores: ir.Value) -> bool:
     """Return whether scores may be this product's: as many, or as many per row."""
     left, right = static_shape(product), static_shape(scores)
@@ -204,45 +193,17 @@ def is_fused(node: ir.Node) -> bool:
     return node.op_type in _FUSED or node.op_type in op_types("multi-head-attention")
 
 
-def _fused(nodes: Iterable[ir.Node]) -> dict[ir.Node, Attention]:
-    found: dict[ir.Node, Attention] = {}
-    for node in nodes:
-        if is_fused(node):
-            tokens = [_tokens(value) for value in node.inputs[:2]]
-            found[node] = Attention(tokens[0], tokens[-1])
-    return found
-
-
-def _tokens(value: ir.Value | None) -> int | None:
-    """Count the tokens of queries or keys, [batch, (heads,) tokens, width]."""
-    shape = open_shape(value)
-    return None if shape is None or len(shape) < 2 else shape[-2]
-
-
 def _softmaxes(nodes: Iterable[ir.Node]) -> Iterator[tuple[ir.Value, ir.Value]]:
-    """Yield (weights, scores) of every softmax."""
+    """Yield (weights, scores) of every softmax, a decomposed one too."""
     for node in nodes:
         if node.op_type == "Softmax" and node.inputs[0] is not None:
             yield node.outputs[0], node.inputs[0]
         elif node.op_type == "Div":
-            scores = _decomposed(node)
-            if scores is not None:
+            above, below = node.inputs[:2]
+            power, total = producer_of(above), producer_of(below)
+            if power is None or total is None or total.inputs[0] is not above:
+                continue
+            scores = power.inputs[0]
+            kinds = (power.op_type, total.op_type)
+            if kinds == ("Exp", "ReduceSum") and scores is not None:
                 yield node.outputs[0], scores
-
-
-def _decomposed(division: ir.Node) -> ir.Value | None:
-    """Return the x of ``Div(Exp(x), ReduceSum(Exp(x)))``."""
-    above, below = division.inputs[:2]
-    power, total = producer_of(above), producer_of(below)
-    if power is None or total is None:
-        return None
-    if power.op_type != "Exp" or total.op_type != "ReduceSum":
-        return None
-    return power.inputs[0] if total.inputs[0] is above else None
-
-
-def _lengths(scores: ir.Value) -> tuple[int | None, int | None]:
-    shape = open_shape(scores)
-    if shape is None or len(shape) < 2:
-        return None, None
-    return shape[-2], shape[-1]

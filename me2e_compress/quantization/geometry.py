@@ -4,7 +4,7 @@ import dataclasses
 import math
 import re
 from collections import deque
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 
 import onnx_ir as ir
 
@@ -114,37 +114,33 @@ class _GeometryWalk:
         """Follow geometry, and learned values, through one node."""
         # does the node read geometry, and is its result still geometry
         product = node.op_type in _PRODUCTS and is_standard(node)
-        reads = node.inputs if product else _data(node)
+        reads: Sequence[ir.Value | None] = node.inputs
+        if not product and node.op_type in _DATA:
+            reads = [input_at(node, index) for index in _DATA[node.op_type]]
         met = [self.sources[each] for each in reads if each in self.sources]
+        shape = open_shape(node.outputs[0])
         goes_on = False
         if met and product:
             self.found[node] = f"multiplies what comes from the input {met[0].name}"
             goes_on = self._passes(node)
         elif met and (node.op_type in _ARITHMETIC or node.op_type in self._inverses):
-            goes_on = self._remains(node, reads)
+            # arithmetic with learned values: few numbers are still points
+            learned = any(each in self._learned for each in reads)
+            goes_on = not learned or (
+                shape is not None and shape != () and is_few(shape[-1])
+            )
         # mark the results as geometry, or else as learned
         if goes_on:
-            matrix = all(each.is_matrix for each in met) and self._alone(reads)
+            matrix = all(each.is_matrix for each in met) and all(
+                each is None or each in self.sources or each in self._constants
+                for each in reads
+            )
             if product:
                 matrix = matrix and _is_small(node.outputs[0])
             source = _Source(met[0].name, matrix)
             self.sources.update(dict.fromkeys(node.outputs, source))
         elif product or any(each in self._learned for each in node.inputs):
             self._learned.update(node.outputs)
-
-    def _alone(self, reads: Iterable[ir.Value | None]) -> bool:
-        """Return whether only geometry and constants are read."""
-        return all(
-            each is None or each in self.sources or each in self._constants
-            for each in reads
-        )
-
-    def _remains(self, node: ir.Node, reads: Iterable[ir.Value | None]) -> bool:
-        """Return whether arithmetic on geometry gives geometry."""
-        if not any(each in self._learned for each in reads):
-            return True
-        shape = open_shape(node.outputs[0])
-        return shape is not None and shape[-1:] != () and is_few(shape[-1])
 
     def _passes(self, product: ir.Node) -> bool:
         """Return whether a product gives points or matrices, not features."""
@@ -156,20 +152,13 @@ class _GeometryWalk:
         one = left if left in self.sources else right
         if one is not None and one in self.sources and self.sources[one].is_matrix:
             return _is_stacked(one) or _is_small(product.outputs[0])
-        return is_few(_width(product, flipped=one is right))
-
-
-def _width(product: ir.Node, *, flipped: bool) -> int | None:
-    """Return how many numbers a product gives for each point.
-
-    ``flipped`` if points are its right operand, one per column.
-    """
-    shape = open_shape(product.outputs[0])
-    if shape is None or len(shape) < 2:
-        return None
-    if product.op_type in ("Conv", "ConvTranspose"):
-        return shape[1]
-    return shape[-2] if flipped else shape[-1]
+        # how many numbers for each point; points on the right are columns
+        shape = open_shape(product.outputs[0])
+        if shape is None or len(shape) < 2:
+            return False
+        if product.op_type in ("Conv", "ConvTranspose"):
+            return is_few(shape[1])
+        return is_few(shape[-2] if one is right else shape[-1])
 
 
 def _source(value: ir.Value) -> _Source | None:
@@ -182,14 +171,6 @@ def _source(value: ir.Value) -> _Source | None:
     if _NAMED.search(name) is None:
         return None
     return _Source(name, shape is None or shape[-2:].count(None) > 0)
-
-
-def _data(node: ir.Node) -> list[ir.Value | None]:
-    """Return the inputs of a node that hold data."""
-    indices = _DATA.get(node.op_type)
-    if indices is None:
-        return list(node.inputs)
-    return [input_at(node, index) for index in indices]
 
 
 def is_few(size: int | None) -> bool:
@@ -272,8 +253,6 @@ _LAYOUT = frozenset(
         "Unsqueeze",
     }
 )  # fmt: skip
-
-_LAYERS = ("Conv", "ConvTranspose", "Einsum", "Gemm", "MatMul")
 _DATA_ONLY = {"Gather": 1, "GatherElements": 1, "GatherND": 1, "Pad": 1, "Slice": 1}
 """How many leading inputs hold data: the others are indices, looked at on their own."""
 
@@ -295,7 +274,7 @@ def find_coordinates(
         for node, reader in _behind_positions(
             model.graph, lambda layer: is_few(depth(layer)), constants
         )
-        if node.op_type in _LAYERS
+        if node.op_type in _PRODUCTS
     }
     return {**found, **_companions(model, found, constants)}
 
@@ -310,12 +289,17 @@ def position_arithmetic(
     camera's matrix and a table of points.
     """
     behind_positions = _behind_positions(
-        model.graph, lambda layer: not _has_weight(layer, constants)
+        model.graph,
+        # a weight is one constant matrix for every row
+        lambda layer: (
+            (layer.op_type == "MatMul" and not is_one_matrix(layer))
+            or input_at(layer, 1) not in constants
+        ),
     )
     return frozenset(
         node
         for node, _ in behind_positions
-        if node.op_type in _POSITION_ARITHMETIC or node.op_type in _LAYERS
+        if node.op_type in _POSITION_ARITHMETIC or node.op_type in _PRODUCTS
     )
 
 
@@ -329,7 +313,13 @@ def _behind_positions(
     The walk goes on through arithmetic, and through the layers that the test names; it
     ends at ``known`` values.
     """
-    queue = deque(_positions(graph))
+    positions = {**position_inputs(), **_POSITIONS}
+    queue = deque(
+        (value, node.op_type)
+        for node in graph
+        for index in positions.get(node.op_type, ())
+        if (value := input_at(node, index)) is not None
+    )
     seen: set[ir.Node] = set()
     while queue:
         value, reader = queue.popleft()
@@ -341,27 +331,11 @@ def _behind_positions(
         # Indices and bounds are looked at on their own
         if node.op_type in _POSITION_ARITHMETIC:
             data = node.inputs[: _DATA_ONLY.get(node.op_type, len(node.inputs))]
-        elif node.op_type in _LAYERS and goes_through(node):
+        elif node.op_type in _PRODUCTS and goes_through(node):
             data = node.inputs
         else:
             continue
         queue.extend((each, reader) for each in data if each is not None)
-
-
-def _has_weight(layer: ir.Node, constants: Collection[ir.Value]) -> bool:
-    """Return whether a layer multiplies every row by one constant matrix."""
-    if layer.op_type == "MatMul" and not is_one_matrix(layer):
-        return False
-    return len(layer.inputs) > 1 and layer.inputs[1] in constants
-
-
-def _positions(graph: ir.Graph) -> Iterator[tuple[ir.Value, str]]:
-    known = {**position_inputs(), **_POSITIONS}
-    for node in graph:
-        for index in known.get(node.op_type, ()):
-            value = input_at(node, index)
-            if value is not None:
-                yield value, node.op_type
 
 
 def _companions(
@@ -372,7 +346,7 @@ def _companions(
 
     def is_beside(node: ir.Node) -> bool:
         return (
-            node.op_type in _LAYERS
+            node.op_type in _PRODUCTS
             and node not in found
             and node.inputs[0] in shared
             and node.inputs[1] in constants
@@ -381,17 +355,11 @@ def _companions(
     # layers behind every tensor of sampling weights
     nearest = behind(model.graph, _LAYOUT, is_beside)
     reason = "sampling weights: they read the tensor that the offsets read"
-    return {
-        node: reason
-        for value in _weights(model.graph)
-        for _, node in nearest.get(value, ())
-    }
-
-
-def _weights(graph: ir.Graph) -> Iterator[ir.Value]:
     scores = {**score_inputs(), "Softmax": 0}
-    for node in graph:
-        index = scores.get(node.op_type)
-        value = None if index is None else node.inputs[index]
-        if value is not None:
-            yield value
+    return {
+        layer: reason
+        for node in model.graph
+        if node.op_type in scores
+        if (value := node.inputs[scores[node.op_type]]) is not None
+        for _, layer in nearest.get(value, ())
+    }

@@ -95,24 +95,12 @@ def break_down(
             source, threads=threads, int8_kernels=True, provider=provider,
             profiled=Path(folder),
         )  # fmt: skip
-        counted = _profiled(session, frames, wanted, warm_up, on_run)
+        replayed = replay(session, chain.from_iterable(repeat(frames)))
+        for done, _ in enumerate(islice(replayed, warm_up + wanted), 1):
+            on_run(max(0, done - warm_up), wanted)
+        with session.end_profile().open(encoding="utf-8") as lines:
+            counted = list(islice(node_runs(lines), warm_up, None))
     return _divided(counted, places)
-
-
-def _profiled(
-    session: Session,
-    frames: Frames,
-    wanted: int,
-    warm_up: int,
-    on_run: Callable[[int, int], None],
-) -> list[tuple[int, list[NodeRun]]]:
-    """Run a profiled session; return the times of the wanted inferences."""
-    endless = chain.from_iterable(repeat(frames))
-    replayed = islice(replay(session, endless), warm_up + wanted)
-    for done, _ in enumerate(replayed, 1):
-        on_run(max(0, done - warm_up), wanted)
-    with session.end_profile().open(encoding="utf-8") as lines:
-        return list(islice(node_runs(lines), warm_up, None))
 
 
 def node_runs(lines: Iterable[str]) -> Iterator[tuple[int, list[NodeRun]]]:
@@ -123,7 +111,8 @@ def node_runs(lines: Iterable[str]) -> Iterator[tuple[int, list[NodeRun]]]:
     """
     nodes: list[NodeRun] = []
     for line in lines:
-        event = _event(line)
+        text = line.strip().rstrip(",")
+        event: dict[str, Any] = json.loads(text) if text.startswith("{") else {}
         if event.get("cat") == "Node" and str(event["name"]).endswith(_KERNEL):
             # Events come at the end of a node, so its body's are earlier.
             begin = int(event["ts"])
@@ -135,14 +124,6 @@ def node_runs(lines: Iterable[str]) -> Iterator[tuple[int, list[NodeRun]]]:
         elif event.get("name") == "model_run":
             yield int(event["dur"]), nodes
             nodes = []
-
-
-def _event(line: str) -> dict[str, Any]:
-    text = line.strip().rstrip(",")
-    if not text.startswith("{"):
-        return {}
-    found: dict[str, Any] = json.loads(text)
-    return found
 
 
 def _divided(
@@ -160,10 +141,9 @@ def _divided(
         rest = max(0, taken_us - sum(node.taken_us for node in nodes))
         modules[BETWEEN][index] += rest
         operators[BETWEEN][index] += rest
-    return Breakdown(_by_cost(modules), _by_cost(operators))
-
-
-def _by_cost(sums: Mapping[str, Any]) -> Microseconds:
-    """Return sums by name, the largest first and :data:`BETWEEN` last."""
-    order = sorted(sums.items(), key=lambda item: (item[0] == BETWEEN, -item[1].sum()))
-    return {name: tuple(each.tolist()) for name, each in order}
+    # The largest first, and what lies between nodes last.
+    by_cost = (
+        sorted(sums.items(), key=lambda item: (item[0] == BETWEEN, -item[1].sum()))
+        for sums in (modules, operators)
+    )
+    return Breakdown(*({n: tuple(us.tolist()) for n, us in each} for each in by_cost))

@@ -37,8 +37,15 @@ def sheltered() -> Iterator[None]:
         if os.name == "posix":
             with _with_environment("PYTHONWARNINGS", _TRACKER_IS_SILENT):
                 resource_tracker.ensure_running()  # else a lock starts it unsheltered
-        with _interrupts_blocked():
+        if not hasattr(signal, "pthread_sigmask"):
             yield
+            return
+        # Block Ctrl-C in this thread: processes that it starts inherit the mask.
+        before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+        try:
+            yield
+        finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 @contextlib.contextmanager
@@ -53,19 +60,6 @@ def _with_environment(name: str, value: str) -> Iterator[None]:
             del os.environ[name]
         else:
             os.environ[name] = before
-
-
-@contextlib.contextmanager
-def _interrupts_blocked() -> Iterator[None]:
-    """Block Ctrl-C in this thread; processes that it starts inherit the mask."""
-    if not hasattr(signal, "pthread_sigmask"):
-        yield
-        return
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 class ShelteredProcess(SpawnProcess):
@@ -157,16 +151,15 @@ def main() -> None:
         import ctypes
 
         ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
-    threading.Thread(target=_wait_for_parent, daemon=True).start()
+
+    def wait_for_parent() -> None:
+        while os.read(0, 1):  # the parent holds standard input open
+            pass
+        os._exit(1)
+
+    threading.Thread(target=wait_for_parent, daemon=True).start()
     del sys.argv[0]
     runpy.run_path(sys.argv[0], run_name="__main__")
-
-
-def _wait_for_parent() -> None:
-    """Exit when standard input closes; the parent holds it open."""
-    while os.read(0, 1):
-        pass
-    os._exit(1)
 
 
 if __name__ == "__main__":

@@ -10,10 +10,10 @@
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from statistics import fmean
-from typing import Annotated
+from typing import Annotated, TypeVar
 
 from pydantic import BaseModel, Field, TypeAdapter, ValidationError
 
@@ -30,7 +30,7 @@ _RAIL = re.compile(r"\b([A-Z][A-Z0-9_]*) (\d+)mW/\d+mW")
 _LONGEST_MS = 1e9
 
 
-@dataclass(frozen=True)
+@dataclass
 class Imported:
     """What was read from files of other tools.
 
@@ -61,17 +61,25 @@ def read_imports(paths: Sequence[Path]) -> Imported:
     Raises:
         EvaluationError: a file is not valid, two hold the same, or none has a latency.
     """
-    found = Imported()
+    whole = Imported()
     for path in paths:
-        found = _joined(found, read_import(path), path)
-    if found.samples_us:
-        return found
+        part = read_import(path)
+        for name in ("samples_us", "layers_us", "rails_w", "machine"):
+            if not getattr(part, name):
+                continue
+            if name != "machine" and getattr(whole, name):
+                raise EvaluationError(f"{path}: a second file of the same kind")
+            setattr(whole, name, getattr(whole, name) or getattr(part, name))
+        whole.sources += part.sources
     # A profile alone gives one latency, the sum of its layers.
-    if found.layers_us:
-        whole = sum(taken for (taken,) in found.layers_us.values())
-        return replace(found, samples_us=(whole,))
-    names = ", ".join(map(str, paths))
-    raise EvaluationError(f"{names}: no latency in it: give the times of trtexec, too")
+    if not whole.samples_us and whole.layers_us:
+        whole.samples_us = (sum(taken for (taken,) in whole.layers_us.values()),)
+    if not whole.samples_us:
+        names = ", ".join(map(str, paths))
+        raise EvaluationError(
+            f"{names}: no latency in it: give the times of trtexec, too"
+        )
+    return whole
 
 
 def read_import(path: Path) -> Imported:
@@ -81,7 +89,12 @@ def read_import(path: Path) -> Imported:
         content = documents.content(path)
         text = content.decode("utf-8-sig", errors="replace")
         if text.lstrip()[:1] not in ("[", "{"):
-            return _tegrastats(path, text)
+            rails = dict[str, tuple[float, ...]]()
+            for name, milliwatts in _RAIL.findall(text):
+                rails[name] = (*rails.get(name, ()), int(milliwatts) / 1e3)
+            if not rails:
+                raise EvaluationError(f"{path}: {FORMATS}; no power of a rail in it")
+            return Imported(rails_w=rails, sources=("tegrastats",))
         found = documents.from_json(content)
     except OSError as error:
         raise EvaluationError(f"{path}: {error.strerror}") from error
@@ -93,7 +106,20 @@ def read_import(path: Path) -> Imported:
     # A list is trtexec's; a profile begins with a count.
     first = next((each for each in found if isinstance(each, dict)), {})
     try:
-        return _profile(found) if "count" in first else _times(found)
+        if "count" not in first:
+            times = TypeAdapter(_Some[_Time]).validate_python(found)
+            samples = tuple(round(1e3 * each.latencyMs) for each in times)
+            return Imported(samples, sources=("times of trtexec",))
+        # Sum layers of the same name: trtexec repeats the names in loops.
+        layers = dict[str, int]()
+        for each in TypeAdapter(_Some[_Layer]).validate_python(found[1:]):
+            taken = layers.get(each.name, 0) + round(1e3 * each.averageMs)
+            layers[each.name] = taken
+        by_cost = sorted(layers.items(), key=lambda item: -item[1])
+        return Imported(
+            layers_us={name: (taken,) for name, taken in by_cost},
+            sources=("a profile of trtexec",),
+        )
     except ValidationError as error:
         one = error.errors(include_url=False)[0]
         where = ".".join(map(str, one["loc"])) or "the file"
@@ -112,46 +138,5 @@ class _Layer(BaseModel):
     averageMs: _Ms  # noqa: N815 - trtexec's name
 
 
-_TIMES = TypeAdapter(Annotated[list[_Time], Field(min_length=1)])
-_LAYERS = TypeAdapter(Annotated[list[_Layer], Field(min_length=1)])
-
-
-def _times(found: list[object]) -> Imported:
-    times = _TIMES.validate_python(found)
-    samples = tuple(round(1e3 * each.latencyMs) for each in times)
-    return Imported(samples, sources=("times of trtexec",))
-
-
-def _profile(found: list[object]) -> Imported:
-    """Sum layers of the same name: trtexec repeats the names in loops."""
-    layers = dict[str, int]()
-    for each in _LAYERS.validate_python(found[1:]):
-        layers[each.name] = layers.get(each.name, 0) + round(1e3 * each.averageMs)
-    by_cost = sorted(layers.items(), key=lambda item: -item[1])
-    return Imported(
-        layers_us={name: (taken,) for name, taken in by_cost},
-        sources=("a profile of trtexec",),
-    )
-
-
-def _tegrastats(path: Path, text: str) -> Imported:
-    rails = dict[str, list[float]]()
-    for name, milliwatts in _RAIL.findall(text):
-        rails.setdefault(name, []).append(int(milliwatts) / 1e3)
-    if not rails:
-        raise EvaluationError(f"{path}: {FORMATS}; no power of a rail in it")
-    found = {name: tuple(watts) for name, watts in rails.items()}
-    return Imported(rails_w=found, sources=("tegrastats",))
-
-
-def _joined(one: Imported, other: Imported, path: Path) -> Imported:
-    for name in ("samples_us", "layers_us", "rails_w"):
-        if getattr(one, name) and getattr(other, name):
-            raise EvaluationError(f"{path}: a second file of the same kind")
-    return Imported(
-        one.samples_us or other.samples_us,
-        one.layers_us or other.layers_us,
-        one.rails_w or other.rails_w,
-        one.machine or other.machine,
-        (*one.sources, *other.sources),
-    )
+_T = TypeVar("_T")
+_Some = Annotated[list[_T], Field(min_length=1)]

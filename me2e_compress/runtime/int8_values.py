@@ -14,6 +14,7 @@ pattern of constant scales, so it is written as a graph is opened.
 """
 
 import dataclasses
+from typing import TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -27,8 +28,9 @@ from me2e_compress.operators import FusedCall
 DOMAIN = "com.microsoft"
 """The domain of onnxruntime's own operators."""
 
-Stored = tuple[ir.Value, ir.Value, ir.Value]
+Stored: TypeAlias = tuple[ir.Value, ir.Value, ir.Value]
 """Integers, scale and zero point."""
+_SUFFIX = {ir.DataType.INT8: "Int8", ir.DataType.UINT8: "Uint8"}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -40,6 +42,17 @@ class _Product:
     reshape: ir.Node | None
     weight: Stored
     bias: npt.NDArray[np.float32]
+
+
+def stored_bias(node: ir.Node | None) -> npt.NDArray[np.float32] | None:
+    """Compute the bias that a DequantizeLinear makes of integers; else None."""
+    if node is None or node.op_type != "DequantizeLinear":
+        return None
+    integers, scales = array_of(node.inputs[0]), array_of(node.inputs[1])
+    if integers is None or scales is None:
+        return None
+    numbers = integers.astype(np.float64) * scales.astype(np.float64)
+    return numbers.astype(np.float32)
 
 
 def write_float_products(where: ir.Graph) -> int:
@@ -90,8 +103,11 @@ def _product(node: ir.Node) -> _Product | None:
         return None
     reshape = maker(node.inputs[0], "Reshape")
     left = _stored(node.inputs[0] if reshape is None else reshape.inputs[0])
-    weight, bias = _stored(node.inputs[1]), _bias(input_at(node, 2))
-    if left is None or weight is None or bias is None:
+    weight, bias = (
+        _stored(node.inputs[1]),
+        stored_bias(maker(input_at(node, 2), "DequantizeLinear")),
+    )
+    if left is None or weight is None or bias is None or bias.ndim != 1:
         return None
     kinds = left[2].dtype, weight[2].dtype
     fast = kinds == (ir.DataType.UINT8, ir.DataType.INT8)
@@ -109,30 +125,6 @@ def _stored(value: ir.Value | None) -> Stored | None:
     return integers, scale, zero
 
 
-def _bias(value: ir.Value | None) -> npt.NDArray[np.float32] | None:
-    """Compute a bias that is stored as int32."""
-    node = maker(value, "DequantizeLinear")
-    if node is None:
-        return None
-    integers, scales = array_of(node.inputs[0]), array_of(node.inputs[1])
-    if integers is None or scales is None or integers.ndim != 1:
-        return None
-    numbers = integers.astype(np.float64) * scales.astype(np.float64)
-    return numbers.astype(np.float32)
-
-
-_SUFFIX = {ir.DataType.INT8: "Int8", ir.DataType.UINT8: "Uint8"}
-
-
-@dataclasses.dataclass(frozen=True)
-class _Stored:
-    """Integers that stand for (number - zero) * scale."""
-
-    value: ir.Value
-    scale: ir.Value
-    zero: ir.Value | None
-
-
 def read_int8(node: ir.Node, opset: int, names: set[str] | None) -> None:
     """Let a kernel call read int8 where its float value only dequantizes int8.
 
@@ -146,33 +138,45 @@ def read_int8(node: ir.Node, opset: int, names: set[str] | None) -> None:
     value = node.inputs[0]
     assert value is not None
     # Look through reshapes for the integers.
-    channels = _channels(value)
+    dims = open_shape(value)  # [N, S, M, D]: heads times channels in a row
+    channels = None if dims is None or len(dims) != 4 else product(dims[2:])
     reshapes: list[ir.Node] = []
     while (made := maker(value, "Reshape")) and made.inputs[0] is not None:
         reshapes.append(made)
         value = made.inputs[0]
-    stored = _int8_values_stored(value, channels)
-    kind = None if stored is None else stored.value.dtype
-    if stored is None or kind is None or kind not in _SUFFIX:
+    stored = _values(value, channels)
+    if stored is None:
+        return
+    rows, scale, zero = stored
+    kind = rows.dtype
+    if kind is None or kind not in _SUFFIX:
         return
     # Repeat the reshapes on the integers.
     call = FusedCall(node, opset=opset, by="session", names=names)
-    rows = stored.value
     for each in reversed(reshapes):
         options = {name: held.as_int() for name, held in each.attributes.items()}
         rows = call.add("Reshape", [rows, each.inputs[1]], options)
-    zero = stored.zero or call.constant(np.zeros(1, kind.numpy()), "zero")
+    zero = zero or call.constant(np.zeros(1, kind.numpy()), "zero")
     # Switch the call to the int8 kernel.
     before, count = node.inputs[0], len(node.inputs)
     node.op_type += _SUFFIX[kind]
     node.resize_inputs(count + 2)
-    for index, new in ((0, rows), (count, stored.scale), (count + 1, zero)):
+    for index, new in ((0, rows), (count, scale), (count + 1, zero)):
         node.replace_input_with(index, new)
-    _remove_unread(None if before is None else producer_of(before))
+    # Remove what nobody reads now, and what only that read.
+    unread = None if before is None else producer_of(before)
+    while unread is not None and unread.graph is not None:
+        if any(value.uses() or value.is_graph_output() for value in unread.outputs):
+            return
+        first = unread.inputs[0]
+        unread.graph.remove(unread, safe=True)
+        unread = None if first is None else producer_of(first)
 
 
-def _int8_values_stored(value: ir.Value | None, channels: int | None) -> _Stored | None:
-    """Return the integers behind a value, if their scales fit the kernel.
+def _values(
+    value: ir.Value | None, channels: int | None
+) -> tuple[ir.Value, ir.Value, ir.Value | None] | None:
+    """Return the integers behind a value, and scale and zero, if they fit the kernel.
 
     ``channels`` is the length of a row's last axis; None if unknown.
     """
@@ -190,34 +194,17 @@ def _int8_values_stored(value: ir.Value | None, channels: int | None) -> _Stored
         # The kernel takes one scale, or one for each channel.
         last = node.attributes.get_int("axis", 1) in (-1, len(source.shape) - 1)
         fits = _size(scale) == 1 or (last and _size(scale) == channels)
-        return _Stored(source, scale, zero) if fits else None
+        return (source, scale, zero) if fits else None
     # The other form: integers cast to float, times a scale.
     if node := maker(value, "Mul"):
         cast, scale = maker(node.inputs[0], "Cast"), node.inputs[1]
         if cast is None or cast.inputs[0] is None or scale is None:
             return None
         if channels is not None and scale.shape == (channels,):
-            return _Stored(cast.inputs[0], scale, None)
+            return cast.inputs[0], scale, None
     return None
 
 
 def _size(value: ir.Value) -> int | None:
     dims = open_shape(value)
     return None if dims is None else product(dims)
-
-
-def _channels(value: ir.Value) -> int | None:
-    """Return heads times channels of a value [N, S, M, D]."""
-    dims = open_shape(value)
-    return None if dims is None or len(dims) != 4 else product(dims[2:])
-
-
-def _remove_unread(node: ir.Node | None) -> None:
-    """Remove a node that nobody reads, and what only it read."""
-    while node is not None and node.graph is not None:
-        read = any(value.uses() or value.is_graph_output() for value in node.outputs)
-        if read:
-            return
-        first = node.inputs[0]
-        node.graph.remove(node, safe=True)
-        node = None if first is None else producer_of(first)

@@ -4,10 +4,9 @@ A graph with an operator of another type is not opened at all: GridSample of flo
 before opset 20, for one, which exporters write where a Python number leaked in.
 """
 
-import dataclasses
 import functools
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Any
+from typing import Any, TypeAlias
 
 import onnx
 import onnx_ir as ir
@@ -20,23 +19,10 @@ from me2e_compress.graph.nodes import is_read, is_standard, nodes_in
 
 _NEWEST = 2**31 - 1
 """The last version of a kernel that nothing has replaced."""
+_Kernel: TypeAlias = tuple[int, int, Mapping[str, Sequence[str]]]
+"""First and last version of a kernel's operator, and types by name of a constraint."""
 _CAST_BY_ITSELF = (ir.DataType.FLOAT16, ir.DataType.BFLOAT16)
 """Types that onnxruntime casts to float32 and back where it has no kernel."""
-
-
-@dataclasses.dataclass(frozen=True)
-class _Kernel:
-    """One kernel: versions of its operator, and types by the name of a constraint."""
-
-    first: int
-    last: int
-    types: Mapping[str, Sequence[str]]
-
-    def serves(self, since: int) -> bool:
-        """Return whether it is of the operator as of a version (as onnxruntime)."""
-        if self.last == _NEWEST:
-            return since == self.first
-        return self.first <= since <= self.last
 
 
 def without_kernel(model: ir.Model) -> Iterator[tuple[ir.Node, str]]:
@@ -61,10 +47,11 @@ def _missing(node: ir.Node, opset: int) -> str:
     given = _given(node, schema)
     if given is None:
         return ""
-    for kernel in kernels:
-        if kernel.serves(schema.since_version) and all(
-            word in kernel.types.get(name, (word,)) for name, word, _ in given
-        ):
+    for first, last, types in kernels:
+        # A kernel without a last version serves the version of its operator alone.
+        since = schema.since_version
+        serves = since == first if last == _NEWEST else first <= since <= last
+        if serves and all(word in types.get(n, (word,)) for n, word, _ in given):
             return ""
     return " and ".join(dict.fromkeys(kind for _, _, kind in given))
 
@@ -107,15 +94,14 @@ def _schema(op_type: str, opset: int) -> onnx.defs.OpSchema | None:
 
 
 @functools.cache
-def _kernels() -> Mapping[str, tuple[_Kernel, ...]]:
+def _kernels() -> Mapping[str, Sequence[_Kernel]]:
     """Return the CPU's kernels of ONNX's own operators, by operator; 8 ms, once."""
-    found: dict[str, list[_Kernel]] = {}
+    kernels: dict[str, list[_Kernel]] = {}
     for each in _native.get_all_opkernel_def():
         if each.provider == "CPUExecutionProvider" and not each.domain:
-            first, last = each.version_range
-            kernel = _Kernel(first, last, dict(each.type_constraints))
-            found.setdefault(each.op_name, []).append(kernel)
-    return {name: tuple(kernels) for name, kernels in found.items()}
+            kernel = (*each.version_range, dict(each.type_constraints))
+            kernels.setdefault(each.op_name, []).append(kernel)
+    return kernels
 
 
 def remedy(model: ir.Model, missing: str) -> str:

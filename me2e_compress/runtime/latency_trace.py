@@ -1,10 +1,13 @@
 """Latencies of a model measured on one machine."""
 
-from collections.abc import Mapping, Sequence
+import os
+import time
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Self, TypeAlias
 
+import psutil
 from pydantic import BaseModel, ConfigDict, Field
 
 from me2e_compress.display import Table, counted, not_measured, table
@@ -12,7 +15,88 @@ from me2e_compress.errors import EvaluationError
 from me2e_compress.metrics.measure import percentile, too_few
 from me2e_compress.registry import documents, drafts
 from me2e_compress.runtime.atomic import write_document
-from me2e_compress.runtime.others_load import Load
+
+BUSY = 0.1
+"""Share of the cores that other processes may take before a latency is in doubt: they
+move our threads between cores and evict caches long before all cores are taken."""
+
+SHORTEST_S = 0.5
+"""Shortest block to be judged, seconds: systems count CPU time in ticks of 10 ms."""
+
+
+@dataclass(frozen=True)
+class Load:
+    """Mean number of cores that other processes took during a measurement."""
+
+    others: float
+    cores: int
+
+    @property
+    def busy(self) -> bool:
+        """Whether they took more than `BUSY` of the cores."""
+        return self.others > BUSY * self.cores
+
+    def to_json(self) -> dict[str, float]:
+        """Return ``others_cores`` and ``cores``."""
+        return {"others_cores": self.others, "cores": self.cores}
+
+    def __str__(self) -> str:
+        said = f"other processes took {self.others:.1f} of {self.cores} cores"
+        if not self.busy:
+            return said
+        return (
+            f"the machine was busy: {said}, and more than {BUSY:.0%} moves latencies;"
+            " measure again when it is idle"
+        )
+
+
+class OthersLoad:
+    """Measure the cores that other processes keep busy while a block runs.
+
+    ``machine`` and ``ours`` return CPU seconds of all processes since boot, and of this
+    process with its ended children. ``load`` is None before the end, or if the block
+    was too short.
+    """
+
+    def __init__(
+        self,
+        machine: Callable[[], float] | None = None,
+        ours: Callable[[], float] | None = None,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._machine, self._ours = machine or _machine_seconds, ours or cpu_seconds
+        self._clock = clock
+        self.load: Load | None = None
+
+    def __enter__(self) -> Self:
+        self._begun = self._clock(), self._machine(), self._ours()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        wall, machine, ours = (
+            now - then
+            for now, then in zip(
+                (self._clock(), self._machine(), self._ours()), self._begun, strict=True
+            )
+        )
+        # A short block is not judged.
+        if wall >= SHORTEST_S:
+            others = max(0.0, machine - ours) / wall
+            self.load = Load(others, os.cpu_count() or 1)
+
+
+def _machine_seconds() -> float:
+    times = psutil.cpu_times()
+    idle = times.idle + getattr(times, "iowait", 0.0)
+    guests = getattr(times, "guest", 0.0) + getattr(times, "guest_nice", 0.0)
+    return float(sum(times) - idle - guests)  # guests are in user and nice already
+
+
+def cpu_seconds() -> float:
+    """Return the CPU time of this process and of its children that have ended."""
+    times = os.times()
+    return sum((times.user, times.system, times.children_user, times.children_system))
+
 
 PERCENTILES = (50, 90, 99)
 
@@ -36,46 +120,43 @@ def shares(parts: Microseconds) -> tuple[TimeShare, ...]:
     """Return the share of each part over all inferences."""
     whole = max(1, sum(map(sum, parts.values())))
     return tuple(
-        TimeShare(
-            name,
-            sum(samples) / whole,
-            _known_percentile(samples, 50),
-            _known_percentile(samples, 90),
-            _known_percentile(samples, 99),
-            max(samples),
-        )
+        TimeShare(name, sum(samples) / whole, *_percentiles(samples))
         for name, samples in parts.items()
     )
 
 
+def _percentiles(
+    samples: Sequence[int],
+) -> tuple[int | None, int | None, int | None, int]:
+    """Return p50, p90, p99, None with too few samples, and the largest."""
+    p50, p90, p99 = (
+        None if too_few(percent, len(samples)) else percentile(samples, percent)
+        for percent in PERCENTILES
+    )
+    return p50, p90, p99, max(samples)
+
+
+def _shown(samples: Sequence[int]) -> list[str]:
+    """Write the percentiles in milliseconds."""
+    return ["-" if us is None else f"{us / 1e3:.2f}" for us in _percentiles(samples)]
+
+
 def shares_table(title: str, what: str, parts: Microseconds) -> Table:
     """Return a table of the parts: share, then percentiles in milliseconds."""
+    whole = max(1, sum(map(sum, parts.values())))
     rows = [
-        (
-            each.name,
-            f"{each.share:.1%}",
-            *map(_ms, (each.p50_us, each.p90_us, each.p99_us, each.max_us)),
-        )
-        for each in shares(parts)
+        (name, f"{sum(samples) / whole:.1%}", *_shown(samples))
+        for name, samples in parts.items()
     ]
     columns = (what, "share", "p50 ms", "p90 ms", "p99 ms", "max ms")
     count = min(map(len, parts.values()), default=0)
     return table(title, columns, rows, _missing_percentiles(count))
 
 
-def _known_percentile(samples: Sequence[int], percent: float) -> int | None:
-    """Return a percentile; None where there are too few samples for it."""
-    return None if too_few(percent, len(samples)) else percentile(samples, percent)
-
-
 def _missing_percentiles(count: int) -> str:
     """Say which percentiles need more samples."""
     why = {f"p{percent}": too_few(percent, count) for percent in PERCENTILES}
     return not_measured({name: each for name, each in why.items() if each})
-
-
-def _ms(taken_us: int | None) -> str:
-    return "-" if taken_us is None else f"{taken_us / 1e3:.2f}"
 
 
 @dataclass(frozen=True, repr=False)
@@ -106,13 +187,10 @@ class LatencyTrace:
 
     def tables(self) -> tuple[Table, ...]:
         """Return the percentiles in milliseconds, and the times of modules."""
-        rows = [
-            *((f"p{p}", _known_percentile(self.samples_us, p)) for p in PERCENTILES),
-            ("max", self.max_us),
-        ]
-        shown = [(name, _ms(taken_us)) for name, taken_us in rows]
+        names = (*(f"p{percent}" for percent in PERCENTILES), "max")
+        rows = list(zip(names, _shown(self.samples_us), strict=True))
         note = _missing_percentiles(len(self.samples_us))
-        whole = table(self.headline, ("latency", "ms"), shown, note)
+        whole = table(self.headline, ("latency", "ms"), rows, note)
         # Times of modules are optional.
         if not self.modules_us:
             return (whole,)
@@ -131,21 +209,17 @@ class LatencyTrace:
 
     def to_json(self) -> dict[str, Any]:
         """Return p50, p90, p99 and max with the samples; None with too few samples."""
-        frames = {} if self.frames is None else {"frames": self.frames}
         taken = {name: list(each) for name, each in self.modules_us.items()}
-        modules = {"modules_us": taken} if taken else {}
-        others = self.others
-        busy = {} if others is None else others.to_json()
+        names = (*(f"p{percent}_us" for percent in PERCENTILES), "max_us")
         # What was not measured is left out.
         return {
             "model_sha256": self.model_sha256,
             "machine": self.machine,
-            **frames,
-            **busy,
-            **{f"p{p}_us": _known_percentile(self.samples_us, p) for p in PERCENTILES},
-            "max_us": self.max_us,
+            **({} if self.frames is None else {"frames": self.frames}),
+            **({} if self.others is None else self.others.to_json()),
+            **dict(zip(names, _percentiles(self.samples_us), strict=True)),
             "samples_us": list(self.samples_us),
-            **modules,
+            **({"modules_us": taken} if taken else {}),
         }
 
     def save(self, path: Path) -> None:

@@ -2,7 +2,8 @@
 
 import tempfile
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable
+from itertools import chain
 from pathlib import Path
 
 import onnx_ir as ir
@@ -54,8 +55,16 @@ def origins(source: ir.Model, found: ir.Model) -> dict[str, ir.Node]:
     """
     names = {str(node.name): node for node in source.graph}
     makers = {str(value.name): node for node in source.graph for value in node.outputs}
-    # Match by name or output first.
-    known = {node: _named_source(node, names, makers) for node in found.graph}
+    known: dict[ir.Node, ir.Node | None] = {}
+    for node in found.graph:
+        # Match by the name and its prefixes at separators, the longest first; or by an
+        # output.
+        name = str(node.name)
+        ends = (at for at in range(len(name) - 1, 0, -1) if name[at] in _SEPARATORS)
+        stems = (name, *(name[:end] for end in ends))
+        named = (names.get(stem) for stem in stems)
+        made = (makers.get(str(value.name)) for value in node.outputs)
+        known[node] = _first(chain(named, made))
     # Take the origin of readers, then of inputs, for the rest.
     for node in reversed(found.graph):
         known[node] = known[node] or _first(
@@ -71,24 +80,5 @@ def origins(source: ir.Model, found: ir.Model) -> dict[str, ir.Node]:
     return {str(node.name): each for node, each in known.items() if each is not None}
 
 
-def _named_source(
-    node: ir.Node, names: Mapping[str, ir.Node], makers: Mapping[str, ir.Node]
-) -> ir.Node | None:
-    """Return the source node that the node's name or an output refers to."""
-    name = str(node.name)
-    for stem in _stems(name):
-        if stem in names:
-            return names[stem]
-    return _first(makers.get(str(value.name)) for value in node.outputs)
-
-
-def _stems(name: str) -> Iterator[str]:
-    """Yield a name and its prefixes at separators, longest first."""
-    yield name
-    for end in range(len(name) - 1, 0, -1):
-        if name[end] in _SEPARATORS:
-            yield name[:end]
-
-
-def _first(found: Iterator[ir.Node | None]) -> ir.Node | None:
+def _first(found: Iterable[ir.Node | None]) -> ir.Node | None:
     return next((each for each in found if each is not None), None)

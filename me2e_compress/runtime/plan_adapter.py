@@ -1,15 +1,71 @@
 """Read the planned waypoints from a model's outputs."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any, Self, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
 import pydantic
 
-from me2e_compress.errors import GraphError
+from me2e_compress.errors import EvaluationError, GraphError
 from me2e_compress.registry import documents
-from me2e_compress.runtime.trajectory import Trajectory
+
+Floats = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Trajectory:
+    """The planned path of the ego.
+
+    Attributes:
+        points: [n, 2] metres, n at least 1; x forward, y left in the ego frame of the
+            observation.
+        times_s: [n] seconds after the observation, above 0 and increasing.
+
+    Raises:
+        EvaluationError: another shape, or times that do not increase from above 0.
+    """
+
+    points: npt.NDArray[np.floating]
+    times_s: npt.NDArray[np.floating]
+
+    def __post_init__(self) -> None:
+        """Check shapes and times; the driver checks that the points are finite."""
+        shape, times = list(self.points.shape), self.times_s
+        if len(shape) != 2 or shape[1] != 2 or not shape[0]:
+            raise EvaluationError(f"waypoints have shape {shape}, they must be [n, 2]")
+        if times.shape != (shape[0],):
+            raise EvaluationError(
+                f"{shape[0]} waypoints and times of shape {list(times.shape)}"
+            )
+        if not (np.diff(times, prepend=0.0) > 0).all():
+            raise EvaluationError("times of waypoints must increase from above 0")
+
+    @classmethod
+    def ahead(
+        cls, points: npt.NDArray[np.floating], times_s: npt.NDArray[np.floating]
+    ) -> Self:
+        """Build a trajectory of the waypoints after the observation."""
+        if not (times_s > 0).any():
+            raise EvaluationError("no waypoint lies after the observation")
+        return cls(points[times_s > 0], times_s[times_s > 0])
+
+    def at(self, times_s: npt.NDArray[np.floating]) -> Floats:
+        """Return the positions [m, 2] at other times [m] from 0 on.
+
+        They are interpolated linearly, from the ego at 0 s; after the last waypoint
+        they continue at the last velocity.
+        """
+        times = np.concatenate([[0.0], self.times_s])
+        points = np.vstack([np.zeros((1, 2)), self.points])
+        velocity = (points[-1] - points[-2]) / (times[-1] - times[-2])
+        asked = np.asarray(times_s, np.float64)
+        x, y = (np.interp(asked, times, column) for column in points.T)
+        beyond = np.maximum(asked - times[-1], 0.0)
+        places: Floats = np.stack([x, y], axis=1) + beyond[:, None] * velocity
+        return places
+
 
 PLAN = "me2e.plan"
 """Metadata key: JSON of :class:`PlanAdapter`."""
@@ -102,13 +158,37 @@ class PlanAdapter(pydantic.BaseModel):
         Raises:
             GraphError: the output has the wrong shape, or no mode is selected.
         """
-        value = self._laid_out(np.asarray(outputs[self.output], np.float64))
+        value = np.asarray(outputs[self.output], np.float64)
+        # Lay out a flat output.
+        if self.shape is not None:
+            if value.size != int(np.prod(self.shape)):
+                raise GraphError(
+                    f"{self.output} has shape {list(value.shape)}, which cannot be laid"
+                    f" out as {list(self.shape)}"
+                )
+            value = value.reshape(1, *self.shape)
         # Choose the mode, then read the coordinates.
         if value.ndim == 4:
-            value = value[:, self._mode(outputs, inputs, value.shape[1])]
-        if value.ndim != 3 or value.shape[0] != 1:
-            raise GraphError(self._not_a_plan(value.shape))
-        points: npt.NDArray[np.float64] = self._coordinates(value)[0]
+            modes = value.shape[1]
+            mode = self._picked(outputs, inputs, modes)
+            if not 0 <= mode < modes:
+                raise GraphError(f"mode {mode} of {self.output}: it has {modes} modes")
+            value = value[:, mode]
+        shape = list(value.shape)
+        if (
+            len(shape) != 3
+            or shape[0] != 1
+            or (self.columns is None and shape[-1] != 2)
+        ):
+            raise GraphError(f"{self.output} has shape {shape}, a plan is [1, n, 2]")
+        if self.columns is not None:
+            if max(self.columns) >= shape[-1]:
+                raise GraphError(
+                    f"{self.output} has shape {shape}: there is no column"
+                    f" {max(self.columns)}"
+                )
+            value = value[..., self.columns]
+        points: npt.NDArray[np.float64] = value[0]
         return np.cumsum(points, axis=0) if self.deltas else points
 
     def trajectory(self, points: npt.NDArray[np.float64]) -> Trajectory:
@@ -141,37 +221,6 @@ class PlanAdapter(pydantic.BaseModel):
             raise GraphError(f"nothing names the scores of {self.output}")
         return int(np.argmax(np.asarray(outputs[self.scores], np.float64).reshape(-1)))
 
-    def _laid_out(self, value: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
-        if self.shape is None:
-            return value
-        if value.size != int(np.prod(self.shape)):
-            raise GraphError(
-                f"{self.output} has shape {list(value.shape)}, which cannot be laid out"
-                f" as {list(self.shape)}"
-            )
-        return value.reshape(1, *self.shape)
-
-    def _coordinates(self, value: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
-        if self.columns is None:
-            if value.shape[-1] != 2:
-                raise GraphError(self._not_a_plan(value.shape))
-            return value
-        if max(self.columns) >= value.shape[-1]:
-            raise GraphError(
-                f"{self.output} has shape {list(value.shape)}: there is no column"
-                f" {max(self.columns)}"
-            )
-        return value[..., self.columns]
-
-    def _not_a_plan(self, shape: tuple[int, ...]) -> str:
-        return f"{self.output} has shape {list(shape)}, a plan is [1, n, 2]"
-
-    def _mode(self, outputs: Arrays, inputs: Arrays, modes: int) -> int:
-        mode = self._picked(outputs, inputs, modes)
-        if not 0 <= mode < modes:
-            raise GraphError(f"mode {mode} of {self.output}: it has {modes} modes")
-        return mode
-
     def _picked(self, outputs: Arrays, inputs: Arrays, modes: int) -> int:
         if self.scores is not None:
             if (count := np.size(outputs[self.scores])) != modes:
@@ -183,16 +232,13 @@ class PlanAdapter(pydantic.BaseModel):
         if self.command_input is not None and self.command_input in inputs:
             given: Any = np.asarray(inputs[self.command_input]).reshape(-1)
             command = int(given[0] if len(given) == 1 else np.argmax(given))
-            return self._mode_of(command)
+            if self.command_modes is None:
+                return command
+            if not 0 <= command < len(self.command_modes):
+                raise GraphError(
+                    f"{self.output}: command_modes names no mode of command {command}"
+                )
+            return self.command_modes[command]
         # Without scores or a command, only a default mode is left.
         self.check_modes(modes)
         return self.default_mode or 0
-
-    def _mode_of(self, command: int) -> int:
-        if self.command_modes is None:
-            return command
-        if not 0 <= command < len(self.command_modes):
-            raise GraphError(
-                f"{self.output}: command_modes names no mode of command {command}"
-            )
-        return self.command_modes[command]

@@ -40,7 +40,8 @@ def insert_probes(model: ir.Model, tensors: Sequence[str], probe: Probe) -> ir.M
     The last output of the copy is :data:`READINGS`.
     """
     copy = model.clone()
-    known = _values(copy)
+    made = (value for node in copy.graph for value in node.outputs)
+    known = {str(value.name): value for value in (*copy.graph.inputs, *made)}
     if missing := [name for name in tensors if name not in known]:
         raise GraphError(f"the graph has no tensor {missing[0]}")
     # Measure each tensor right after its producer.
@@ -57,11 +58,6 @@ def insert_probes(model: ir.Model, tensors: Sequence[str], probe: Probe) -> ir.M
     copy.graph.append(joined)
     copy.graph.outputs.append(joined.outputs[0])
     return copy
-
-
-def _values(model: ir.Model) -> dict[str, ir.Value]:
-    made = (value for node in model.graph for value in node.outputs)
-    return {str(value.name): value for value in (*model.graph.inputs, *made)}
 
 
 def _watch(

@@ -1,19 +1,17 @@
 """Measure the latency of a warm model, alone on this machine."""
 
-import dataclasses
 import platform
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections import deque
+from collections.abc import Callable, Mapping, Sequence
 from itertools import chain, islice, repeat
 from pathlib import Path
-from time import perf_counter, process_time
 
 from me2e_compress.display import counted
 from me2e_compress.errors import EvaluationError
 from me2e_compress.graph import sha256_of
-from me2e_compress.runtime.frames import Array, Frame, Frames
-from me2e_compress.runtime.latency_trace import LatencyTrace
-from me2e_compress.runtime.others_load import OthersLoad
+from me2e_compress.runtime.frames import Array, Frames
+from me2e_compress.runtime.latency_trace import LatencyTrace, OthersLoad
 from me2e_compress.runtime.providers import CPU, PROVIDERS, Provider
 from me2e_compress.runtime.session import Session, replay
 
@@ -117,41 +115,6 @@ RE_WARM = 2
 data."""
 
 
-@dataclasses.dataclass(frozen=True)
-class RunTimes:
-    """Times of one model, one for each round; CPU time adds up all threads."""
-
-    wall_s: tuple[float, ...]
-    cpu_s: tuple[float, ...]
-
-    @property
-    def best_wall_s(self) -> float:
-        """The least wall time in seconds: that of an idle machine."""
-        return min(self.wall_s)
-
-
-def time_interleaved(
-    sessions: Mapping[str, Session], frames: Sequence[Frame], rounds: int
-) -> dict[str, RunTimes]:
-    """Time one frame of every model in turn, A B C A B C, after one uncounted round.
-
-    All models should have the same number of threads. Only the first frame is run, with
-    recurrent state at zeros.
-    """
-    wall: dict[str, list[float]] = {name: [] for name in sessions}
-    cpu: dict[str, list[float]] = {name: [] for name in sessions}
-    for turn in range(rounds + 1):
-        for name, session in sessions.items():
-            start, used = perf_counter(), process_time()
-            for _ in replay(session, frames[:1]):
-                pass
-            # The first round only warms up.
-            if turn:
-                wall[name].append(perf_counter() - start)
-                cpu[name].append(process_time() - used)
-    return {name: RunTimes(tuple(wall[name]), tuple(cpu[name])) for name in sessions}
-
-
 def record_traces(
     models: Mapping[str, Path],
     frames: Frames,
@@ -181,14 +144,14 @@ def record_traces(
     }
     kept = {name: list[int]() for name in models}
     for run in runs.values():
-        _advance(run, warm_up)
+        deque(islice(run, warm_up), maxlen=0)
     # Measure block by block, and discard the start of each.
     total = samples * len(models)
     with OthersLoad() as others:
         for done in range(0, samples, BLOCK):
             block = min(BLOCK, samples - done)
             for place, (name, session) in enumerate(sessions.items()):
-                _advance(runs[name], RE_WARM + block)
+                deque(islice(runs[name], RE_WARM + block), maxlen=0)
                 kept[name] += session.taken_us[-block:]
                 on_sample(done * len(models) + place * block, total, name)
     machine = describe_machine(threads, provider)
@@ -203,8 +166,3 @@ def record_traces(
 def describe_machine(threads: int, provider: Provider = CPU) -> str:
     """Describe the machine of `record_traces`: processor, threads, provider."""
     return f"{machine_words(threads, provider)}, in turn"
-
-
-def _advance(runs: Iterator[object], count: int) -> None:
-    for _ in islice(runs, count):
-        pass

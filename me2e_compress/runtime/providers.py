@@ -129,11 +129,7 @@ class Provider(abc.ABC):
 
 @dataclasses.dataclass(frozen=True)
 class CpuProvider(Provider):
-    """onnxruntime's own kernels on the CPU.
-
-    Attributes:
-        plugins: libraries of onnxruntime operators that the graph needs.
-    """
+    """onnxruntime's own kernels on the CPU."""
 
     name: ClassVar[str] = "cpu"
     native: ClassVar[str] = _CPU
@@ -152,7 +148,6 @@ class CudaProvider(Provider):
     Attributes:
         device: index of the GPU.
         tf32: round the operands of products to 10 bits of mantissa: faster.
-        plugins: libraries of onnxruntime operators that the graph needs.
     """
 
     name: ClassVar[str] = "cuda"
@@ -226,7 +221,6 @@ class TensorRtRtxProvider(Provider):
 
     Attributes:
         cache: folder of compiled kernels; without it they are compiled every time.
-        plugins: libraries of onnxruntime operators that the graph needs.
     """
 
     name: ClassVar[str] = "tensorrt-rtx"

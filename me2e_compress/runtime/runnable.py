@@ -93,7 +93,14 @@ def runnable(
             custom_ops.register(options, needed)
         except (ImportError, OSError):
             made, _ = compiled_or_expanded(model, compiled=False, theirs=theirs)
-    if provider.native != CPU.native or not _by_int8(options):
+    if provider.native != CPU.native:
+        return made
+    # May onnxruntime make int8 kernels of pairs?
+    try:
+        as_written = str(options.get_session_config_entry(QDQ_OFF)) == "1"
+    except RuntimeError:  # it is not set
+        as_written = False
+    if as_written or options.graph_optimization_level == _AS_WRITTEN:
         return made
     # Files without fused nodes are opened unread, so their products stay, too.
     if made is not model:
@@ -138,16 +145,6 @@ _WEIGHT_INPUTS = {"DequantizeLinear": (0, 2), "MatMulIntegerToFloat": (1, 5)}
 """Where nodes read an int8 weight and its zero point."""
 
 
-def _by_int8(options: ort.SessionOptions) -> bool:
-    """Return whether onnxruntime may make int8 kernels of pairs."""
-    if options.graph_optimization_level == _AS_WRITTEN:
-        return False
-    try:
-        return str(options.get_session_config_entry(QDQ_OFF)) != "1"
-    except RuntimeError:  # it is not set
-        return True
-
-
 def compiled_or_expanded(
     model: ir.Model,
     *,
@@ -164,20 +161,31 @@ def compiled_or_expanded(
     if not ours:
         return model, ()
     copy = model.clone()
-    # Bodies depend on the types and ranks of their inputs.
-    if any(_is_bare(node) for node in unknown_nodes(copy) if node.op_type in ours):
-        graph.infer_shapes(copy)  # the file does not say what bodies have to know
-    # Expand the fused nodes; bodies may call kernels.
+    # Bodies depend on the types and ranks of their inputs, which a file may leave out.
+    if any(
+        value is not None and (value.type is None or value.shape is None)
+        for node in unknown_nodes(copy)
+        if node.op_type in ours
+        for value in node.inputs
+    ):
+        graph.infer_shapes(copy)
+    # Expand the fused nodes, unless the file has bodies that may run.
     taken = value_names(copy.graph)
     try:
         for node in list(unknown_nodes(copy)):
-            if node.op_type in ours and operators.find(node) is not None:
-                _expand(node, copy, taken, compiled)
+            if node.op_type not in ours or operators.find(node) is None:
+                continue
+            if compiled or node.op_identifier() not in copy.functions:
+                opset, used = _surroundings(node, copy, taken)
+                operators.expand(
+                    node, opset=opset, by=_BY, names=used, compiled=compiled
+                )
     except PreconditionError as error:
         raise GraphError(str(error)) from error
-    for node in list(unknown_nodes(copy)):
-        if compiled and _calls_kernel(node):
-            read_int8(node, _opset(node, copy), _names(node, taken))
+    # Kernels that can read int8 do.
+    for node in list(unknown_nodes(copy)) if compiled else ():
+        if node.domain == kernels.DOMAIN and node.op_type in _FLOAT_KERNELS:
+            read_int8(node, *_surroundings(node, copy, taken))
     # List the kernels, and import their domain.
     needed: dict[str, kernels.CompiledKernel] = {}
     for node in unknown_nodes(copy):
@@ -187,39 +195,20 @@ def compiled_or_expanded(
     return copy, tuple(needed.values())
 
 
+def _surroundings(
+    node: ir.Node, model: ir.Model, taken: set[str]
+) -> tuple[int, set[str] | None]:
+    """Return the opset of a node, and the names that its graph must not use again."""
+    where = node.graph
+    assert where is not None
+    opset = where.opset_imports.get("", model.opset_imports.get("", 1))
+    return opset, taken if isinstance(where, ir.Graph) else None
+
+
 def is_fused(node: ir.Node) -> bool:
     """Return whether a kernel or a body is known for a node."""
     kernel = node.domain == kernels.DOMAIN and node.op_type in _COMPILED
     return kernel or operators.find(node) is not None
-
-
-def _is_bare(node: ir.Node) -> bool:
-    """Return whether the type or the rank of an input is unknown."""
-    return any(
-        value is not None and (value.type is None or value.shape is None)
-        for value in node.inputs
-    )
-
-
-def _expand(node: ir.Node, model: ir.Model, names: set[str], compiled: bool) -> None:
-    """Replace a node by its body, unless the file has one that may run."""
-    if node.op_identifier() in model.functions and not compiled:
-        return
-    opset, taken = _opset(node, model), _names(node, names)
-    operators.expand(node, opset=opset, by=_BY, names=taken, compiled=compiled)
-
-
-def _calls_kernel(node: ir.Node) -> bool:
-    return node.domain == kernels.DOMAIN and node.op_type in _FLOAT_KERNELS
-
-
-def _opset(node: ir.Node, model: ir.Model) -> int:
-    assert node.graph is not None
-    return node.graph.opset_imports.get("", model.opset_imports.get("", 1))
-
-
-def _names(node: ir.Node, names: set[str]) -> set[str] | None:
-    return names if isinstance(node.graph, ir.Graph) else None
 
 
 MOST_ROUNDS = 1 << 24
@@ -259,22 +248,18 @@ def _rounds(node: ir.Node) -> float:
     if len(body.inputs) < 2 or not body.outputs:
         return 1
     # Both conditions must be constantly true, or passed through unchanged.
-    goes_on = unrenamed(body.outputs[0])
-    first = input_at(node, 1)
-    if first is not None and not _is_true(first):
-        return 1
-    if goes_on is not body.inputs[1] and not _is_true(goes_on):
-        return 1
+    goes_on, first = unrenamed(body.outputs[0]), input_at(node, 1)
+    conditions = [] if first is None else [unrenamed(first)]
+    if goes_on is not body.inputs[1]:
+        conditions.append(goes_on)
+    for array in map(array_of, conditions):
+        if array is None or array.size != 1 or not array.item():
+            return 1
     most = input_at(node, 0)
     if most is None:
         return math.inf
     count = array_of(most)
     return 1 if count is None or count.size != 1 else max(0, int(count.item()))
-
-
-def _is_true(value: ir.Value) -> bool:
-    array = array_of(unrenamed(value))
-    return array is not None and array.size == 1 and bool(array.item())
 
 
 def unsupported(model: ir.Model, provider: Provider = CPU) -> str | None:

@@ -1,5 +1,11 @@
-"""Sessions that run one graph, and the replay of recordings."""
+"""Sessions that run one graph, its weights lent to onnxruntime, not serialized.
 
+onnxruntime gets the graph without its large weights, as if they were in an external
+file, and the arrays in place of that file. So their total size does not matter,
+although a protobuf message ends at 2 GiB.
+"""
+
+import tempfile
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Literal, TypeAlias, cast
@@ -7,29 +13,216 @@ from typing import Literal, TypeAlias, cast
 import numpy as np
 import onnx_ir as ir
 import onnxruntime as ort
+from onnxruntime.capi import (
+    onnxruntime_pybind11_state as _native,  # pyright: ignore[reportAttributeAccessIssue]
+)
 
+from me2e_compress import graph
 from me2e_compress.errors import FramesError, GraphError
-from me2e_compress.graph.nodes import NATIVE
+from me2e_compress.graph.files import INLINE_LIMIT_BYTES
+from me2e_compress.graph.nodes import NATIVE, is_read
 from me2e_compress.graph.recurrence import SessionPort, not_fed_back, recurrence
 from me2e_compress.runtime.frames import Array, Frame
-from me2e_compress.runtime.opening import (
-    REFUSALS,
-    InvalidArgument,
-    Weights,
-    open_file,
-    open_graph,
-)
-from me2e_compress.runtime.providers import CPU, Provider
-from me2e_compress.runtime.runnable import NO_OVERFLOW, QDQ_OFF
+from me2e_compress.runtime.kernel_types import remedy, without_kernel
+from me2e_compress.runtime.providers import CPU, Provider, holds
+from me2e_compress.runtime.runnable import NO_OVERFLOW, QDQ_OFF, runnable, unsupported
 
-__all__ = [
-    "Level",
-    "Session",
-    "SessionPort",
-    "detached",
-    "replay",
-    "run_once",
-]
+# The compiled module has no stubs.
+
+
+InvalidArgument: type[Exception] = _native.InvalidArgument
+"""Raised where inputs do not fit."""
+
+REFUSALS: tuple[type[Exception], ...] = (
+    _native.Fail,
+    _native.InvalidArgument,
+    _native.InvalidGraph,
+    _native.InvalidProtobuf,
+    _native.NoModel,
+    _native.NoSuchFile,
+    _native.NotImplemented,
+    _native.RuntimeException,
+    UnicodeDecodeError,  # a message about names that are not UTF-8
+    MemoryError,  # what it computes of constants as it opens is too large
+    RuntimeError,  # an output of a type that numpy lacks, such as bfloat16
+)
+"""Everything raised where a graph cannot be read, built or run."""
+
+
+_INT8_STAYS = "session.qdqisint8allowed"
+LENT_BYTES = 1024
+"""Smaller tensors stay in the graph: shape inference reads them."""
+
+Weights: TypeAlias = Mapping[str, ort.OrtValue]
+"""Lent weights by name; they must live as long as the session."""
+
+_LENDABLE = frozenset(
+    {
+        ir.DataType.FLOAT, ir.DataType.DOUBLE, ir.DataType.FLOAT16, ir.DataType.INT8,
+        ir.DataType.UINT8, ir.DataType.INT32, ir.DataType.INT64,
+    }
+)  # fmt: skip
+
+
+def open_file(
+    path: Path,
+    options: ort.SessionOptions,
+    provider: Provider = CPU,
+    without: Sequence[str] | None = None,
+) -> tuple[ort.InferenceSession, Weights]:
+    """Open an ONNX file directly or, if onnxruntime refuses it, after loading it here.
+
+    This opens graphs that are newer than onnxruntime, that store shapes in a file of
+    weights, or that hold fused operators. See :func:`open_graph`.
+    """
+    if not path.is_file():
+        raise GraphError(f"{path}: no such file")
+    # Most files open directly: to load one takes ten times as long as to search it.
+    if not holds(path, _OWN_NODE, _LOOP):
+        try:
+            return _build(str(path), options, provider, without), {}
+        except GraphError:
+            pass
+    return open_graph(graph.load(path), options, provider, without)
+
+
+_OWN_NODE = b":\x04me2e"
+"""Bytes of a node in the toolkit's own domain; onnxruntime would run its body."""
+_LOOP = b'"\x04Loop'
+"""Bytes of a node that may never end."""
+
+
+def open_graph(
+    model: ir.Model,
+    options: ort.SessionOptions,
+    provider: Provider = CPU,
+    without: Sequence[str] | None = None,
+) -> tuple[ort.InferenceSession, Weights]:
+    """Open a graph in memory, and return its session and its lent weights.
+
+    The weights must live as long as the session, and must not change. The provider is
+    attached to ``options``; ``without`` lists optimizations to disable, by default
+    those of the provider. The GraphError of a refused graph names the operator.
+    """
+    if reason := unsupported(model, provider):
+        raise GraphError(reason)
+    model = runnable(model, options, provider)
+    try:
+        return _lending(model, options, provider, without)
+    except GraphError as refusal:
+        # Name the first operator that has no kernel; if all have one, what was said.
+        reason = str(refusal)
+        if provider.native == CPU.native:
+            typed = model.clone()
+            graph.infer_shapes(typed)
+            for node, missing in without_kernel(typed):
+                reason = f"{missing} (node {node.name!r}){remedy(typed, missing)}"
+                break
+        raise GraphError(reason) from refusal
+
+
+def _lending(
+    model: ir.Model,
+    options: ort.SessionOptions,
+    provider: Provider,
+    without: Sequence[str] | None,
+) -> tuple[ort.InferenceSession, Weights]:
+    # Lend the large weights that are read, and keep the rest in the graph.
+    lent: dict[str, ir.TensorProtocol] = {}
+    kept: list[ir.TensorProtocol] = []
+    for each in model.graphs():
+        for name, value in each.initializers.items():
+            tensor = value.const_value
+            if tensor is None:
+                continue
+            if (
+                each is model.graph
+                and tensor.dtype in _LENDABLE
+                and tensor.nbytes
+                and (tensor.nbytes >= LENT_BYTES or _is_external(tensor))
+                and is_read(value)  # onnxruntime drops the others, and then misses them
+            ):
+                lent[name] = tensor
+            else:
+                kept.append(tensor)
+    # What remains may be external, or too large for one message.
+    if (
+        any(map(_is_external, kept))
+        or sum(tensor.nbytes for tensor in kept) > INLINE_LIMIT_BYTES
+    ):
+        with tempfile.TemporaryDirectory(prefix="me2e-session-") as folder:
+            path = Path(folder) / "model.onnx"
+            graph.save(model, path)
+            return _build(str(path), options, provider, without), {}
+    weights = {
+        name: ort.OrtValue.ortvalue_from_numpy(np.ascontiguousarray(tensor.numpy()))
+        for name, tensor in lent.items()
+    }
+    # The arrays stand in for an external file: of them the graph has name and type.
+    options.add_external_initializers(list(weights), list(weights.values()))
+    bare = model.clone()
+    for name, tensor in lent.items():
+        shape = ir.Shape(tensor.shape.numpy())
+        bare.graph.initializers[name].const_value = ir.ExternalTensor(
+            "lent", 0, tensor.nbytes, tensor.dtype, shape=shape, name=name
+        )
+    content = ir.to_proto(bare).SerializeToString()
+    return _build(content, options, provider, without), weights
+
+
+def _is_external(tensor: ir.TensorProtocol) -> bool:
+    return isinstance(tensor, ir.ExternalTensor)
+
+
+def _build(
+    source: str | bytes,
+    options: ort.SessionOptions,
+    provider: Provider,
+    without: Sequence[str] | None,
+) -> ort.InferenceSession:
+    """Open a graph; on failure, retry without converting int8 to uint8.
+
+    From opset 21 on, that step of onnxruntime (1.31) leaves QuantizeLinear nodes whose
+    ``output_dtype`` is not that of their zero point, and then refuses them.
+    """
+    left_out = provider.left_out if without is None else without
+    try:
+        return _opened(source, options, provider, left_out)
+    except REFUSALS as error:
+        refusal = error
+    # Disable that step; setting the option twice would make onnxruntime warn.
+    try:
+        options.get_session_config_entry(_INT8_STAYS)
+    except RuntimeError:  # it is not set yet
+        options.add_session_config_entry(_INT8_STAYS, "1")
+    try:
+        return _opened(source, options, provider, left_out)
+    except REFUSALS:
+        line = " ".join(str(refusal).split())
+        raise GraphError(f"onnxruntime cannot run this graph: {line}") from refusal
+
+
+def _opened(
+    source: str | bytes,
+    options: ort.SessionOptions,
+    provider: Provider,
+    left_out: Sequence[str],
+) -> ort.InferenceSession:
+    found = ort.InferenceSession(
+        source,
+        options,
+        providers=provider.chain(),
+        disabled_optimizers=list(left_out),
+        enable_fallback=False,  # to another provider, with a print
+    )
+    provider.confirm(found.get_providers())
+    return found
+
+
+# Sessions that run one graph, and the replay of recordings.
+
+
+__all__ = ["Level", "Session", "SessionPort", "detached", "replay", "run_once"]
 
 DTYPES: Mapping[str, np.dtype[np.generic]] = {
     f"tensor({kind.name.lower()})": kind.numpy() for kind in NATIVE
@@ -153,9 +346,7 @@ class Session:
         }
 
     def run(
-        self,
-        feeds: Mapping[str, Array],
-        outputs: Sequence[str] | None = None,
+        self, feeds: Mapping[str, Array], outputs: Sequence[str] | None = None
     ) -> dict[str, Array]:
         """Run one inference; return all outputs, or those that are named.
 

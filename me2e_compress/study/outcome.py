@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from me2e_compress.metrics.measure import Measure
-from me2e_compress.runtime.others_load import Load
+from me2e_compress.runtime.latency_trace import Load
 from me2e_compress.runtime.profile import processor
 from me2e_compress.study.changes import Change, changes, held_against
 from me2e_compress.study.condition import Condition

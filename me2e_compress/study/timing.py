@@ -8,8 +8,7 @@ from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.driving.latency import LatencySource
 from me2e_compress.errors import EvaluationError
 from me2e_compress.metrics.measure import Measure, too_few
-from me2e_compress.runtime.latency_trace import LatencyTrace
-from me2e_compress.runtime.others_load import Load
+from me2e_compress.runtime.latency_trace import LatencyTrace, Load
 from me2e_compress.runtime.profile import describe_machine, record_traces
 from me2e_compress.study.condition import Condition
 from me2e_compress.study.definition import Study, Variant

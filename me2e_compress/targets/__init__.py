@@ -3,18 +3,23 @@
 To add a target, write its class, then add it to this table.
 """
 
-from me2e_compress.errors import RecipeError
+import abc
+import dataclasses
+from collections.abc import Callable, Collection, Iterable, Iterator
+from typing import ClassVar, Literal, TypeAlias, get_args
+
+import onnx
+import onnx_ir as ir
+
+from me2e_compress import graph
+from me2e_compress.calibration.ranges import Ranges
+from me2e_compress.errors import PreconditionError, RecipeError
+from me2e_compress.graph import is_standard, opset_of
+from me2e_compress.graph.validity import refusal
+from me2e_compress.quantization.costs import Costs
+from me2e_compress.quantization.plan import KeptFloat, QuantPlan
 from me2e_compress.registry import Registry
-from me2e_compress.targets.base import (
-    LintFinding,
-    LintRule,
-    Severity,
-    Target,
-    error,
-    of_opset,
-    valid,
-    warning,
-)
+from me2e_compress.runtime.providers import CPU, Provider
 
 __all__ = [
     "DEFAULT_TARGET",
@@ -28,6 +33,179 @@ __all__ = [
     "valid",
     "warning",
 ]
+
+
+Severity = Literal["error", "wrong", "warning"]
+SEVERITIES: tuple[Severity, ...] = get_args(Severity)
+"""The worst first."""
+
+
+@dataclasses.dataclass(frozen=True)
+class LintFinding:
+    """One problem of a graph for its target.
+
+    Attributes:
+        severity: with ``error`` it is refused, with ``wrong`` computed otherwise, with
+            ``warning`` slow, or in float.
+        rule: id of the rule.
+        node: name of the node; empty for a finding about the whole graph.
+        message: what was found; and what is expected.
+    """
+
+    severity: Severity
+    rule: str
+    node: str
+    message: str
+
+
+LintRule: TypeAlias = Callable[[ir.Model], Iterator[LintFinding]]
+"""Inspects a graph whose shapes are inferred and yields findings."""
+
+
+def error(rule: str, node: ir.Node | None, message: str) -> LintFinding:
+    """Return a finding that makes the target refuse the graph."""
+    return LintFinding("error", rule, name_of(node), message)
+
+
+def warning(rule: str, node: ir.Node | None, message: str) -> LintFinding:
+    """Return a finding with which the target still runs the graph, but badly."""
+    return LintFinding("warning", rule, name_of(node), message)
+
+
+def valid(model: ir.Model) -> Iterator[LintFinding]:
+    """Run ONNX's checker, ignoring plugins."""
+    if reason := refusal(model, plugins=True):
+        yield error("onnx", None, f"not valid ONNX: {reason}")
+
+
+def worst_first(found: Iterable[LintFinding]) -> tuple[LintFinding, ...]:
+    """Sort findings by their severity."""
+    return tuple(sorted(found, key=lambda each: SEVERITIES.index(each.severity)))
+
+
+def of_opset(model: ir.Model) -> Iterator[LintFinding]:
+    """Find operators that are newer than the opset of the graph.
+
+    TensorRT's parser does not look at the opset; onnxruntime does.
+    """
+    main, defs = opset_of(model), onnx.defs
+    parts: tuple[ir.Graph | ir.Function, ...]
+    parts = (model.graph, *model.functions.values())
+    for part in parts:
+        own = opset_of(part) if isinstance(part, ir.Function) else None
+        opset = own or main
+        for node in part.all_nodes():
+            name = node.op_type
+            if not is_standard(node) or not defs.has(name, domain=""):
+                continue
+            if not defs.has(name, max_inclusive_version=opset, domain=""):
+                since = min(
+                    schema.since_version
+                    for schema in defs.get_all_schemas_with_history()
+                    if schema.name == name and schema.domain == ""
+                )
+                message = f"{name} came with opset {since}, the graph is of {opset}"
+                yield error("operator-of-opset", node, message)
+
+
+def name_of(node: ir.Node | None) -> str:
+    """Return what a finding calls a node: its name, or that of its first output."""
+    return "" if node is None else node.name or str(node.outputs[0].name)
+
+
+@dataclasses.dataclass(frozen=True)
+class Target(abc.ABC):
+    """A runtime of graphs: how int8 is written for it, and what it refuses.
+
+    Derive a frozen dataclass; its fields are its options.
+
+    Class attributes:
+        name: its name in recipes and on the command line.
+        half_since: the first opset in which it supports int8 in a float16 graph, with
+            float16 scales; None if it has no such kernels.
+        opens: whether :meth:`read_back` opens the graph, in onnxruntime.
+    """
+
+    name: ClassVar[str]
+    half_since: ClassVar[int | None] = None
+    opens: ClassVar[bool] = False
+
+    @abc.abstractmethod
+    def tensors(self, plan: QuantPlan, model: ir.Model) -> tuple[str, ...]:
+        """List the activations whose ranges :meth:`place` needs."""
+
+    @abc.abstractmethod
+    def place(self, model: ir.Model, plan: QuantPlan, ranges: Ranges) -> ir.Model:
+        """Return a copy of a float graph in which a plan's nodes are int8.
+
+        Raises:
+            PreconditionError: the graph is older than opset 13 or in a float type
+                without int8 here, or a planned weight is not constant.
+            FramesError: the range of a tensor is missing.
+        """
+
+    def kept_float(self, plan: QuantPlan, model: ir.Model) -> tuple[KeptFloat, ...]:
+        """List the plan's nodes that stay float in that copy, with the reasons."""
+        return ()
+
+    def fused_objection(self, node: ir.Node) -> str | None:
+        """Explain why a fused operator cannot read int8; None if it can.
+
+        ``node`` is of an operator that declares which of its inputs may be int8.
+        """
+        return f"{self.name} has no int8 kernel for {node.op_type}"
+
+    def check_types(self, plan: QuantPlan, model: ir.Model) -> None:
+        """Check that the graph's float type can be quantized.
+
+        Raises:
+            PreconditionError: it is float16, and the target lacks such kernels, or the
+                opset float16 scales; the message has a remedy.
+        """
+        types = {v.name: v.dtype for node in model.graph for v in node.outputs}
+        # Float16 needs kernels, and scales of that type.
+        halves = [e for e in plan.chosen if types[e.output] == ir.DataType.FLOAT16]
+        opset, since = opset_of(model), self.half_since
+        if not halves or (since is not None and since <= opset):
+            return
+        reason = f"{self.name} has int8 kernels for float32 alone"
+        if since is not None:
+            reason = f"float16 scales need opset {since}, the graph is of {opset}"
+        raise PreconditionError(
+            f"{halves[0].node or halves[0].output} and {len(halves) - 1} more layers"
+            f" are in float16, and {reason}: put convert-float32 before quantize-int8"
+            " (--passes import-normalize,convert-float32,fuse-basic,quantize-int8)"
+        )
+
+    def costs(self, model: ir.Model, layers: Collection[ir.Node]) -> Costs | None:
+        """Estimate the savings and costs of int8 for candidate layers; None if unknown.
+
+        Shapes of the float graph are inferred.
+        """
+        return None
+
+    def lint_rules(self) -> tuple[LintRule, ...]:
+        """Return the target's lint rules."""
+        return ()
+
+    def lint(self, model: ir.Model) -> tuple[LintFinding, ...]:
+        """List all findings of a graph, errors first; the graph is not changed."""
+        # The rules need inferred shapes.
+        copy = model.clone()
+        graph.infer_shapes(copy)
+        found = [finding for rule in self.lint_rules() for finding in rule(copy)]
+        return worst_first(found)
+
+    def read_back(
+        self, model: ir.Model, provider: Provider = CPU
+    ) -> tuple[LintFinding, ...]:
+        """Open a graph, and list what runs differently from its types; errors first.
+
+        The graph must pass :meth:`lint` without errors. A target without a runtime here
+        finds nothing.
+        """
+        return ()
+
 
 _HERE = "me2e_compress.targets"
 

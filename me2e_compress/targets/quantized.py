@@ -7,7 +7,7 @@ import onnx_ir as ir
 
 from me2e_compress import graph
 from me2e_compress.graph.nodes import maker
-from me2e_compress.quantization.plan.decision import METADATA
+from me2e_compress.quantization.decision import METADATA
 
 QUANTIZE, DEQUANTIZE = PAIR = ("QuantizeLinear", "DequantizeLinear")
 INTEGER_OPS = frozenset(
@@ -53,25 +53,19 @@ def describe_quantized(model: ir.Model) -> str | None:
     # Operators first, then the grid and the producer.
     parts = [listed]
     if any(op in counts for op in PAIR):
-        parts.append(_grid(model))
+        # the element types of all pairs, and whether they are symmetric
+        pairs = [node for node in model.graph.all_nodes() if node.op_type in PAIR]
+        zeros = [graph.input_at(node, 2) for node in pairs]
+        types = dict.fromkeys(
+            "uint8" if zero is None or zero.dtype is None else zero.dtype.name.lower()
+            for zero in zeros
+        )
+        arrays = [graph.array_of(zero) for zero in zeros]
+        centred = not any(array.any() for array in arrays if array is not None)
+        grid = "zero points 0" if centred else "zero points that are not 0"
+        parts.append(f"{' and '.join(types)} with {grid}")
     if METADATA in model.metadata_props:
         parts.append("it carries the plan it was made by")
     elif model.producer_name:
         parts.append(f"made by {model.producer_name}")
     return "; ".join(parts)
-
-
-def _grid(model: ir.Model) -> str:
-    """Return the element types of all pairs, and whether they are symmetric."""
-    pairs = [node for node in model.graph.all_nodes() if node.op_type in PAIR]
-    zeros = [graph.input_at(node, 2) for node in pairs]
-    types = dict.fromkeys(_type(zero) for zero in zeros)
-    arrays = [graph.array_of(zero) for zero in zeros]
-    centred = not any(array.any() for array in arrays if array is not None)
-    grid = "zero points 0" if centred else "zero points that are not 0"
-    return f"{' and '.join(types)} with {grid}"
-
-
-def _type(zero: ir.Value | None) -> str:
-    """Return the type of a zero point; without one, ONNX uses uint8."""
-    return "uint8" if zero is None or zero.dtype is None else zero.dtype.name.lower()

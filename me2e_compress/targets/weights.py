@@ -57,19 +57,33 @@ def weights_of(
             f"the graph is of opset {opset}: int8 with one scale a channel needs"
             f" {MIN_OPSET} or later, export it so"
         )
-    # Find the weight of each planned layer, and its channel axis.
+    # Find the weight of each planned layer, and its channel axis: -1 for a MatMul.
     nodes = {str(node.outputs[0].name): node for node in model.graph}
-    layers = {
-        each.output: _planned(nodes[each.output], each, each.weight)
-        for each in chosen
-        if each.weight is not None
-    }
+    layers = dict[str, tuple[ir.Value, int | None]]()
+    plain = set[tuple[ir.Value, int | None]]()
+    for each in chosen:
+        if each.weight is None:
+            continue
+        node, axis = nodes[each.output], each.axis
+        weight = node.inputs[each.weight]
+        if weight is None:
+            raise PreconditionError(f"{each.node} is planned as a layer without weight")
+        layer = weight, -1 if axis is not None and node.op_type == "MatMul" else axis
+        layers[each.output] = layer
+        # The errors of a weight add up over neighbouring pixels, and over elements that
+        # are never negative. Over tokens of both signs, behind a LayerNormalization,
+        # balance only adds to the errors: on the driver such products lose up to 1.7
+        # dB, while products behind a ReLU and convolutions gain 0.2 to 8.6, but for
+        # one that loses 0.2 (``python -m benchmarks.bench_weights``).
+        made = producer_of(node.inputs[0])
+        behind_relu = made is not None and made.op_type == "Relu"
+        if node.op_type not in CONVOLUTIONS and not behind_relu:
+            plain.add(layer)
     # Weights that nodes compute are evaluated together.
     values = dict.fromkeys(value for value, _ in layers.values())
-    made = [str(each.name) for each in values if each.producer() is not None]
-    computed = evaluate_constants(model, made)
+    made_by_nodes = [str(each.name) for each in values if each.producer() is not None]
+    computed = evaluate_constants(model, made_by_nodes)
     # Quantize each weight once.
-    plain = {layers[name] for name in layers if not _gains_by_balance(nodes[name])}
     quantized = {
         layer: _quantize(*layer, computed, balanced and layer not in plain)
         for layer in dict.fromkeys(layers.values())
@@ -183,30 +197,6 @@ def _excess(error: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
     return found
 
 
-def _gains_by_balance(node: ir.Node) -> bool:
-    """Return whether the errors of a weight add up over what its layer reads.
-
-    They do over neighbouring pixels, and over elements that are never negative. Over
-    tokens of both signs, behind a LayerNormalization, balance only adds to the errors:
-    on the driver such products lose up to 1.7 dB, while products behind a ReLU and
-    convolutions gain 0.2 to 8.6, but for one that loses 0.2
-    (``python -m benchmarks.bench_weights``).
-    """
-    made = producer_of(node.inputs[0])
-    behind_relu = made is not None and made.op_type == "Relu"
-    return node.op_type in CONVOLUTIONS or behind_relu
-
-
-def _planned(
-    node: ir.Node, decision: Decision, index: int
-) -> tuple[ir.Value, int | None]:
-    """Return a weight and the axis of its channels: -1, the last, for a MatMul."""
-    weight, axis = node.inputs[index], decision.axis
-    if weight is None:
-        raise PreconditionError(f"{decision.node} is planned as a layer without weight")
-    return weight, -1 if axis is not None and node.op_type == "MatMul" else axis
-
-
 def _quantize(
     value: ir.Value, axis: int | None, computed: Mapping[str, Array], balanced: bool
 ) -> QuantizedWeight:
@@ -260,7 +250,7 @@ Floats = npt.NDArray[np.float32]
 def is_bias(value: ir.Value | None, rank: int, columns: int | None) -> bool:
     """Return whether a value is a constant that adds one number to every column."""
     # A higher rank or more columns would change the product's shape.
-    array = _stored(value)
+    array = None if value is None else array_of(unrenamed(value))
     return (
         array is not None
         and array.ndim <= rank
@@ -278,7 +268,7 @@ def biased_end(product: ir.Node) -> ir.Node | None:
         return None
     # The other operand must be a plain bias.
     columns = extent(product, weight=True).columns
-    return addition if is_bias(_other(addition, product), rank, columns) else None
+    return addition if is_bias(_added(addition, product), rank, columns) else None
 
 
 def bias_by_channel(node: ir.Node, channels: int | None) -> Floats | None:
@@ -289,10 +279,10 @@ def bias_by_channel(node: ir.Node, channels: int | None) -> Floats | None:
     """
     if node.op_type == "MatMul":
         end = biased_end(node)
-        value = None if end is None else _other(end, node)
+        value = None if end is None else _added(end, node)
     else:
         value = graph.bias_of(node)
-    array = _stored(value)
+    array = None if value is None else array_of(unrenamed(value))
     if array is None:
         return None
     bias = array.astype(np.float32).reshape(-1)
@@ -328,10 +318,6 @@ def with_room(
     return dataclasses.replace(weight, integers=integers, scales=scales)
 
 
-def _other(addition: ir.Node, product: ir.Node) -> ir.Value | None:
+def _added(addition: ir.Node, product: ir.Node) -> ir.Value | None:
     left, right = addition.inputs
     return right if left is product.outputs[0] else left
-
-
-def _stored(value: ir.Value | None) -> npt.NDArray[np.generic] | None:
-    return None if value is None else array_of(unrenamed(value))

@@ -5,7 +5,7 @@ from pathlib import Path
 from me2e_compress.errors import EnergyError, RecipeError
 from me2e_compress.runtime.energy.energy_counter import EnergySchedule, open_counter
 from me2e_compress.runtime.energy.energy_result import FEWEST_WINDOWS, Absent, Reader
-from me2e_compress.runtime.energy.models import measure_energy
+from me2e_compress.runtime.energy.meter import measure_energy
 from me2e_compress.runtime.frames import Frames
 from me2e_compress.runtime.providers import Provider
 from me2e_compress.workflows.checks import check_number

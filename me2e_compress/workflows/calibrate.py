@@ -19,7 +19,7 @@ from me2e_compress.calibration.review import not_in, review
 from me2e_compress.calibration.sample import FrameSubset, draw
 from me2e_compress.errors import FramesError
 from me2e_compress.manager import recipe
-from me2e_compress.quantization.plan.overrides import keep_readers, overrides_text
+from me2e_compress.quantization.decision import keep_readers, overrides_text
 from me2e_compress.registry import drafts
 from me2e_compress.runtime.atomic import write_bytes
 from me2e_compress.workflows.calibrate_options import (

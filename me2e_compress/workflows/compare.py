@@ -10,11 +10,16 @@ from me2e_compress import graph
 from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.driving.adapter.outputs import adapted
 from me2e_compress.errors import EvaluationError, GraphError
-from me2e_compress.fidelity.compare import Fidelity, common_adapter
+from me2e_compress.fidelity.compare import (
+    Fidelity,
+    SetFidelity,
+    SetOutputs,
+    SetTally,
+    common_adapter,
+)
 from me2e_compress.fidelity.compare import compare as measure
 from me2e_compress.fidelity.floor import ALIVE
 from me2e_compress.fidelity.liveness import Liveness, LivenessTally
-from me2e_compress.fidelity.matched_sets import SetFidelity, SetOutputs, SetTally
 from me2e_compress.runtime.frames import Array, Frame
 from me2e_compress.runtime.providers import CPU, Provider
 from me2e_compress.runtime.session import Session

@@ -18,7 +18,7 @@ from me2e_compress.passes import Context, Pass
 from me2e_compress.passes.fix_shapes import with_sizes
 from me2e_compress.passes.quantize_int8 import QuantizeInt8
 from me2e_compress.quantization.rules import RuleSet
-from me2e_compress.runtime.others_load import cpu_seconds
+from me2e_compress.runtime.latency_trace import cpu_seconds
 from me2e_compress.runtime.providers import CPU, Provider
 from me2e_compress.workflows.checks import (
     check_count,

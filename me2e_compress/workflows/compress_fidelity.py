@@ -18,7 +18,7 @@ from me2e_compress.passes import Pass
 from me2e_compress.passes.lower_int8 import LowerInt8
 from me2e_compress.passes.quantize_int8 import QuantizeInt8
 from me2e_compress.runtime.frames import Array, Frame, Frames
-from me2e_compress.runtime.others_load import cpu_seconds
+from me2e_compress.runtime.latency_trace import cpu_seconds
 from me2e_compress.runtime.providers import Provider
 from me2e_compress.runtime.session import Session
 from me2e_compress.shipped.drivers import sample_frames

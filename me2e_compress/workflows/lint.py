@@ -16,10 +16,16 @@ from me2e_compress.passes.import_normalize import with_own_domains
 from me2e_compress.passes.quantize_int8 import QuantizeInt8
 from me2e_compress.quantization.plan import plan_of
 from me2e_compress.runtime.providers import CPU, Provider
-from me2e_compress.targets import TARGETS, LintFinding, Severity, Target
-from me2e_compress.targets.base import SEVERITIES, worst_first
+from me2e_compress.targets import (
+    SEVERITIES,
+    TARGETS,
+    LintFinding,
+    Severity,
+    Target,
+    worst_first,
+)
 from me2e_compress.targets.tensorrt import TensorRT
-from me2e_compress.targets.tensorrt.rtx import BuildResult, check
+from me2e_compress.targets.tensorrt.rtx_check import BuildResult, check
 from me2e_compress.workflows.checks import model_path
 from me2e_compress.workflows.first_opening import try_first
 from me2e_compress.workflows.listener import SILENT, Listener

@@ -19,7 +19,6 @@ from me2e_compress.quantization.plan import (
     plan_of,
     save_plan,
 )
-from me2e_compress.quantization.plan.decision import record
 from me2e_compress.quantization.rules import DEFAULT_RULES, RuleSet
 from me2e_compress.targets import DEFAULT_TARGET
 from me2e_compress.workflows.checks import lacking_shapes, model_path
@@ -104,7 +103,7 @@ class PlanResult(Result):
     def to_json(self) -> object:
         """Return the plan, or the differences from another."""
         if self.changes is None:
-            return record(self.plan)
+            return dataclasses.asdict(self.plan)
         return {"differences": self.changes}
 
 

@@ -17,9 +17,8 @@ from me2e_compress.registry import drafts
 from me2e_compress.runtime.breakdown import Breakdown, break_down
 from me2e_compress.runtime.energy import EnergyResult
 from me2e_compress.runtime.energy.energy_counter import EnergySchedule, check_counter
-from me2e_compress.runtime.energy.models import measure_energy
-from me2e_compress.runtime.latency_trace import LatencyTrace, Microseconds
-from me2e_compress.runtime.others_load import OthersLoad
+from me2e_compress.runtime.energy.meter import measure_energy
+from me2e_compress.runtime.latency_trace import LatencyTrace, Microseconds, OthersLoad
 from me2e_compress.runtime.profile import WARM_UP
 from me2e_compress.runtime.profile import profile as measure
 from me2e_compress.runtime.providers import CPU, Provider

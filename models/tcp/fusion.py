@@ -5,7 +5,7 @@ from typing import Literal
 
 from me2e_compress.driving.contract import PedalsAndWheel
 from me2e_compress.driving.waypoint_pid import PidOptions, Place, WaypointPid
-from me2e_compress.runtime.trajectory import Trajectory
+from me2e_compress.runtime.plan_adapter import Trajectory
 
 Rule = Literal["tcp", "bench2drive"]
 

@@ -4,7 +4,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import onnx_ir as ir
 import pytest
 from onnxruntime.quantization import calibrate as peer
 
@@ -17,7 +16,7 @@ from me2e_compress.errors import FramesError, GraphError, RecipeError
 from me2e_compress.runtime.frames import Array
 from me2e_compress.runtime.session import Session, replay
 from tests.frames import record
-from tests.nets import conv_attention, image
+from tests.nets import conv_attention, image, parsed
 
 TENSORS = ("image", "a", "r", "seen", "q", "scores", "p", "mixed")
 
@@ -106,8 +105,7 @@ def test_a_tensor_whose_range_one_element_makes_is_named(tmp_path: Path) -> None
     lone = {"image": np.ones((1, 3, 64, 64), np.float32)}
     lone["image"].flat[5] = 1e4
     frames = CalibrationSet(record(tmp_path, [lone]))
-    model = ir.from_onnx_text(
-        '<ir_version: 9, opset_import: ["" : 17]>\n'
+    model = parsed(
         "m (float[1,3,64,64] image) => (float[1,3,64,64] y) { y = Relu(image) }"
     )
 

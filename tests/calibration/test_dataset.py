@@ -7,9 +7,9 @@ import pytest
 from me2e_compress.calibration.dataset import CalibrationSet, synthetic
 from me2e_compress.errors import FramesError, PreconditionError
 from tests.frames import record
+from tests.nets import parsed
 
 MODEL = """
-<ir_version: 9, opset_import: ["" : 17]>
 model (float[1,2] x, int64[1] command, float[1,2] memory)
     => (float[1,2] memory_out) {
     memory_out = Add(x, memory)
@@ -23,7 +23,7 @@ def frame(value: float = 0.0) -> dict[str, np.ndarray]:
 
 @pytest.fixture
 def model() -> ir.Model:
-    return ir.from_onnx_text(MODEL)
+    return parsed(MODEL)
 
 
 def test_frames_come_in_order_and_know_their_scene(tmp_path: Path) -> None:
@@ -139,7 +139,7 @@ def test_synthetic_frames_fit_and_follow_the_seed(model: ir.Model) -> None:
 
 
 def test_open_shapes_have_no_synthetic_frames() -> None:
-    model = ir.from_onnx_text(MODEL.replace("float[1,2] x", "float[n,2] x"))
+    model = parsed(MODEL.replace("float[1,2] x", "float[n,2] x"))
 
     with pytest.raises(PreconditionError, match=r"input x is .*\[n,2\].*give frames"):
         synthetic(model, seed=0, count=1)

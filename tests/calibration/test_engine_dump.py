@@ -193,13 +193,6 @@ def test_arrays_of_no_numbers(
     )
 
 
-def test_values_that_are_fewer_than_their_shape(tmp_path: Path) -> None:
-    (tmp_path / "a.json").write_text(
-        '[{"name": "plan", "dimensions": "1x6x2", "values": [1, 2]}]'
-    )
-    assert "plan has 2 values for 1x6x2" in refused(tmp_path)
-
-
 def test_fewer_frames(tmp_path: Path, frames: CalibrationSet) -> None:
     as_npz(tmp_path / "dump", ANSWERS[:2])
     assert refused(tmp_path / "dump", frames).endswith(

@@ -14,11 +14,10 @@ from me2e_compress.errors import FramesError, GraphError
 from me2e_compress.runtime.frames import Frame
 from me2e_compress.runtime.session import run_once
 from tests.frames import record
-from tests.nets import conv_attention, image
+from tests.nets import conv_attention, image, parsed
 from tests.profiles import scaled
 
 KINDS = """
-<ir_version: 9, opset_import: ["" : 17]>
 kinds (float[1,4] x) => (float[1,4] y) <float limit = {0.0}> {
     best = ArgMax <axis = 1> (x)
     brave = Greater (x, limit)
@@ -29,7 +28,7 @@ kinds (float[1,4] x) => (float[1,4] y) <float limit = {0.0}> {
 
 
 def kinds() -> ir.Model:
-    model = ir.from_onnx_text(KINDS)
+    model = parsed(KINDS)
     graph.infer_shapes(model)
     return model
 
@@ -119,7 +118,7 @@ def test_what_is_not_finite_has_no_mean(bad: float, kind: str) -> None:
 
 
 def test_one_value_one_shape() -> None:
-    model = ir.from_onnx_text(
+    model = parsed(
         '<ir_version: 9, opset_import: ["" : 17]>'
         " m (float[1,4] x) => (int64[2,n] where) { where = NonZero(x) }"
     )

@@ -3,7 +3,6 @@
 from pathlib import Path
 
 import numpy as np
-import onnx_ir as ir
 import pytest
 
 from me2e_compress.calibration.calibrator import Calibrator
@@ -11,9 +10,9 @@ from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.calibration.observers import OBSERVERS
 from me2e_compress.calibration.statistics import Statistics
 from tests.frames import record
+from tests.nets import parsed
 
 FOUND = """
-<ir_version: 9, opset_import: ["" : 17]>
 found (float[8] scores) => (float[N] kept)
 <float none = {0.0}> {
     sure = Greater(scores, none)
@@ -32,7 +31,7 @@ def frames_of(folder: Path, *scores: np.ndarray) -> CalibrationSet:
 def test_frames_without_elements_change_no_range(method: str, tmp_path: Path) -> None:
     random = np.random.default_rng(11)
     some = [random.uniform(-1, 1, 8).astype(np.float32) for _ in range(3)]
-    model = ir.from_onnx_text(FOUND)
+    model = parsed(FOUND)
     calibrator = Calibrator(method, threads=1)
     whole = calibrator.run(model, ["kept"], frames_of(tmp_path / "a", *some))
 
@@ -43,7 +42,7 @@ def test_frames_without_elements_change_no_range(method: str, tmp_path: Path) ->
 
 
 def test_what_never_has_an_element_is_dead(tmp_path: Path) -> None:
-    model = ir.from_onnx_text(FOUND)
+    model = parsed(FOUND)
     frames = frames_of(tmp_path / "f", NOTHING, NOTHING)
 
     found = Calibrator(threads=1).run(model, ["scores", "kept"], frames)

@@ -8,9 +8,16 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from me2e_compress.calibration.observers import OBSERVERS, Bounds, Observer, scale_of
-from me2e_compress.calibration.observers.base import MaxMin, within
-from me2e_compress.calibration.observers.histogram import MeanSquaredError, Percentile
+from me2e_compress.calibration.observers import (
+    OBSERVERS,
+    Bounds,
+    MaxMin,
+    MeanSquaredError,
+    Observer,
+    Percentile,
+    scale_of,
+    within,
+)
 from me2e_compress.calibration.statistics import BINS, Statistics
 from me2e_compress.errors import FramesError, RecipeError
 from tests.installed import install

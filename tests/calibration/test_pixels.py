@@ -15,9 +15,9 @@ from me2e_compress.errors import FramesError
 from me2e_compress.runtime.frames import Frame
 from me2e_compress.runtime.session import Session, replay
 from tests.frames import record
+from tests.nets import parsed
 
 MODEL = """
-<ir_version: 9, opset_import: ["" : 17]>
 model (float[1,2,3,4,6] img, float[1] speed) => (float[1,2,3,4,6] y)
 <float[1] half = {0.5}> {
     far = Mul(img, half)
@@ -66,7 +66,7 @@ def written(folder: Path, *, as_bytes: bool) -> CalibrationSet:
 
 @pytest.fixture
 def model() -> ir.Model:
-    return ir.from_onnx_text(MODEL)
+    return parsed(MODEL)
 
 
 def test_bytes_are_fed_as_the_floats_they_stand_for(tmp_path: Path) -> None:

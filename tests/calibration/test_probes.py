@@ -1,7 +1,6 @@
 from pathlib import Path
 
 import numpy as np
-import onnx_ir as ir
 import pytest
 
 from me2e_compress import graph
@@ -12,7 +11,7 @@ from me2e_compress.calibration.stream import probed_session, schedule_probes
 from me2e_compress.runtime.probing import READINGS, insert_probes
 from me2e_compress.runtime.session import Session
 from tests.frames import record
-from tests.nets import conv_attention, image
+from tests.nets import conv_attention, image, parsed
 
 TENSORS = ("image", "a", "r", "seen", "q", "scores", "p", "mixed")
 
@@ -78,8 +77,7 @@ def test_scheduling_lets_probes_run_as_soon_as_they_can() -> None:
 
 
 def test_nodes_that_lead_nowhere_survive_the_scheduling() -> None:
-    model = ir.from_onnx_text(
-        '<ir_version: 9, opset_import: ["" : 17]>\n'
+    model = parsed(
         "m (float[2] x, bool c) => (float[2] y) { y = Relu(x)"
         " z = If (c) <then_branch = t () => (float[2] a) { a = Abs(y) },"
         " else_branch = e () => (float[2] b) { b = Neg(y) }> }"
@@ -92,7 +90,7 @@ def test_nodes_that_lead_nowhere_survive_the_scheduling() -> None:
 
 @pytest.mark.parametrize("opset", [13, 17])
 def test_histograms_are_those_of_numpy(tmp_path: Path, opset: int) -> None:
-    model = ir.from_onnx_text(
+    model = parsed(
         f'<ir_version: 9, opset_import: ["" : {opset}]>\n'
         "m (float[4,900] x) => (float[4,900] y) { y = Neg(x) }"
     )
@@ -111,7 +109,7 @@ def test_histograms_are_those_of_numpy(tmp_path: Path, opset: int) -> None:
 
 def test_what_onnxruntime_names_twice_in_a_branch_is_still_measured() -> None:
     # Its fusion of MatMul and Add gives a reshape one name, here and in the branch.
-    model = ir.from_onnx_text(
+    model = parsed(
         '<ir_version: 9, opset_import: ["" : 20]>\n'
         """g (bool s, float[2,2,3,2] x) => (float[2,2,3,2] z)
         <float[2] b = {1, 2}, float[2,2] w = {1, 2, 3, 4}> {

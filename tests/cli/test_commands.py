@@ -21,7 +21,7 @@ from me2e_compress.workflows.listing import KINDS, REGISTRIES
 from tests.command import Cli, strict
 from tests.docs.documents import faults
 from tests.installed import install
-from tests.nets import save_text
+from tests.nets import parsed, save_text
 from tests.targets.onnxruntime.lowered import MATMUL_RELU
 
 NAMES = sorted(COMMANDS)
@@ -145,7 +145,7 @@ def test_a_version_refuses_what_came_later(
 
 
 def test_int8_that_onnxruntime_runs_in_float_is_named(cli: Cli, tmp_path: Path) -> None:
-    graph.save(ir.from_onnx_text(MATMUL_RELU), tmp_path / "m.onnx")
+    graph.save(parsed(MATMUL_RELU), tmp_path / "m.onnx")
 
     (found,) = cli.document("lint m.onnx --target onnxruntime")["findings"]
     assert (found["rule"], found["node"]) == ("float-kernel", "/head/fc")

@@ -8,13 +8,13 @@ import onnx_ir as ir
 
 from me2e_compress.runtime.frames import Frame
 from me2e_compress.runtime.session import Session
+from tests.nets import parsed
 
 Arrays: TypeAlias = dict[str, Any]
 SCENES = (0, 4)
 COUNT = 8
 
 _TEXT = """
-<ir_version: 9, opset_import: ["" : 17]>
 stack (float[1,3,3,8,8] img, float[1,3,4,4] lidar2img, float[4] ego, float[1,16] prev)
  => (float[1,4,2] plan, float[1,5,6] boxes, float[1,16] prev_out)
 <int64[2] by_camera = {{3, 192}}, int64[2] row = {{1, -1}},
@@ -49,7 +49,7 @@ def stack() -> ir.Model:
         sides = ",".join(map(str, shape))
         listed = ", ".join(f"{value:.6f}" for value in values)
         weights.append(f"float[{sides}] {name} = {{{listed}}}")
-    return ir.from_onnx_text(_TEXT.format(weights=", ".join(weights)))
+    return parsed(_TEXT.format(weights=", ".join(weights)))
 
 
 def frames() -> list[Frame]:

@@ -3,7 +3,6 @@ import math
 from pathlib import Path
 
 import numpy as np
-import onnx_ir as ir
 import pytest
 
 from me2e_compress import graph
@@ -14,9 +13,9 @@ from me2e_compress.runtime.plan_adapter import PlanAdapter
 from me2e_compress.runtime.session import Session
 from me2e_compress.workflows.compare import compare as compare_files
 from tests.command import write_frames
+from tests.nets import parsed
 
 SCALED = """
-<ir_version: 9, opset_import: ["" : 17]>
 scaled (float[1,2] x, float[1,2] s) => (float[1,2] y, float[1,2] s_out)
 <float gain = {%s}> {
     sum = Add(x, s)
@@ -26,7 +25,6 @@ scaled (float[1,2] x, float[1,2] s) => (float[1,2] y, float[1,2] s_out)
 """
 
 PLANNER = """
-<ir_version: 9, opset_import: ["" : 17]>
 planner (float[1,3,6,2] x, int64[1] command) => (float[1,3,6,2] modes, int64[1] c)
 <float step = {%s}> {
     modes = Add(x, step)
@@ -36,7 +34,7 @@ planner (float[1,3,6,2] x, int64[1] command) => (float[1,3,6,2] modes, int64[1] 
 
 
 def scaled(gain: float) -> Session:
-    return Session(ir.from_onnx_text(SCALED % gain))
+    return Session(parsed(SCALED % gain))
 
 
 def ones(index: int, starts: bool = False) -> Frame:
@@ -44,7 +42,7 @@ def ones(index: int, starts: bool = False) -> Frame:
 
 
 def planner(step: float, **adapter: object) -> Session:
-    model = ir.from_onnx_text(PLANNER % step)
+    model = parsed(PLANNER % step)
     if adapter:
         model.metadata_props["me2e.plan"] = json.dumps(adapter)
     return Session(model)
@@ -97,7 +95,7 @@ def test_the_plan_moves_in_metres(
 
 
 def test_modes_that_nothing_picks_from_name_the_file(tmp_path: Path) -> None:
-    model = ir.from_onnx_text(PLANNER % 0)
+    model = parsed(PLANNER % 0)
     model.metadata_props["me2e.plan"] = json.dumps({"output": "modes"})
     graph.save(model, tmp_path / "vad.onnx")
     write_frames(tmp_path / "frames", **modes().arrays)
@@ -166,7 +164,7 @@ def test_no_frames_is_an_error() -> None:
 
 
 def test_outputs_that_went_are_listed_and_a_lost_plan_has_a_reason() -> None:
-    model = ir.from_onnx_text(PLANNER % 0)
+    model = parsed(PLANNER % 0)
     model.graph.outputs.pop(0)
     adapter = {"output": "modes"}
 

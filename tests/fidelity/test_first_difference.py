@@ -17,7 +17,7 @@ from me2e_compress.fidelity.first_difference import (
 from me2e_compress.graph import provenance
 from me2e_compress.graph.provenance import Provenance
 from me2e_compress.runtime.session import Session
-from tests.nets import conv_attention, image_frames, turn_softmax
+from tests.nets import conv_attention, image_frames, parsed, turn_softmax
 
 Change = Callable[[ir.Model], object]
 
@@ -88,14 +88,13 @@ def test_borders_without_a_namesake_are_counted() -> None:
 def int8(model: ir.Model) -> None:
     """Round the second product to a grid of a quarter of its range."""
     text = """
-    <ir_version: 9, opset_import: ["" : 17]>
     q (float[1,64,8] mixed) => (float[1,64,8] coarse)
     <float step = {2.0}, int8 zero = {0}> {
         ["/head/Quantize"] grid = QuantizeLinear(mixed, step, zero)
         ["/head/Dequantize"] coarse = DequantizeLinear(grid, step, zero)
     }
     """
-    part = ir.from_onnx_text(text)
+    part = parsed(text)
     nodes = list(part.graph)
     constants = list(part.graph.initializers.values())
     part.graph.outputs.clear()
@@ -120,7 +119,6 @@ def test_a_graph_in_int8_is_judged_by_the_floor_of_outputs() -> None:
 
 
 OTHER = """
-<ir_version: 9, opset_import: ["" : 17]>
 other (float[1,3,8,8] image, float[1,8,64] memory) => (float[1,3,8,8] z)
 { z = Exp(image) }
 """
@@ -138,7 +136,7 @@ def test_graphs_that_cannot_be_compared_are_refused(
     text: str, error: type[Exception], words: str
 ) -> None:
     with pytest.raises(error, match=words):
-        difference(ir.from_onnx_text(text))
+        difference(parsed(text))
 
 
 def test_no_frame_is_refused() -> None:

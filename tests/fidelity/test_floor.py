@@ -1,7 +1,6 @@
 import math
 
 import numpy as np
-import onnx_ir as ir
 import pytest
 
 from me2e_compress.fidelity.compare import (
@@ -13,9 +12,9 @@ from me2e_compress.fidelity.compare import (
 from me2e_compress.fidelity.floor import Floor, Rounding, choice_between
 from me2e_compress.runtime.frames import Frame
 from me2e_compress.runtime.session import Session
+from tests.nets import parsed
 
 CHOOSER = """
-<ir_version: 9, opset_import: ["" : 17]>
 chooser (float[1,4] img)
     => (float[1,4] steady, float[1,1] chosen, int64[1,1] label, float[1,1] coarse)
 <int64[1] one = {1}, float[4] boxes = {1.0, -5.0, 9.0, -40.0},
@@ -67,7 +66,7 @@ def test_an_output_that_chooses_is_told_by_rounding_the_input() -> None:
     """
     values = np.array([[4.0, 4.001, -127.0, 0.0]], np.float32)
     frames = [Frame(0, True, {"img": values})]
-    model = ir.from_onnx_text(CHOOSER)
+    model = parsed(CHOOSER)
     reference = Reference.of(Session(model), frames)
 
     found = Rounding.of(reference, model, Floor())
@@ -119,6 +118,6 @@ def test_what_chooses_between_an_input_and_an_output_is_named(
     output: str, choice: str
 ) -> None:
     """A mask that another input makes is none of it."""
-    model = ir.from_onnx_text(CHOICES)
+    model = parsed(CHOICES)
 
     assert choice_between(model, "x", output) == choice

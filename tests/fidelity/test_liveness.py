@@ -15,9 +15,9 @@ from me2e_compress.runtime.frames import Frame
 from me2e_compress.runtime.session import Session
 from tests.command import Command, command
 from tests.frames import record
+from tests.nets import parsed
 
 DRIVER = """
-<ir_version: 9, opset_import: ["" : 17]>
 driver (float[1,2,3,16,16] img, float[1,4] can_bus, int64[1] command, float[1,2] prev)
     => (float[1,2] plan, float[1,2] prev_out, int64[1] label, float[1,2] still)
 <float[1,2] seen = {SEEN}, float[1] turns = {TURNS}, float[1] history = {HISTORY},
@@ -54,7 +54,7 @@ def driver(*, fed: bool = True, **changed: str) -> ir.Model:
     text = DRIVER
     for name, value in (HEALTHY | changed).items():
         text = text.replace(f"{{{name}}}", f"{{{value}}}")
-    model = ir.from_onnx_text(text)
+    model = parsed(text)
     model.metadata_props["me2e.recurrent"] = json.dumps(FED if fed else {"prev": None})
     return model
 

@@ -5,18 +5,16 @@ import math
 from pathlib import Path
 
 import numpy as np
-import onnx_ir as ir
 import pytest
 
 from me2e_compress.calibration.recording import write_recording
 from me2e_compress.errors import GraphError
-from me2e_compress.fidelity.compare import compare
-from me2e_compress.fidelity.matched_sets import SetFidelity, SetOutputs, SetTally
+from me2e_compress.fidelity.compare import SetFidelity, SetOutputs, SetTally, compare
 from me2e_compress.runtime.frames import Array, Frame
 from me2e_compress.runtime.plan_adapter import PlanAdapter
 from me2e_compress.runtime.session import Session
 from me2e_compress.workflows.compare import compare as compare_files
-from tests.nets import save_text
+from tests.nets import parsed, save_text
 
 Frames = dict[str, np.ndarray]
 
@@ -33,7 +31,6 @@ tracker (float[1,2,3] x, float[1,2] s) => (float[1,2,3] boxes, float[1,2] scores
 """
 
 SCORED = """
-<ir_version: 9, opset_import: ["" : 17]>
 chooser (float[1,2,6,2] x, float[1,2] s) => (float[1,2,6,2] plans, float[1,2] votes)
 <float bias = {%s}> {
     plans = Identity(x)
@@ -135,7 +132,7 @@ def test_compare_matches_what_both_graphs_have(
 
 
 def chooser(bias: float) -> Session:
-    model = ir.from_onnx_text(SCORED % bias)
+    model = parsed(SCORED % bias)
     model.metadata_props["me2e.plan"] = json.dumps(
         {"output": "plans", "scores": "votes"}
     )

@@ -14,7 +14,7 @@ from me2e_compress.graph.modules import ModuleMap
 from me2e_compress.manager import PassManager, recipe
 from me2e_compress.passes.base import Context
 from me2e_compress.passes.fold_constants import FoldConstants
-from me2e_compress.runtime.opening import REFUSALS
+from me2e_compress.runtime.session import REFUSALS
 from tests.passes import onnx_cases
 from tests.passes.onnx_cases import Case
 

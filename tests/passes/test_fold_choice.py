@@ -20,7 +20,7 @@ from me2e_compress.passes.fold_constants import (
     knowledge,
 )
 from me2e_compress.passes.fold_constants.knowledge import Knowledge
-from me2e_compress.runtime.opening import REFUSALS
+from me2e_compress.runtime.session import REFUSALS
 from tests.passes.small import NO_MODULES, apply, compute, ops, read
 
 HEAD = '<ir_version: 9, opset_import: ["" : 17]>\n'

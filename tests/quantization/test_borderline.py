@@ -27,7 +27,6 @@ HEAD = QuantScheme.of(("head",), MODULES)
 )
 def test_borderline_attention_is_reported(queries: int, keys: int, remark: str) -> None:
     text = (
-        '<ir_version: 9, opset_import: ["" : 17]>\n'
         f"a (float[{queries},32] q, float[32,{keys}] k, float[{keys},32] v)"
         f" => (float[{queries},32] y)"
         " { s = MatMul(q, k) p = Softmax(s) y = MatMul(p, v) }"

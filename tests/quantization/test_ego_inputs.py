@@ -6,8 +6,7 @@ import pytest
 from me2e_compress.quantization.plan import Decision
 from tests.nets import by_output, net, planned
 
-NET = """<ir_version: 9, opset_import: ["" : 17]>
-ego (float[3,18] can_bus, float[1,3,%d,32] image, float[3,32] memory,
+NET = """ego (float[3,18] can_bus, float[1,3,%d,32] image, float[3,32] memory,
      float[18,32] a, float[32,32] b, float[32,64] c, float[64,32] d,
      float[500,32] grid) => (float y, float z, float memory_out)
     <int64[2] rows = {3, 32}, int64[2] cells = {32, -1}> {

@@ -100,7 +100,8 @@ def test_learned_keys_of_several_heads_are_keys() -> None:
 
     attention = find_attention(model, constant_values(model))
 
-    assert [each.length for each in attention.values()] == [6, 6]
+    sizes = [max(each.queries or 0, each.keys or 0) for each in attention.values()]
+    assert sizes == [6, 6]
 
 
 def test_heads_written_out_one_by_one_are_found() -> None:
@@ -118,38 +119,20 @@ def test_heads_written_out_one_by_one_are_found() -> None:
     assert len(found(text)) == 1 + heads
 
 
-def test_an_open_batch_leaves_the_lengths_known() -> None:
-    text = """
-    batch (float[N,30,8] a, float[N,8,700] b, float[N,700,8] c) => (float[N,30,8] y) {
-        s = MatMul(a, b)
-        p = Softmax(s)
-        y = MatMul(p, c)
-    }
+@pytest.mark.parametrize(
+    ("batch", "keys", "mask"),
+    [("N", 700, ""), ("1", None, ""), ("N", 700, "mask = MatMul(m, n)")],
+)
+def test_an_open_batch_leaves_the_lengths_known(
+    batch: str, keys: int | None, mask: str
+) -> None:
+    """And a mask of another length is no product of keys."""
+    k = keys or "K"
+    added = f"t = Mul(s, s) {mask} u = Add(t, mask)" if mask else "u = Identity(s)"
+    text = f"""
+    batch (float[{batch},30,8] a, float[{batch},8,{k}] b, float[{batch},{k},8] c,
+           float[{batch},30,4] m, float[{batch},4,1] n) => (float[{batch},30,8] y) {{
+        s = MatMul(a, b) {added} p = Softmax(u) y = MatMul(p, c)
+    }}
     """
-    assert found(text) == {"s": Attention(30, 700), "y": Attention(30, 700)}
-
-
-def test_an_open_length_is_unknown() -> None:
-    text = """
-    batch (float[1,30,8] a, float[1,8,K] b, float[1,K,8] c) => (float[1,30,8] y) {
-        s = MatMul(a, b)
-        p = Softmax(s)
-        y = MatMul(p, c)
-    }
-    """
-    assert found(text) == {"s": Attention(30, None), "y": Attention(30, None)}
-
-
-def test_with_an_open_batch_a_mask_of_another_length_is_no_product_of_keys() -> None:
-    text = """
-    batch (float[N,30,8] a, float[N,8,700] b, float[N,700,8] c, float[N,30,4] m,
-           float[N,4,1] n) => (float[N,30,8] y) {
-        s = MatMul(a, b)
-        t = Mul(s, s)
-        mask = MatMul(m, n)
-        masked = Add(t, mask)
-        p = Softmax(masked)
-        y = MatMul(p, c)
-    }
-    """
-    assert found(text) == {"s": Attention(30, 700), "y": Attention(30, 700)}
+    assert found(text) == {"s": Attention(30, keys), "y": Attention(30, keys)}

@@ -8,7 +8,6 @@ from me2e_compress.workflows.int8_outcome import FloatWeight, float_weights
 from tests.nets import MODULES, net
 
 TEXT = """
-<ir_version: 9, opset_import: ["" : 17]>
 net (float[1,32,32] x, int64[4] ids, float[32,64] layer, float[64,64] table,
      float[1,256,64] recurrent, float[1,256,64] step, float[8] small)
     => (float[1,32,64] y, float[4,64] rows, float[32,1,1,64] state) {

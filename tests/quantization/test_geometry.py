@@ -7,7 +7,7 @@ import pytest
 
 from me2e_compress.quantization.plan import QuantPlan, make_plan
 from me2e_compress.quantization.rules import RULE_SETS
-from me2e_compress.quantization.rules.safe_rules import Geometry
+from me2e_compress.quantization.rules.rule_sets import Geometry
 from me2e_compress.quantization.scheme import QuantScheme
 from tests.nets import MODULES, by_output, net
 

@@ -13,12 +13,11 @@ from me2e_compress.graph import static_shape
 from me2e_compress.passes import Context
 from me2e_compress.passes.quantize_int8 import QuantizeInt8
 from me2e_compress.quantization.rules import Rule, RuleFacts, RuleSet
-from me2e_compress.quantization.rules.paper_rules import PaperRules
+from me2e_compress.quantization.rules.rule_sets import PaperRules
 from tests.installed import install
 from tests.nets import MODULES, by_output, net, planned
 
 PRODUCTS = (
-    '<ir_version: 9, opset_import: ["" : 17]>\n'
     "p (float[9,32] x, float[32,32] w, float[32,64] v)"
     " => (float[9,32] y, float[9,64] z) { y = MatMul(x, w) z = MatMul(x, v) }"
 )

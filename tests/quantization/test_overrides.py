@@ -27,10 +27,7 @@ def chosen(plan: QuantPlan) -> list[str]:
 
 @pytest.mark.parametrize(
     "matcher",
-    [
-        'nodes = "/head/?[KV]"',
-        'module = "head"\nop = "MatMul"\nnodes = "/head/[QA]*"',
-    ],
+    ['nodes = "/head/?[KV]"', 'module = "head"\nop = "MatMul"\nnodes = "/head/[QA]*"'],
 )
 def test_nodes_are_kept_in_float_by_glob_module_and_operator(matcher: str) -> None:
     plan = planned(f'[[override]]\n{matcher}\ndtype = "float"\nreason = "loses 3 dB"')

@@ -10,7 +10,7 @@ from me2e_compress.manager import recipe
 from me2e_compress.passes import PASSES, Context
 from me2e_compress.passes.quantize_int8 import QuantizeInt8
 from me2e_compress.quantization.rules import RULE_SETS, Rule, RuleFacts, RuleSet
-from me2e_compress.quantization.rules.paper_rules import PaperRules
+from me2e_compress.quantization.rules.rule_sets import PaperRules
 from tests.nets import MODULES, conv_attention
 
 

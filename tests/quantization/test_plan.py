@@ -4,9 +4,8 @@ import pytest
 
 from me2e_compress.errors import ModuleMapError, RecipeError
 from me2e_compress.quantization.plan import Decision, make_plan, tensors_of
-from me2e_compress.quantization.rules.base import RuleSet
-from me2e_compress.quantization.rules.paper_rules import PaperRules
-from me2e_compress.quantization.rules.safe_rules import SafeRules
+from me2e_compress.quantization.rules import RuleSet
+from me2e_compress.quantization.rules.rule_sets import PaperRules, SafeRules
 from me2e_compress.quantization.scheme import QuantScheme
 from tests.calls import calls
 from tests.nets import MODULES, PAPER, conv_attention, net
@@ -14,7 +13,6 @@ from tests.nets import MODULES, PAPER, conv_attention, net
 HEAD = QuantScheme.of(("head",), MODULES)
 
 ATTENTION = """
-<ir_version: 9, opset_import: ["" : 17]>
 attention (float[1,2,%(q)d,8] q, float[1,2,8,%(k)d] k, float[1,2,%(k)d,8] v,
            float[1,2,%(q)d,%(k)d] mask, bool[1,2,%(q)d,%(k)d] seen)
     => (float[1,2,%(q)d,8] y)
@@ -97,7 +95,6 @@ def test_a_product_without_softmax_is_no_layer() -> None:
 
 def test_sampling_weights_are_a_layer_not_an_attention() -> None:
     text = """
-    <ir_version: 9, opset_import: ["" : 17]>
     weights (float[1,900,8] x, float[8,4] w, float[4] b) => (float[1,900,4] y) {
         s = MatMul(x, w)
         t = Add(s, b)
@@ -110,7 +107,6 @@ def test_sampling_weights_are_a_layer_not_an_attention() -> None:
 
 
 LINEAR = """
-<ir_version: 9, opset_import: ["" : 17]>
 linear (float[%s] x, float[%s] w) => (float[%s] y) { y = MatMul(x, w) }
 """
 
@@ -147,7 +143,6 @@ def test_gemm_counts_rows_of_what_it_multiplies(
 ) -> None:
     shape = (6, 4) if flip else (4, 6)
     text = f"""
-    <ir_version: 9, opset_import: ["" : 17]>
     gemm (float[{rows},4] x, float[{shape[0]},{shape[1]}] w) => (float[{rows},6] y) {{
         y = Gemm<transB={flip}>(x, w)
     }}
@@ -159,7 +154,6 @@ def test_gemm_counts_rows_of_what_it_multiplies(
 
 def test_weights_that_are_turned_at_run_time_are_weights() -> None:
     text = """
-    <ir_version: 9, opset_import: ["" : 17]>
     turned (float[2,4] x, float[6,4] w) => (float[2,6] y) {
         t = Transpose(w)
         y = MatMul(x, t)
@@ -241,7 +235,6 @@ def test_planning_is_linear_on_diamonds_and_on_many_softmaxes(rules: RuleSet) ->
 
 
 OPEN = """
-<ir_version: 9, opset_import: ["" : 17]>
 batch (float[N,%s,8] a, float[N,8,%s] b, float[N,%s,8] c) => (float[N,%s,8] y) {
     s = MatMul(a, b)
     p = Softmax(s)

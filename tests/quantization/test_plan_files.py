@@ -15,7 +15,7 @@ from me2e_compress.quantization.plan import (
     save_plan,
     stamp_plan,
 )
-from me2e_compress.quantization.rules.paper_rules import PaperRules
+from me2e_compress.quantization.rules.rule_sets import PaperRules
 from me2e_compress.quantization.scheme import QuantScheme
 from tests.nets import MODULES, PAPER, conv_attention
 

@@ -22,7 +22,6 @@ from tests.nets import MODULES, PAPER, net
 FULL = QuantScheme.named("full", MODULES)
 
 BLOCK = """
-<ir_version: 9, opset_import: ["" : 17]>
 block (float[1,16,8,8] x, float[16,16,1,1] w1, float[16,16,1,1] w2,
        float[16,16,1,1] w3, float[16] b, float[16,16,1,1] w4) => (float[1,16,8,8] y) {
     ["/backbone/1"] a = Conv(x, w1)
@@ -127,7 +126,6 @@ def test_readers_of_a_tensor_are_a_group() -> None:
 
 
 CONCAT = """
-<ir_version: 9, opset_import: ["" : 17]>
 join (float[9,16] a, float[9,16] b, float[9,16] c, float[16,16] w, float[48,16] v,
       float[80,16] u) => (float[9,16] k, float[9,16] l, float[9,16] m, float[9,16] n) {
     ["/head/A"] k = MatMul(a, w)

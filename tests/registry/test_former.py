@@ -6,8 +6,7 @@ from typing import ClassVar
 
 import pytest
 
-from me2e_compress.calibration.observers import OBSERVERS
-from me2e_compress.calibration.observers.base import MaxMin
+from me2e_compress.calibration.observers import OBSERVERS, MaxMin
 from me2e_compress.errors import FORMER, RecipeError
 from me2e_compress.manager import recipe
 from me2e_compress.quantization.rules import RULE_SETS

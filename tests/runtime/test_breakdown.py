@@ -21,7 +21,6 @@ from me2e_compress.runtime.providers import CudaProvider
 from tests.nets import net
 
 TEXT = """
-<ir_version: 9, opset_import: ["" : 17]>
 m (float[1,4,8,8] image, float[4,4,3,3] k, float[4] b, float[64,8] w, float[8] c)
     => (float[1,4,8] y) <int64[3] flat = {1, 4, 64}> {
     ["/backbone/Conv"] a = Conv<kernel_shape=[3,3], pads=[1,1,1,1]>(image, k, b)

@@ -9,9 +9,9 @@ from me2e_compress import graph
 from me2e_compress.errors import GraphError
 from me2e_compress.runtime.runnable import endless
 from me2e_compress.runtime.session import Session
+from tests.nets import parsed
 
 LOOP = """
-<ir_version: 9, opset_import: ["" : 17]>
 g (float[4] x) => (float[4] y)
 <bool first = {{{first}}}, int64 most = {{{most}}}> {{
     ["loop"] y = Loop ({rounds}, first, x) <body = round (
@@ -27,7 +27,7 @@ MAY_END = "s = ReduceSum<keepdims = 0>(b) z = Sub(s, s) on = Less(z, s)"
 
 
 def loop(most: int, on: str = SAME, rounds: str = "most", first: int = 1) -> ir.Model:
-    return ir.from_onnx_text(LOOP.format(most=most, on=on, rounds=rounds, first=first))
+    return parsed(LOOP.format(most=most, on=on, rounds=rounds, first=first))
 
 
 @pytest.mark.parametrize(
@@ -65,5 +65,5 @@ INNER = """b = Loop (most, first, a) <body = inner (
 
 def test_loops_in_loops_count_together() -> None:
     text = LOOP.format(most=1 << 13, on=SAME, rounds="most", first=1)
-    assert endless(ir.from_onnx_text(text)) is None
-    assert endless(ir.from_onnx_text(text.replace("b = Relu(a)", INNER)))
+    assert endless(parsed(text)) is None
+    assert endless(parsed(text.replace("b = Relu(a)", INNER)))

@@ -9,12 +9,10 @@ from me2e_compress import graph
 from me2e_compress.errors import GraphError
 from me2e_compress.graph.files import external_tensors
 from me2e_compress.graph.rewrite import add_constant
-from me2e_compress.runtime.opening import open_graph
-from me2e_compress.runtime.session import Session
-from tests.nets import net
+from me2e_compress.runtime.session import Session, open_graph
+from tests.nets import net, parsed
 
 TEXT = """
-<ir_version: 9, opset_import: ["" : 17]>
 block (float[1,8,9,9] x, float[16,8,3,3] w, float[16] b, float[16] m, float[16] v,
        float[1296,40] l) => (float[1,40] y) <int64[2] flat = {1, -1}> {
     c = Conv<kernel_shape=[3,3], pads=[1,1,1,1]>(x, w)
@@ -86,7 +84,6 @@ def test_weights_in_a_file_are_mapped_not_copied(
 def test_weights_of_a_body_that_lie_in_a_file_are_found(tmp_path: Path) -> None:
     big = ", ".join("1" for _ in range(600))
     text = f"""
-    <ir_version: 9, opset_import: ["" : 17]>
     fork (bool turn, float[600] x) => (float[600] y) {{
         y = If (turn) <
             then_branch = twice () => (float[600] t) <float[600] o = {{{big}}}>
@@ -95,7 +92,7 @@ def test_weights_of_a_body_that_lie_in_a_file_are_found(tmp_path: Path) -> None:
         >
     }}
     """
-    graph.save(ir.from_onnx_text(text), tmp_path / "m.onnx", external=True)
+    graph.save(parsed(text), tmp_path / "m.onnx", external=True)
     mapped = ir.load(tmp_path / "m.onnx")  # graph.load would read them at once
     assert external_tensors(mapped)
     feeds = {"turn": np.array(True), "x": np.zeros(600, np.float32)}
@@ -133,7 +130,6 @@ def test_int8_activations_run_at_every_opset(opset: int) -> None:
 
 
 PADDED_POOL = """
-<ir_version: 9, opset_import: ["" : 17]>
 pool (float[1,1,2,2] x) => (float[1,1,2,2] y)
 <int64[8] around = {0, 0, 1, 1, 0, 0, 1, 1}> {
     q = Pad(x, around)
@@ -145,7 +141,7 @@ pool (float[1,1,2,2] x) => (float[1,1,2,2] y)
 def test_zeros_around_a_max_pool_stay_zeros() -> None:
     below = {"x": np.full((1, 1, 2, 2), -1, np.float32)}
 
-    found = Session(ir.from_onnx_text(PADDED_POOL), threads=1).run(below)["y"]
+    found = Session(parsed(PADDED_POOL), threads=1).run(below)["y"]
 
     assert not found.any()  # -1 where onnxruntime folds the Pad into the pool
 
@@ -160,8 +156,7 @@ def test_a_large_weight_that_nothing_reads_is_not_lent(model: ir.Model) -> None:
 def test_a_graph_that_is_refused_twice_makes_no_warning(
     tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    model = ir.from_onnx_text(
-        '<ir_version: 9, opset_import: ["" : 17]>\n'
+    model = parsed(
         "g (float[1,4] x, float[3,3] w) => (float[1,3] y) { y = MatMul(x, w) }"
     )
     (_, weight), product = model.graph.inputs, model.graph[0]

@@ -12,9 +12,9 @@ from me2e_compress.runtime.frames import Array, Frame
 from me2e_compress.runtime.runnable import unsupported
 from me2e_compress.runtime.session import Session, replay, run_once
 from me2e_compress.targets.weights import evaluate_constants
+from tests.nets import parsed
 
 COUNTER = """
-<ir_version: 9, opset_import: ["" : 17]>
 counter (float[1,2] x, float[1,2] memory) => (float[1,2] y, float[1,2] memory_out) {
     memory_out = Add(x, memory)
     y = Identity(memory_out)
@@ -31,7 +31,7 @@ plugin (float[4] x) => (float[4] y) {
 
 @pytest.fixture
 def counter() -> ir.Model:
-    return ir.from_onnx_text(COUNTER)
+    return parsed(COUNTER)
 
 
 def ones(index: int, starts: bool) -> Frame:
@@ -89,14 +89,14 @@ def test_metadata_that_pairs_nothing_is_refused(
 
 
 def test_state_of_open_shape_needs_a_first_value() -> None:
-    model = ir.from_onnx_text(COUNTER.replace("float[1,2]", "float[n,2]"))
+    model = parsed(COUNTER.replace("float[1,2]", "float[n,2]"))
 
     with pytest.raises(GraphError, match=r"memory .*must stand in the frame"):
         list(replay(Session(model), [ones(0, True)]))
 
 
 def test_an_unknown_operator_is_named(counter: ir.Model) -> None:
-    plugin = ir.from_onnx_text(PLUGIN)
+    plugin = parsed(PLUGIN)
 
     assert unsupported(counter) is None
     assert (
@@ -108,10 +108,7 @@ def test_an_unknown_operator_is_named(counter: ir.Model) -> None:
 
 
 def test_an_output_that_numpy_cannot_hold_is_an_error_of_the_graph() -> None:
-    model = ir.from_onnx_text(
-        '<ir_version: 9, opset_import: ["" : 17]>\n'
-        "m (float[2] x) => (bfloat16[2] y) { y = Cast<to=16>(x) }"
-    )
+    model = parsed("m (float[2] x) => (bfloat16[2] y) { y = Cast<to=16>(x) }")
 
     with pytest.raises(GraphError, match=r"onnxruntime failed: .* bfloat16"):
         Session(model).run({"x": np.ones(2, np.float32)})
@@ -138,11 +135,10 @@ def test_a_file_and_the_graph_in_memory_run_alike(
 
 def test_a_graph_with_weights_on_disk_runs(tmp_path: Path) -> None:
     text = """
-    <ir_version: 9, opset_import: ["" : 17]>
     add (float[2] x) => (float[2] y) <float[2] w = {1.0, 2.0}> { y = Add(x, w) }
     """
     path = tmp_path / "add.onnx"
-    graph.save(ir.from_onnx_text(text), path, external=True)
+    graph.save(parsed(text), path, external=True)
 
     y = run_once(graph.load(path), {"x": np.zeros(2, np.float32)})["y"]
 
@@ -150,8 +146,7 @@ def test_a_graph_with_weights_on_disk_runs(tmp_path: Path) -> None:
 
 
 def test_what_no_input_changes_is_constant_and_can_be_computed() -> None:
-    model = ir.from_onnx_text("""
-    <ir_version: 9, opset_import: ["" : 17]>
+    model = parsed("""
     layer (float[1,2] x) => (float[1,3] y, float[2] noise)
     <float[3,2] w = {1.0, 2.0, 3.0, 4.0, 5.0, 6.0}> {
         turned = Transpose(w)
@@ -170,11 +165,8 @@ def test_what_no_input_changes_is_constant_and_can_be_computed() -> None:
     )
 
 
-def test_the_graph_as_onnxruntime_rewrites_it_computes_the_same(
-    tmp_path: Path,
-) -> None:
-    model = ir.from_onnx_text(
-        '<ir_version: 9, opset_import: ["" : 17]>\n'
+def test_the_graph_as_onnxruntime_rewrites_it_computes_the_same(tmp_path: Path) -> None:
+    model = parsed(
         "m (float[2] x) => (float[2] y) { a = Identity(x) b = Identity(a) y = Relu(b) }"
     )
     path = tmp_path / "rewritten.onnx"

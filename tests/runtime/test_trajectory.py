@@ -6,8 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from me2e_compress.errors import EvaluationError, GraphError
-from me2e_compress.runtime.plan_adapter import PlanAdapter
-from me2e_compress.runtime.trajectory import Trajectory
+from me2e_compress.runtime.plan_adapter import PlanAdapter, Trajectory
 
 OUT = {"way": np.arange(8, dtype=np.float32).reshape(1, 4, 2)}
 
@@ -135,10 +134,7 @@ def test_none_lies_ahead() -> None:
         Trajectory.ahead(np.zeros((2, 2)), np.array([-0.5, 0.0]))
 
 
-@given(
-    st.lists(st.floats(-50, 50), min_size=2, max_size=12),
-    st.floats(0.05, 1.0),
-)
+@given(st.lists(st.floats(-50, 50), min_size=2, max_size=12), st.floats(0.05, 1.0))
 def test_between_waypoints_it_goes_straight(values: list[float], step: float) -> None:
     points = np.array(values[: len(values) // 2 * 2]).reshape(-1, 2)
     times = step * (1 + np.arange(len(points)))

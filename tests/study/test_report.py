@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from me2e_compress.errors import StudyError
 from me2e_compress.metrics.measure import Estimate, Measure
 from me2e_compress.registry.drafts import IN_JSON, IN_MARKDOWN, is_marked
-from me2e_compress.runtime.others_load import Load
+from me2e_compress.runtime.latency_trace import Load
 from me2e_compress.study import Condition, StudyResult
 from me2e_compress.study.cells import MINUS
 from me2e_compress.study.report.curves import curves

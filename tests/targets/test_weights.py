@@ -22,7 +22,6 @@ from tests.nets import MODULES, net
 from tests.profiles import scaled
 
 NET = """
-<ir_version: 9, opset_import: ["" : 17]>
 net (float[1,16,8,8] x, float[16,16,3,3] w, float[16,16] v, float[16,16] u)
     => (float[1,8,8,16] p, float[1,8,8,16] n) {
     c = Conv<kernel_shape=[3,3], pads=[1,1,1,1]>(x, w)

@@ -6,8 +6,7 @@ from typing import Any, ClassVar
 import numpy as np
 import pytest
 
-from me2e_compress.calibration.observers import OBSERVERS, Bounds, Observer
-from me2e_compress.calibration.observers.base import within
+from me2e_compress.calibration.observers import OBSERVERS, Bounds, Observer, within
 from me2e_compress.calibration.statistics import Statistics
 from me2e_compress.errors import VerificationError
 from me2e_compress.testing import check_observer

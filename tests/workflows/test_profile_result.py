@@ -5,8 +5,12 @@ from pathlib import Path
 
 import pytest
 
-from me2e_compress.runtime.latency_trace import LatencyTrace
-from me2e_compress.runtime.others_load import SHORTEST_S, Load, OthersLoad
+from me2e_compress.runtime.latency_trace import (
+    SHORTEST_S,
+    LatencyTrace,
+    Load,
+    OthersLoad,
+)
 from me2e_compress.workflows.profile_result import BEYOND_P99, ProfileResult
 
 ENOUGH = 100 * BEYOND_P99

@@ -5,8 +5,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from me2e_compress.calibration.observers import Observer
-from me2e_compress.calibration.observers.base import Bounds, within
+from me2e_compress.calibration.observers import Bounds, Observer, within
 from me2e_compress.calibration.statistics import Statistics
 
 

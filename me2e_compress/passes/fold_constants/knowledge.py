@@ -19,7 +19,7 @@ from me2e_compress.graph.nodes import DRAWS, NATIVE, attribute_values, unrenamed
 from me2e_compress.graph.rewrite import Array, has_subgraph, is_standard
 from me2e_compress.graph.shapes import refined
 from me2e_compress.graph.summary import value_bytes
-from me2e_compress.runtime.opening import REFUSALS
+from me2e_compress.runtime.session import REFUSALS
 
 SILENT = 4
 """onnxruntime's log level "fatal": the notes report what cannot be evaluated."""

@@ -4,21 +4,23 @@ To add one, write its class and its reader, then add it to this table.
 """
 
 import abc
+import csv
+import io
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import ClassVar
+from pathlib import Path
+from typing import Any, ClassVar
 
 import numpy as np
 import numpy.typing as npt
 
 from me2e_compress.display import prefixed
 from me2e_compress.errors import EnergyError
-from me2e_compress.registry import Registry
+from me2e_compress.registry import Registry, documents
 from me2e_compress.runtime.energy.energy_result import (
     FEWEST_WINDOWS,
     Absent,
-    CountedBy,
     EnergyResult,
     Reader,
     Window,
@@ -72,9 +74,9 @@ class EnergySchedule:
         """Return the models in order of their windows: A B B A spreads drift evenly."""
         there, back = list(models), list(reversed(models))
         return [
-            each
+            name
             for turn in range(self.windows)
-            for each in (back if turn % 2 else there)
+            for name in (back if turn % 2 else there)
         ]
 
 
@@ -101,7 +103,8 @@ class EnergyRecording:
 
     def measured(self, schedule: EnergySchedule) -> EnergyResult:
         """Return the energy of the model; EnergyError if the recording is too short."""
-        by = CountedBy(self.counter, self.device, self.scope, self.step_s())
+        step_s = float(np.median(np.diff(self.times_s)))
+        by = (self.counter, self.device, self.scope, step_s)
         return summarise(self.windows(schedule), by, self.idle_w(schedule))
 
     def windows(self, schedule: EnergySchedule) -> list[Window]:
@@ -110,24 +113,26 @@ class EnergyRecording:
         working = np.flatnonzero(np.diff(self.frames) > 0)
         if not len(working):
             raise EnergyError("energy recording: no frame is done in it")
-        first, last = int(working[0]), int(working[-1]) + 1
-        start = self.times_s[first] + schedule.warm_up_s
-        at = int(np.searchsorted(self.times_s, start))
-        # Cut windows until the rest is too short for another one.
-        found = list[Window]()
+        times, last = self.times_s, int(working[-1]) + 1
+        start = times[int(working[0])] + schedule.warm_up_s
+        at = int(np.searchsorted(times, start))
+        # Cut windows, long enough and of enough frames, until the rest is too short.
+        windows = list[Window]()
         while at < last:
-            end = self._end(at, last, schedule)
-            if end is None:
+            long = int(np.searchsorted(times, times[at] + schedule.window_s))
+            many = self.frames[at] + schedule.window_frames
+            end = max(long, int(np.searchsorted(self.frames, many)))
+            if end > last:
                 break
-            found.append(self._window(at, end))
+            windows.append(self._window(at, end))
             at = end
-        if len(found) < FEWEST_WINDOWS:
+        if len(windows) < FEWEST_WINDOWS:
             raise EnergyError(
-                f"energy recording: {len(found)} windows of {schedule.window_s:g} s and"
-                f" {schedule.window_frames} frames after a warm-up of"
+                f"energy recording: {len(windows)} windows of {schedule.window_s:g} s"
+                f" and {schedule.window_frames} frames after a warm-up of"
                 f" {schedule.warm_up_s:g} s: at least {FEWEST_WINDOWS} are needed"
             )
-        return found
+        return windows
 
     def idle_w(self, schedule: EnergySchedule) -> float | None:
         """Return the mean watts before and after the work; None if both are short."""
@@ -140,17 +145,6 @@ class EnergyRecording:
             if self.times_s[end] - self.times_s[begin] >= schedule.idle_s
         ]
         return sum(each.watts for each in idle) / len(idle) if idle else None
-
-    def step_s(self) -> float:
-        """Return the median seconds between rows."""
-        return float(np.median(np.diff(self.times_s)))
-
-    def _end(self, at: int, last: int, schedule: EnergySchedule) -> int | None:
-        """Return the last row of the window that begins at ``at``; None: too late."""
-        long = int(np.searchsorted(self.times_s, self.times_s[at] + schedule.window_s))
-        many = self.frames[at] + schedule.window_frames
-        end = max(long, int(np.searchsorted(self.frames, many)))
-        return end if end <= last else None
 
     def _window(self, begin: int, end: int) -> Window:
         joules = float(self.joules[end] - self.joules[begin])
@@ -195,10 +189,7 @@ ENERGY_COUNTERS: Registry[EnergyCounter] = Registry(
     "energy counter",
     "me2e_compress.energy_counters",
     EnergyError,
-    {
-        "nvml": f"{_HERE}.nvml:Nvml",
-        "recorded": f"{_HERE}.recorded_energy:Recorded",
-    },
+    {"nvml": f"{_HERE}.nvml:Nvml", "recorded": f"{_HERE}.energy_counter:Recorded"},
 )
 
 
@@ -212,9 +203,17 @@ def open_counter(text: str = AUTO) -> Reader | EnergyRecording | Absent:
         EnergyError: no such counter, an unknown option, or a file that is not usable.
     """
     if text.strip() != AUTO:
-        return _first([ENERGY_COUNTERS.parse(text)])
-    kinds = [ENERGY_COUNTERS.get(name) for name in ENERGY_COUNTERS.usable()]
-    return _first([ENERGY_COUNTERS.make(kind, {}) for kind in kinds if kind.automatic])
+        counters = [ENERGY_COUNTERS.parse(text)]
+    else:
+        kinds = map(ENERGY_COUNTERS.get, ENERGY_COUNTERS.usable())
+        counters = [ENERGY_COUNTERS.make(each, {}) for each in kinds if each.automatic]
+    answers = list[str]()
+    for counter in counters:
+        opened = counter.open()
+        if not isinstance(opened, Absent):
+            return opened
+        answers.append(prefixed(counter.name, opened.reason))
+    return Absent(f"no energy counter answers ({'; '.join(answers)})")
 
 
 def check_counter(text: str) -> None:
@@ -230,11 +229,108 @@ def check_counter(text: str) -> None:
         found.close()
 
 
-def _first(counters: Sequence[EnergyCounter]) -> Reader | EnergyRecording | Absent:
-    answers = list[str]()
-    for each in counters:
-        found = each.open()
-        if not isinstance(found, Absent):
-            return found
-        answers.append(prefixed(each.name, found.reason))
-    return Absent(f"no energy counter answers ({'; '.join(answers)})")
+def integrated(times_s: Floats, watts: Floats) -> Floats:
+    """Return the joules since the first time, at each time, by the trapezoidal rule."""
+    steps = np.diff(times_s) * (watts[1:] + watts[:-1]) / 2
+    return np.concatenate([[0.0], np.cumsum(steps)])
+
+
+_COLUMNS = "time_s, frames, and joules or watts"
+
+
+@dataclass(frozen=True)
+class Recorded(EnergyCounter):
+    """A file of the energy or the power that was recorded on the target device.
+
+    CSV with a header, or JSON with an array for each column: ``time_s``, ``frames``
+    (inferences done so far), and ``joules`` (so far) or ``watts`` (at that time). JSON
+    may add the texts ``device``, ``scope`` and ``counter``.
+
+    Attributes:
+        file: the recording.
+    """
+
+    name: ClassVar[str] = "recorded"
+    automatic: ClassVar[bool] = False
+    file: Path
+
+    def open(self) -> EnergyRecording:
+        """Read the file and check it."""
+        try:
+            columns, words = _read(self.file)
+            return _recording(columns, words, self.file.name)
+        except OSError as error:
+            raise EnergyError(f"{self.file}: {error.strerror}") from error
+        except (documents.MalformedError, ValueError, TypeError, csv.Error) as error:
+            raise EnergyError(
+                f"{self.file}: not an energy recording: {error}"
+            ) from error
+
+
+def _read(path: Path) -> tuple[Mapping[str, Sequence[Any]], Mapping[str, str]]:
+    """Return the columns, and the texts that describe the device."""
+    content = documents.content(path)
+    # JSON: arrays are columns, texts describe the device.
+    if path.suffix.lower() == ".json":
+        record = documents.from_json(content)
+        if not isinstance(record, dict):
+            raise ValueError(f"an object with {_COLUMNS} is expected")
+        columns = {k: v for k, v in record.items() if isinstance(v, list)}
+        return columns, {k: v for k, v in record.items() if isinstance(v, str)}
+    # CSV: every row must have as many values as the header.
+    rows = csv.reader(io.StringIO(content.decode("utf-8-sig")))
+    header = [name.strip() for name in next(rows, [])]
+    lines = [line for line in rows if line]
+    for number, line in enumerate(lines, 2):
+        if len(line) != len(header):
+            raise ValueError(
+                f"line {number} has {len(line)} values, the header {len(header)}"
+            )
+    values = zip(*lines, strict=True) if lines else [()] * len(header)
+    return dict(zip(header, values, strict=True)), {}
+
+
+def _recording(
+    columns: Mapping[str, Sequence[Any]], words: Mapping[str, str], name: str
+) -> EnergyRecording:
+    times, frames = _numbers(columns, "time_s"), _numbers(columns, "frames")
+    if np.any(np.diff(times) <= 0):
+        raise ValueError(f"time_s does not ascend at row {_row(np.diff(times) <= 0)}")
+    if np.any(np.diff(frames) < 0):
+        raise ValueError(f"frames go back at row {_row(np.diff(frames) < 0)}")
+    # Check the columns against each other.
+    counts = "joules" in columns
+    found = _numbers(columns, "joules" if counts else "watts")
+    if len({len(times), len(frames), len(found)}) > 1 or len(times) < 2:
+        raise ValueError("the columns are not of one length of 2 rows or more")
+    if counts and np.any(np.diff(found) < 0):
+        raise ValueError(f"joules go back at row {_row(np.diff(found) < 0)}")
+    if not counts and np.any(found < 0):
+        raise ValueError(f"watts are negative at row {_row(found < 0)}")
+    # Power is integrated to joules.
+    joules = found if counts else integrated(times, found)
+    counter = words.get(
+        "counter", "recorded" if counts else "recorded-power-integrated"
+    )
+    return EnergyRecording(
+        times,
+        joules,
+        frames,
+        words.get("device", name),
+        words.get("scope", "as recorded"),
+        counter,
+    )
+
+
+def _numbers(columns: Mapping[str, Sequence[Any]], name: str) -> Floats:
+    if name not in columns:
+        there = ", ".join(columns) or "none"
+        raise ValueError(f"no column {name}; there are {there}, wanted: {_COLUMNS}")
+    found = np.array([float(each) for each in columns[name]])
+    if not np.all(np.isfinite(found)):
+        raise ValueError(f"{name} is not finite at row {_row(~np.isfinite(found))}")
+    return found
+
+
+def _row(wrong: Any) -> int:
+    return int(np.argmax(wrong)) + 1

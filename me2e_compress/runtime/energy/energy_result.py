@@ -119,17 +119,8 @@ class Window:
         return self.joules / self.taken_s
 
 
-@dataclass(frozen=True)
-class EnergyEstimate:
-    """Mean joules per frame over the windows, and the 95 % interval."""
-
-    j_per_frame: float
-    low: float
-    high: float
-
-
-def estimate(windows: Sequence[Window], step_s: float) -> EnergyEstimate:
-    """Return joules per frame over windows of one model, with the 95 % interval.
+def estimate(windows: Sequence[Window], step_s: float) -> tuple[float, float, float]:
+    """Return joules per frame over windows of one model, and the 95 % interval.
 
     A straight line over time (a parabola from :data:`ENOUGH_FOR_A_BEND` windows) is
     fitted to the windows, because warm-up and drift are no noise; Student's t applies
@@ -138,13 +129,8 @@ def estimate(windows: Sequence[Window], step_s: float) -> EnergyEstimate:
     together than the step (``step_s``) alone allows, its error replaces the spread: a
     window of whole steps and ``r`` more seconds holds one step more or less by chance,
     a standard deviation of power x sqrt(r (step - r)), for the worst r that the step,
-    which is `UNSURE`, leaves open.
+    which is `UNSURE`, leaves open. At least :data:`FEWEST_WINDOWS` are needed.
     """
-    if len(windows) < FEWEST_WINDOWS:
-        raise EnergyError(
-            f"energy: {len(windows)} windows: at least {FEWEST_WINDOWS} are needed for"
-            " an interval"
-        )
     frames = np.array([each.frames for each in windows], float)
     taken = np.array([each.taken_s for each in windows])
     watts = np.array([each.watts for each in windows])
@@ -161,7 +147,7 @@ def estimate(windows: Sequence[Window], step_s: float) -> EnergyEstimate:
     variance = max(float(left @ left) / free, float(np.mean(ends**2)))
     half = student_t(free) * math.sqrt(variance / len(windows))
     mean = float(spent.mean())
-    return EnergyEstimate(mean, max(0.0, mean - half), mean + half)
+    return mean, max(0.0, mean - half), mean + half
 
 
 def student_t(free: int) -> float:
@@ -256,27 +242,21 @@ class EnergyResult:
             f" ({self.low:.4g} to {self.high:.4g}), {self.counter} of {self.device}"
         )
 
-    @property
-    def power_apart(self) -> float | None:
-        """The relative difference of integrated power from the counter."""
-        if self.j_per_frame is None or self.power_j_per_frame is None:
-            return None
-        return self.power_j_per_frame / self.j_per_frame - 1
-
     def alerts(self) -> tuple[str, ...]:
         """Return reasons to doubt the figure."""
-        slowed = ", ".join(self.throttled)
-        throttled = (f"energy: the device slowed itself down: {slowed}",)
+        found = list[str]()
+        if self.throttled:
+            slowed = ", ".join(self.throttled)
+            found.append(f"energy: the device slowed itself down: {slowed}")
         # A counter that disagrees with integrated power is suspect.
-        apart = self.power_apart
-        found = throttled if slowed else ()
-        if apart is None or abs(apart) <= FURTHEST_APART:
-            return found
-        line = (
-            f"energy: integrated power says {self.power_j_per_frame:.4g} J a frame,"
-            f" {apart:+.0%} from the counter: one of them is wrong"
-        )
-        return (*found, line)
+        if self.j_per_frame is not None and self.power_j_per_frame is not None:
+            apart = self.power_j_per_frame / self.j_per_frame - 1
+            if abs(apart) > FURTHEST_APART:
+                found.append(
+                    f"energy: integrated power says {self.power_j_per_frame:.4g} J a"
+                    f" frame, {apart:+.0%} from the counter: one of them is wrong"
+                )
+        return tuple(found)
 
     def tables(self) -> tuple[Table, ...]:
         """Return the table of figures; empty if nothing was measured."""
@@ -289,11 +269,7 @@ class EnergyResult:
             rows.append(("net of idle", f"{self.net_j_per_frame:.4g}", "", ""))
         if self.power_j_per_frame is not None:
             rows.append(("by power", f"{self.power_j_per_frame:.4g}", "", ""))
-        columns = ("energy", "J/frame", "low 95 %", "high 95 %")
-        title = f"{self.counter} of {self.device} ({self.scope})"
-        return (table(title, columns, rows, "\n".join(self._notes())),)
-
-    def _notes(self) -> list[str]:
+        # Below the figures: how they were measured.
         long = f" of {self.window_s:.1f} s" if self.window_s else ""
         notes = [f"{self.frames} frames in {self.windows} windows{long}"]
         if self.idle_w is not None:
@@ -304,7 +280,9 @@ class EnergyResult:
             f"{name} {low:.0f} to {high:.0f} MHz"
             for name, (low, high) in self.clocks.items()
         ]
-        return notes
+        columns = ("energy", "J/frame", "low 95 %", "high 95 %")
+        title = f"{self.counter} of {self.device} ({self.scope})"
+        return (table(title, columns, rows, "\n".join(notes)),)
 
     def save(self, path: Path) -> None:
         """Write the result atomically."""
@@ -319,19 +297,9 @@ class EnergyResult:
             return TypeAdapter(cls).validate_python(record)
 
 
-@dataclass(frozen=True)
-class CountedBy:
-    """Description of the counter, copied into the result."""
-
-    counter: str
-    device: str
-    scope: str
-    step_s: float
-
-
 def summarise(
     windows: Sequence[Window],
-    by: CountedBy,
+    by: tuple[str, str, str, float],
     idle_w: float | None,
     *,
     states: Sequence[DeviceState] = (),
@@ -339,43 +307,38 @@ def summarise(
 ) -> EnergyResult:
     """Return the energy result of one model.
 
+    ``by`` is the counter, the device, its scope, and the seconds between two updates;
     ``idle_w`` is None where the idle device was not measured; ``states`` are those
     before and after each window.
     """
-    found = estimate(windows, by.step_s)
+    counter, device, scope, step_s = by
+    j_per_frame, low, high = estimate(windows, step_s)
     frames = sum(each.frames for each in windows)
     frame_s = sum(each.taken_s for each in windows) / frames
     # Not every device reports temperatures or clocks.
     warmth = [e.temperature_c for e in states if e.temperature_c is not None]
     throttled = dict.fromkeys(reason for each in states for reason in each.throttled)
+    clocks = dict[str, list[float]]()
+    for state in states:
+        for name, mhz in state.clocks_mhz.items():
+            clocks.setdefault(name, []).append(mhz)
     return EnergyResult(
         joules=sum(each.joules for each in windows),
         frames=frames,
-        j_per_frame=found.j_per_frame,
-        net_j_per_frame=None
-        if idle_w is None
-        else found.j_per_frame - idle_w * frame_s,
-        low=found.low,
-        high=found.high,
+        j_per_frame=j_per_frame,
+        net_j_per_frame=None if idle_w is None else j_per_frame - idle_w * frame_s,
+        low=low,
+        high=high,
         windows=len(windows),
         window_s=float(np.mean([each.taken_s for each in windows])),
-        counter=by.counter,
-        counter_step_s=by.step_s,
+        counter=counter,
+        counter_step_s=step_s,
         idle_w=idle_w,
         temperature=(warmth[0], warmth[-1]) if warmth else None,
-        clocks=_clocks(states),
+        clocks={name: (min(each), max(each)) for name, each in clocks.items()},
         throttled=tuple(throttled),
-        device=by.device,
-        scope=by.scope,
+        device=device,
+        scope=scope,
         window_j_per_frame=tuple(each.joules / each.frames for each in windows),
         power_j_per_frame=power_j_per_frame,
     )
-
-
-def _clocks(states: Sequence[DeviceState]) -> dict[str, tuple[float, float]]:
-    """Return the lowest and highest MHz of each clock."""
-    seen: dict[str, list[float]] = {}
-    for state in states:
-        for name, mhz in state.clocks_mhz.items():
-            seen.setdefault(name, []).append(mhz)
-    return {name: (min(each), max(each)) for name, each in seen.items()}

@@ -1,32 +1,40 @@
 """Measure the energy of models in alternating windows, with idle before and after."""
 
 import contextlib
+import dataclasses
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
-from dataclasses import dataclass
-from itertools import pairwise
+from functools import partial
+from itertools import chain, pairwise, repeat
+from pathlib import Path
 from statistics import fmean, median
 from threading import Event, Thread
 
 import numpy as np
-import numpy.typing as npt
 
 from me2e_compress.errors import EnergyError
-from me2e_compress.runtime.energy.energy_counter import EnergySchedule
+from me2e_compress.graph import sha256_of
+from me2e_compress.runtime.energy.energy_counter import (
+    EnergyRecording,
+    EnergySchedule,
+    integrated,
+    open_counter,
+)
 from me2e_compress.runtime.energy.energy_result import (
-    CountedBy,
+    Absent,
     DeviceState,
     EnergyResult,
     Reader,
     Window,
     summarise,
 )
+from me2e_compress.runtime.frames import Frame, Frames
+from me2e_compress.runtime.providers import CPU, Provider
+from me2e_compress.runtime.session import Session, replay
 
 # Sample the power in the background and integrate it.
 
-
-Floats = npt.NDArray[np.float64]
 
 SAMPLED_S = 0.02
 """Seconds between samples of the power: five within a usual step of 0.1 s."""
@@ -65,12 +73,6 @@ class PowerSamples:
         )
 
 
-def integrated(times_s: Floats, watts: Floats) -> Floats:
-    """Return the joules since the first time, at each time, by the trapezoidal rule."""
-    steps = np.diff(times_s) * (watts[1:] + watts[:-1]) / 2
-    return np.concatenate([[0.0], np.cumsum(steps)])
-
-
 @contextlib.contextmanager
 def in_background(period_s: float, call: Callable[[], None]) -> Iterator[None]:
     """Call a function periodically in a thread while the context is open.
@@ -105,17 +107,6 @@ Every = Callable[[float, Callable[[], None]], AbstractContextManager[None]]
 """Calls a function every so many seconds while the context is open."""
 
 
-@dataclass(frozen=True)
-class _Span:
-    """A stretch between two readings; joules are None where power is integrated."""
-
-    begin_s: float
-    end_s: float
-    frames: int
-    joules: float | None
-    states: tuple[DeviceState, ...] = ()
-
-
 class EnergyMeter:
     """Measure several models side by side with one counter.
 
@@ -144,58 +135,77 @@ class EnergyMeter:
 
     def measure(self, work: Mapping[str, Work]) -> dict[str, EnergyResult]:
         """Measure models in turn; ``work`` maps each name to what runs one frame."""
-        spans: dict[str, list[_Span]] = {name: [] for name in work}
-        turns = self._schedule.turns(list(work))
+        windows: dict[str, list[Window]] = {name: [] for name in work}
+        states: dict[str, list[DeviceState]] = {name: [] for name in work}
+        reader, schedule = self._reader, self._schedule
+        turns = schedule.turns(list(work))
+        rest = partial(self._sleep, schedule.idle_s)
         with (
             self._every(SAMPLED_S, self._power.add)
-            if self._reader.tells_power
+            if reader.tells_power
             else contextlib.nullcontext()
         ):
             # Idle and warm up before the windows.
-            idle = [self._idle()]
+            idle = [self._window(0, rest)]
             frame_s = self._warm_up(work)
             # Alternate the models, so that drift falls on all alike.
             for done, name in enumerate(turns):
                 self._on_window(done, len(turns), name)
-                spans[name].append(self._work(work[name], frame_s[name]))
+                frames = schedule.frames(frame_s[name])
+                windows[name].append(self._work(work[name], frames, states[name]))
             self._on_window(len(turns), len(turns), turns[-1])
-            self._sleep(self._schedule.lead_in_s)
-            idle.append(self._idle())
+            self._sleep(schedule.lead_in_s)
+            idle.append(self._window(0, rest))
             self._sleep(2 * SAMPLED_S)  # the last sample of power lies behind it
         # Idle power is the mean of before and after.
-        idle_w = fmean(self._window(each).watts for each in idle)
-        return {name: self._result(spans[name], idle_w) for name in work}
+        idle_w = fmean(self._integrated(each).watts for each in idle)
+        return {
+            name: summarise(
+                [self._integrated(each) for each in windows[name]],
+                (reader.counter, reader.device, reader.scope, reader.step_s),
+                idle_w,
+                states=states[name],
+                power_j_per_frame=self._by_power(windows[name]),
+            )
+            for name in work
+        }
 
-    def _result(self, spans: Sequence[_Span], idle_w: float) -> EnergyResult:
-        reader = self._reader
-        return summarise(
-            [self._window(each) for each in spans],
-            CountedBy(reader.counter, reader.device, reader.scope, reader.step_s),
-            idle_w,
-            states=[state for each in spans for state in each.states],
-            power_j_per_frame=self._by_power(spans),
-        )
+    def _integrated(self, window: Window) -> Window:
+        """Return a window with its integrated power where no joules are counted."""
+        if self._reader.counts:
+            return window
+        joules = self._power.joules(window.begin_s, window.end_s)
+        return dataclasses.replace(window, joules=joules)
 
-    def _by_power(self, spans: Sequence[_Span]) -> float | None:
+    def _by_power(self, windows: Sequence[Window]) -> float | None:
         """Return joules per frame by integrated power; None with too few samples."""
-        ends = [(each.begin_s, each.end_s) for each in spans]
+        ends = [(each.begin_s, each.end_s) for each in windows]
         fewest = min(self._power.count(*each) for each in ends)
         if not self._reader.counts or fewest < FEWEST_SAMPLES:
             return None
         joules = sum(self._power.joules(*each) for each in ends)
-        return joules / sum(each.frames for each in spans)
+        return joules / sum(each.frames for each in windows)
 
-    def _window(self, span: _Span) -> Window:
-        joules = span.joules
-        if joules is None:
-            joules = self._power.joules(span.begin_s, span.end_s)
-        return Window(span.begin_s, span.end_s, span.frames, joules)
+    def _window(self, frames: int, wait: Callable[[], object]) -> Window:
+        """Measure what happens meanwhile; its joules are 0 where power is integrated.
 
-    def _idle(self) -> _Span:
-        begin, before = self._read()
-        self._sleep(self._schedule.idle_s)
-        end, after = self._read()
-        return _Span(begin, end, 0, self._moved(before, after, end - begin))
+        Raises:
+            EnergyError: the counter stands still, or goes back.
+        """
+        reader = self._reader
+        before = reader.joules() if reader.counts else 0.0
+        begin = self._clock()
+        wait()
+        after = reader.joules() if reader.counts else 0.0
+        end = self._clock()
+        if reader.counts and after <= before:
+            what = f"stands still at {after:g} J for {end - begin:.1f} s"
+            if after < before:
+                what = f"went back from {before:g} to {after:g} J"
+            raise EnergyError(
+                f"energy counter {reader.counter} of {reader.device} {what}"
+            )
+        return Window(begin, end, frames, after - before)
 
     def _warm_up(self, work: Mapping[str, Work]) -> dict[str, float]:
         """Warm up all models in turn; return the seconds of a frame of each."""
@@ -213,36 +223,99 @@ class EnergyMeter:
             times.append(self._clock())
         return [after - before for before, after in pairwise(times)]
 
-    def _work(self, run: Work, frame_s: float) -> _Span:
-        """Run one window at a random phase of the counter."""
-        frames = self._schedule.frames(frame_s)
+    def _work(self, run: Work, frames: int, states: list[DeviceState]) -> Window:
+        """Run one window at a random phase of the counter; add the states around it."""
         # The lead-in follows the wait: caches must hold this model.
         self._sleep(float(self._random.uniform(0, self._reader.step_s)))
-        first = self._reader.state()
+        states.append(self._reader.state())
         self._lead_in(run)
-        begin, before = self._read()
-        for _ in range(frames):
-            run()
-        end, after = self._read()
-        joules = self._moved(before, after, end - begin)
-        states = (first, self._reader.state())
-        return _Span(begin, end, frames, joules, states)
 
-    def _read(self) -> tuple[float, float]:
-        """Return the time and the joules; 0 joules where power is integrated."""
-        joules = self._reader.joules() if self._reader.counts else 0.0
-        return self._clock(), joules
+        def work() -> None:
+            for _ in range(frames):
+                run()
 
-    def _moved(self, before: float, after: float, taken_s: float) -> float | None:
-        if not self._reader.counts:
-            return None
-        if after < before:
-            raise EnergyError(self._says(f"went back from {before:g} to {after:g} J"))
-        if after == before:
+        window = self._window(frames, work)
+        states.append(self._reader.state())
+        return window
+
+
+# Measure the energy of ONNX files on this machine, in turn.
+
+
+MOST_BYTES = 500_000_000
+"""Bytes of frames held in memory: reading from disk takes energy too."""
+
+
+def measure_energy(
+    models: Mapping[str, Path],
+    frames: Frames,
+    counter: str = "auto",
+    schedule: EnergySchedule | None = None,
+    *,
+    threads: int = 1,
+    provider: Provider = CPU,
+    said: Mapping[str, str] | None = None,
+    on_window: Callable[[int, int, str], None] = lambda done, total, name: None,
+) -> dict[str, EnergyResult]:
+    """Measure the energy of models, one frame at a time, in alternating windows.
+
+    Recurrent state is fed forward and reset where scenes begin. The first frames, as
+    many as fit into 500 MB, are repeated as often as needed. Nothing else may run on
+    the device. ``models`` has ONNX files by name; ``counter``
+    is described at ``open_counter``; ``said`` is metadata that overrides the models'
+    own; ``on_window`` is called with windows done, windows in all, and the model's
+    name.
+
+    Returns joules per frame by model; without a counter, the reason why not, at once. A
+    counter that fails, or a recording given for several models, is an EnergyError.
+    """
+    digests = {name: sha256_of(path) for name, path in models.items()}
+    # Measure, take the recording, or say why there is no counter.
+    opened = open_counter(counter)
+    if isinstance(opened, Absent):
+        found = dict.fromkeys(models, EnergyResult(reason=opened.reason))
+    elif isinstance(opened, EnergyRecording):
+        if len(models) != 1:
             raise EnergyError(
-                self._says(f"stands still at {after:g} J for {taken_s:.1f} s")
+                f"energy {counter}: a recording is of one model, and there are"
+                f" {len(models)}: {', '.join(models)}"
             )
-        return after - before
+        found = dict.fromkeys(models, opened.measured(schedule or EnergySchedule()))
+    else:
+        with contextlib.closing(opened):
+            work = _work_of(models, frames, threads, provider, said)
+            meter = EnergyMeter(opened, schedule, on_window=on_window)
+            found = meter.measure(work)
+    # Each result carries the digest of its model's files.
+    return {
+        name: dataclasses.replace(result, model_sha256=digests[name])
+        for name, result in found.items()
+    }
 
-    def _says(self, what: str) -> str:
-        return f"energy counter {self._reader.counter} of {self._reader.device} {what}"
+
+def _work_of(
+    models: Mapping[str, Path],
+    frames: Frames,
+    threads: int,
+    provider: Provider,
+    said: Mapping[str, str] | None,
+) -> dict[str, Work]:
+    """Open each model, to replay endlessly the first frames that fit into memory."""
+    kept, size = list[Frame](), 0
+    for frame in frames:
+        size += sum(array.nbytes for array in frame.arrays.values())
+        if kept and size > MOST_BYTES:
+            break
+        kept.append(frame)
+    if not kept:
+        raise EnergyError("energy: there is no frame to run")
+    sessions = {
+        name: Session(
+            path, threads=threads, int8_kernels=True, provider=provider, said=said
+        )
+        for name, path in models.items()
+    }
+    return {
+        name: replay(session, chain.from_iterable(repeat(kept))).__next__
+        for name, session in sessions.items()
+    }

@@ -118,20 +118,18 @@ class NvmlReader(Reader):
         return found
 
 
-def _answer(question: Callable[[Any], T], handle: Any) -> T | str:
+def _answer(question: Callable[..., T], *arguments: Any) -> T | str:
     """Return NVML's answer, or its error as text."""
     try:
-        return question(handle)
+        return question(*arguments)
     except pynvml.NVMLError as error:
         return str(error)
 
 
 def _number(question: Callable[..., int], *arguments: Any) -> float | None:
     """Return NVML's answer as a number; None on an error."""
-    try:
-        return float(question(*arguments))
-    except pynvml.NVMLError:
-        return None
+    answer = _answer(question, *arguments)
+    return None if isinstance(answer, str) else float(answer)
 
 
 def _instant_power(handle: Any) -> int:

@@ -1,4 +1,4 @@
-"""Convert a graph quantized for TensorRT, by this package or another."""
+"""Convert a graph quantized for TensorRT, or say that onnxruntime runs it slowly."""
 
 import dataclasses
 from collections.abc import Collection
@@ -11,12 +11,28 @@ from me2e_compress import graph
 from me2e_compress.calibration.observers import QUANT_MAX
 from me2e_compress.calibration.ranges import Ranges
 from me2e_compress.errors import PreconditionError
-from me2e_compress.graph import producer_of, rewrite
+from me2e_compress.graph import (
+    CONVOLUTIONS,
+    WEIGHTED,
+    array_of,
+    bias_of,
+    input_at,
+    is_standard,
+    nodes_of,
+    producer_of,
+    rewrite,
+)
 from me2e_compress.graph.nodes import LAYOUT_OPERATORS, maker
-from me2e_compress.targets.onnxruntime.kernels import LAYERS, has_kernel
+from me2e_compress.runtime.int8_values import stored_bias
+from me2e_compress.runtime.providers import CPU, Provider
 from me2e_compress.targets.onnxruntime.lower import Draft, lower
-from me2e_compress.targets.onnxruntime.region import find_region
-from me2e_compress.targets.quantized import DEQUANTIZE, QUANTIZE
+from me2e_compress.targets.onnxruntime.region import (
+    LAYERS,
+    find_region,
+    is_clip_at_zero,
+    objection,
+)
+from me2e_compress.targets.quantized import DEQUANTIZE, QUANTIZE, is_dequantized
 from me2e_compress.targets.weights import QuantizedWeight
 
 Floats = npt.NDArray[np.float32]
@@ -89,7 +105,15 @@ def _draft_of_qdq(model: ir.Model) -> Draft:
             "the graph has no quantized activation; lower a graph with int8 pairs, or"
             " quantize a float one for this target"
         )
-    reach = {value: _reach(node) for node, value in pairs.items()}
+    reach = dict[ir.Value, float]()
+    for node, value in pairs.items():
+        step = _step_of(node)
+        if step.size != 1:
+            raise PreconditionError(
+                f"{node.name} has {step.size} scales: onnxruntime's kernels take one"
+                " for an activation"
+            )
+        reach[value] = float(step.reshape(())) * QUANT_MAX
     # Read biases and weights before the pairs go.
     layers = [
         node
@@ -97,12 +121,12 @@ def _draft_of_qdq(model: ir.Model) -> Draft:
         if node.op_type in LAYERS and producer_of(node.inputs[0]) in pairs
     ]
     for node in layers:
-        bias = _bias_of(node)
+        bias = stored_bias(producer_of(graph.bias_of(node)))
         if bias is not None:
             name = f"{node.inputs[2].name}_stored" if node.inputs[2] else ""
             node.replace_input_with(2, rewrite.add_constant(copy.graph, bias, name))
     # Only layers with a kernel become int8.
-    weights = {node: _weight_of(node) for node in layers if has_kernel(node)}
+    weights = {node: _weight_of(node) for node in layers if objection(node) is None}
     # Remove the pairs of activations.
     for node, value in pairs.items():
         if rewrite.can_replace(node.outputs[0], value):
@@ -127,17 +151,6 @@ def _activation(node: ir.Node) -> ir.Value | None:
         return None
     value = quantize.inputs[0]
     return value if graph.array_of(value) is None else None
-
-
-def _reach(dequantize: ir.Node) -> float:
-    """Return the largest magnitude on a pair's grid."""
-    step = _step_of(dequantize)
-    if step.size != 1:
-        raise PreconditionError(
-            f"{dequantize.name} has {step.size} scales: onnxruntime's kernels take one"
-            " for an activation"
-        )
-    return float(step.reshape(())) * QUANT_MAX
 
 
 def _step_of(node: ir.Node) -> Floats:
@@ -198,17 +211,6 @@ def _weight_of(layer: ir.Node) -> QuantizedWeight | None:
     return QuantizedWeight(name, integers, np.ascontiguousarray(scales), axis)
 
 
-def _bias_of(layer: ir.Node) -> Floats | None:
-    """Read a bias that is stored as int32; None if there is none."""
-    node = producer_of(graph.bias_of(layer))
-    if node is None or node.op_type != DEQUANTIZE:
-        return None
-    stored, scale = graph.array_of(node.inputs[0]), graph.array_of(node.inputs[1])
-    if stored is None or scale is None:
-        return None
-    return np.asarray(stored.astype(np.float64) * scale.astype(np.float64), np.float32)
-
-
 def _integers(dequantize: ir.Node, step: Floats) -> npt.NDArray[np.int8] | None:
     """Return the constant input of a DequantizeLinear as int8."""
     source = dequantize.inputs[0]
@@ -227,3 +229,122 @@ def _integers(dequantize: ir.Node, step: Floats) -> npt.NDArray[np.int8] | None:
         shape[dequantize.attributes.get_int("axis", 1) % weight.ndim] = step.size
     steps: Floats = np.rint(weight.astype(np.float32) / step.reshape(shape))
     return np.clip(steps, -QUANT_MAX, QUANT_MAX).astype(np.int8)
+
+
+# Tell a quantized file that onnxruntime's CPU runs slower than float: TensorRT's form.
+#
+# TensorRT wants pairs where a layer reads. onnxruntime wants one behind a layer, too:
+# it computes in integers what stands between two pairs, and everything else in float,
+# each pair in a kernel of its own. Measured with 1.31.1 on one core of an AMD EPYC (Zen
+# 3): convolutions take 1.26 of float's time with pairs on their inputs alone and 0.52
+# between two, products with a bias 1.14 to 1.25 and 0.52 to 0.58. Signed activations
+# become unsigned when a session opens, so the sign alone costs nothing.
+
+
+_PASSED = frozenset(
+    {"MaxPool", "Reshape", "Slice", "Squeeze", "Transpose", "Unsqueeze"}
+)
+"""Operators that onnxruntime moves a QuantizeLinear in front of (QDQPropagation)."""
+_LEAST = {ir.DataType.INT8: -128, ir.DataType.UINT8: 0}
+"""Types of activations that there are integer kernels for, with their least number."""
+_OF_TENSORRT = (ir.DataType.INT8, ir.DataType.FLOAT8E4M3FN)
+"""Types of activations that TensorRT takes, with zero points 0."""
+
+
+def slow_here(model: ir.Model, provider: Provider = CPU) -> str | None:
+    """Say that a quantized graph is slow in onnxruntime's CPU, and what is fast.
+
+    That is so where half or more of the layers whose operands both come through a pair
+    gain nothing by it, whoever placed the pairs. None for other graphs, and where
+    another provider runs it.
+    """
+    if provider.native != CPU.native:
+        return None
+    layers = [
+        node
+        for node in nodes_of(model)
+        if is_standard(node) and node.op_type in WEIGHTED and reads_integers(node)
+    ]
+    slow = [node for node in layers if not _is_fast(node)]
+    if not slow or 2 * len(slow) < len(layers):
+        return None
+    form, remedy = "a form that is", ""
+    read = [pair for node in slow if (pair := dequantizer_of(node.inputs[0]))]
+    kinds = {_kind_of(pair) for pair in read}
+    if kinds.issubset(_OF_TENSORRT) and not any(_zeros_of(pair).any() for pair in read):
+        form = "TensorRT's form,"
+        if kinds == {ir.DataType.INT8}:
+            remedy = ", --passes import-normalize,lower-int8 makes it of this file"
+    return (
+        f"it is quantized in {form} slow in onnxruntime's CPU (no fast kernel for"
+        f" {len(slow)} of {len(layers)} layers): compress --target onnxruntime writes"
+        f" what is fast here{remedy}"
+    )
+
+
+def _is_fast(layer: ir.Node) -> bool:
+    """Return whether onnxruntime has a kernel for a layer that beats float."""
+    end, bias = layer.outputs[0], bias_of(layer)
+    left, right = (dequantizer_of(value) for value in layer.inputs[:2])
+    if layer.op_type == "ConvTranspose" or left is None:
+        return False
+    # sessions take a pair in that is of uint8, or of int8 with a zero point
+    kind = _kind_of(left)
+    if kind not in _LEAST or (kind != ir.DataType.UINT8 and len(left.inputs) <= 2):
+        return False
+    # products of two activations, as an attention's, take 1.1 to 1.8 of float's time
+    quantize = None if right is None else maker(right.inputs[0], QUANTIZE)
+    if quantize is not None and array_of(quantize.inputs[0]) is None:
+        return False
+    # a MatMul and its bias become one Gemm before pairs are looked for
+    merged, readers = False, list(end.consumers())
+    if layer.op_type == "MatMul" and [each.op_type for each in readers] == ["Add"]:
+        merged = any(array_of(value) is not None for value in readers[0].inputs)
+        end = readers[0].outputs[0] if merged else end
+    ends = _ends(end, takes_relu=not merged)
+    pairs = [each for each in ends if each.op_type == QUANTIZE]
+    if ends and len(pairs) == len(ends):
+        return True
+    # a product may answer in float, unless a ReLU or a pair was to be taken in
+    biased = merged or (bias is not None and not is_dequantized(bias))
+    return layer.op_type not in CONVOLUTIONS and not biased and not pairs
+
+
+def _ends(value: ir.Value, *, takes_relu: bool) -> list[ir.Node]:
+    """List the readers of a layer's output, past what onnxruntime takes in.
+
+    A ReLU goes where the grid behind it begins at zero; elsewhere it hides the layer,
+    and a Gemm that was made of a MatMul takes none.
+    """
+    readers = [] if value.is_graph_output() else list(value.consumers())
+    if len(readers) != 1:
+        return readers
+    behind = readers[0].outputs[0]
+    if is_clip_at_zero(readers[0]):
+        ends = _ends(behind, takes_relu=takes_relu)
+        for end in ends if takes_relu else ():
+            least = _LEAST.get(_kind_of(end)) if end.op_type == QUANTIZE else None
+            takes_relu &= least is not None and bool((_zeros_of(end) == least).all())
+        return ends if takes_relu else [*readers, *ends]
+    passed = readers[0].op_type in _PASSED
+    return _ends(behind, takes_relu=takes_relu) if passed else readers
+
+
+def _zeros_of(pair: ir.Node) -> npt.NDArray[np.generic]:
+    """Return the zero points of a QuantizeLinear or DequantizeLinear; 0 without."""
+    zeros = array_of(input_at(pair, 2))
+    return np.zeros(1, np.int8) if zeros is None else zeros
+
+
+def _kind_of(pair: ir.Node) -> ir.DataType:
+    """Return what a QuantizeLinear writes, or a DequantizeLinear reads.
+
+    That is its zero point's type or, without one, what ``output_dtype`` says: uint8 by
+    default.
+    """
+    zeros = array_of(input_at(pair, 2))
+    if zeros is not None:
+        return ir.DataType.from_numpy(zeros.dtype)
+    source = pair if pair.op_type == QUANTIZE else maker(pair.inputs[0], QUANTIZE)
+    number = 0 if source is None else source.attributes.get_int("output_dtype", 0)
+    return ir.DataType(number or ir.DataType.UINT8)

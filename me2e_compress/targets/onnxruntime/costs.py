@@ -13,8 +13,7 @@ from me2e_compress.graph.nodes import constant_values
 from me2e_compress.graph.rewrite import sole_reader
 from me2e_compress.operators import find, int8_inputs
 from me2e_compress.quantization.costs import Border, Costs, Join, Layers
-from me2e_compress.targets.onnxruntime.kernels import JOINS, end_of
-from me2e_compress.targets.onnxruntime.region import Region, find_region
+from me2e_compress.targets.onnxruntime.region import JOINS, Region, end_of, find_region
 
 CACHE_BYTES = 2**21
 """Float32 feature maps up to this size are sampled as fast as uint8 ones: one core's
@@ -136,8 +135,15 @@ def work_of(layer: ir.Node) -> tuple[Counts, Counts] | None:
         float_ |= {"float_mac": macs}
         int8 |= {"int8_mac": macs, "int8_product": outputs}
         return float_, int8
+    # A float convolution reorders what it exchanges with others than convolutions.
+    source, end, reordered = layer.inputs[0], end_of(layer), 0
+    made_by = None if source is None else source.producer()
+    if made_by is None or made_by.op_type not in (*_BLOCKED, "Clip", "Relu"):
+        reordered += inputs
+    if not any(reader.op_type in _BLOCKED for reader in end.consumers()):
+        reordered += math.prod(static_shape(end) or ())
     grouped = "grouped_" if layer.attributes.get_int("group", 1) > 1 else ""
-    float_ |= {f"float_{grouped}mac": macs, "float_reorder": _reordered(layer)}
+    float_ |= {f"float_{grouped}mac": macs, "float_reorder": reordered}
     int8 |= {f"int8_{grouped}mac": macs, "int8_answer": outputs}
     # Kernels larger than 1 copy patches first.
     taps = math.prod(weight[2:])
@@ -160,33 +166,10 @@ def sampled_work(node: ir.Node) -> tuple[Counts, Counts] | None:
     return {}, {"int8_cached_mac": macs}
 
 
-def _reordered(layer: ir.Node) -> int:
-    """Count the elements that a float convolution exchanges with other operators."""
-    source, end = layer.inputs[0], end_of(layer)
-    found = 0
-    if source is not None and not _is_convolved(source):
-        found += math.prod(static_shape(source) or ())
-    # The output stays blocked if any reader works on blocks.
-    if not any(reader.op_type in _BLOCKED for reader in end.consumers()):
-        found += math.prod(static_shape(end) or ())
-    return found
-
-
-_BLOCKED = (
-    "Add",
-    "AveragePool",
-    "Concat",
-    "Conv",
-    "GlobalAveragePool",
-    "MaxPool",
-    "Mul",
+_BLOCKED = frozenset(
+    ["Add", "AveragePool", "Concat", "Conv", "GlobalAveragePool", "MaxPool", "Mul"]
 )
 """Operators that onnxruntime computes on blocks of channels, as convolutions."""
-
-
-def _is_convolved(value: ir.Value) -> bool:
-    node = value.producer()
-    return node is not None and node.op_type in (*_BLOCKED, "Clip", "Relu")
 
 
 class _Surroundings:
@@ -230,21 +213,18 @@ class _Surroundings:
 
     def makers(self, value: ir.Value) -> Layers:
         """Return the nearest layers that a tensor comes from."""
-        if value not in self._makers:
-            self._makers[value] = frozenset()
-            self._makers[value] = self._find_makers(value)
-        return self._makers[value]
-
-    def _find_makers(self, value: ir.Value) -> Layers:
-        if value in self._layers and value in self._region.written:
-            return frozenset({self._layers[value]})
+        if value in self._makers:
+            return self._makers[value]
+        self._makers[value] = frozenset()
         node = self._carriers.get(value)
-        if node is None:
-            return frozenset()
-        read = node.inputs if node.op_type in JOINS else node.inputs[:1]
-        sides = [each for each in read if each is not None]
-        near = [self._layers[each] for each in sides if each in self._layers]
-        return frozenset(near) or frozenset().union(*map(self.makers, sides))
+        if value in self._layers and value in self._region.written:
+            self._makers[value] = frozenset({self._layers[value]})
+        elif node is not None:
+            read = node.inputs if node.op_type in JOINS else node.inputs[:1]
+            sides = [each for each in read if each is not None]
+            near = frozenset(self._layers[v] for v in sides if v in self._layers)
+            self._makers[value] = near or frozenset().union(*map(self.makers, sides))
+        return self._makers[value]
 
     def readers(self, value: ir.Value) -> Layers:
         """Return the nearest layers that read a tensor, through joins and moves."""

@@ -15,7 +15,7 @@ import onnx_ir as ir
 
 from me2e_compress.errors import PreconditionError
 from me2e_compress.graph import rank_of, rewrite
-from me2e_compress.targets.onnxruntime.kernels import end_of, reads_one_pixel
+from me2e_compress.targets.onnxruntime.region import end_of, reads_one_pixel
 from me2e_compress.targets.quantized import QUANTIZE
 from me2e_compress.targets.weights import (
     Floats,
@@ -116,20 +116,33 @@ def write_layer(
     integers = None
     if bias is not None:
         weight, integers = with_bias(weight, bias, step)
+    # Does a QuantizeLinear alone read it, behind bias and ReLU?
+    left = node.inputs[0]
+    reader = rewrite.sole_reader(end_of(_last_of(node)))
+    known = left is not None and left.shape is not None
+    quantize = reader if known and reader and reader.op_type == QUANTIZE else None
     # Choose the form.
-    quantize = _quantize_of(node)
     if node.op_type == "Conv":
         if quantize is None and reads_one_pixel(node):
-            weight = _matrix_of(weight)
+            matrix = weight.integers.reshape(weight.integers.shape[:2])
+            name = f"{weight.name}_matrix"
+            weight = dataclasses.replace(weight, name=name, integers=matrix)
             node = _write_row(writer, node, weight.integers.shape)
     elif quantize is not None:
-        weight = _filter_of(node, weight)
-        columns, depth = weight.integers.shape[:2]
-        node = _write_convolution(writer, node, quantize, (columns, depth))
+        columns_first = node.attributes.get_int("transB", 0)
+        matrix = weight.integers if columns_first else weight.integers.T
+        filters = np.ascontiguousarray(matrix)[:, :, None, None]
+        axis = None if weight.axis is None else 0
+        name = f"{weight.name}_filter"
+        weight = QuantizedWeight(name, filters, weight.scales, axis)
+        node = _write_convolution(writer, node, quantize, filters.shape)
     elif node.op_type == "MatMul" and bias is not None:
         node = _write_gemm(writer, node, weight.integers.shape)
     # Write the weight, and the bias in units of the product's steps.
-    _store(writer, node, 1, weight)
+    fresh = writer.dequantized(
+        weight.name, weight.integers, weight.scales, weight.axis, node
+    )
+    node.replace_input_with(1, fresh)
     if integers is None:
         node.resize_inputs(2)
     else:
@@ -151,13 +164,6 @@ def with_bias(
         weight = dataclasses.replace(roomy, name=f"{weight.name}_coarse")
     integers = np.rint(bias / (weight.scales.astype(np.float64) * step))
     return weight, integers.astype(np.int32)
-
-
-def _store(writer: Writer, node: ir.Node, index: int, weight: QuantizedWeight) -> None:
-    fresh = writer.dequantized(
-        weight.name, weight.integers, weight.scales, weight.axis, node
-    )
-    node.replace_input_with(index, fresh)
 
 
 def _write_gemm(writer: Writer, product: ir.Node, size: Sequence[int]) -> ir.Node:
@@ -191,12 +197,6 @@ def _write_gemm(writer: Writer, product: ir.Node, size: Sequence[int]) -> ir.Nod
     return gemm
 
 
-def _matrix_of(weight: QuantizedWeight) -> QuantizedWeight:
-    """Return a filter [N, K, 1, 1] as the weight [N, K] of a Gemm."""
-    matrix = weight.integers.reshape(weight.integers.shape[:2])
-    return dataclasses.replace(weight, name=f"{weight.name}_matrix", integers=matrix)
-
-
 def _write_row(writer: Writer, node: ir.Node, size: Sequence[int]) -> ir.Node:
     """Replace a convolution of one pixel by a Gemm.
 
@@ -221,26 +221,8 @@ def _write_row(writer: Writer, node: ir.Node, size: Sequence[int]) -> ir.Node:
     return gemm
 
 
-def _quantize_of(product: ir.Node) -> ir.Node | None:
-    """Return the QuantizeLinear that alone reads a product, behind bias and ReLU."""
-    if product.inputs[0] is None:
-        return None
-    reader = rewrite.sole_reader(end_of(_last_of(product)))
-    known = product.inputs[0].shape is not None
-    return reader if known and reader and reader.op_type == QUANTIZE else None
-
-
-def _filter_of(product: ir.Node, weight: QuantizedWeight) -> QuantizedWeight:
-    """Return the weight of a product as a filter [N, K, 1, 1]."""
-    columns_first = product.attributes.get_int("transB", 0)
-    matrix = weight.integers if columns_first else weight.integers.T
-    integers = np.ascontiguousarray(matrix)[:, :, None, None]
-    axis = None if weight.axis is None else 0
-    return QuantizedWeight(f"{weight.name}_filter", integers, weight.scales, axis)
-
-
 def _write_convolution(
-    writer: Writer, product: ir.Node, quantize: ir.Node, size: tuple[int, int]
+    writer: Writer, product: ir.Node, quantize: ir.Node, size: Sequence[int]
 ) -> ir.Node:
     """Replace a product that only a QuantizeLinear reads by a convolution.
 
@@ -248,18 +230,20 @@ def _write_convolution(
     Result:  q = Reshape(Transpose(QuantizeLinear(Relu(Conv(DequantizeLinear(
                  Transpose(Reshape(x, [1, -1, 1, K]))), w, b)))), [..., N])
 
-    x is uint8 [..., K], ``size`` (N, K). onnxruntime computes with the channels last,
-    and so removes both transposes. The filter and the bias of the returned Conv are
-    still to be written.
+    x is uint8 [..., K], ``size`` (N, K, ...). onnxruntime computes with the channels
+    last, and so removes both transposes. The filter and the bias of the returned Conv
+    are still to be written.
     """
     last = _last_of(product)
     left, weight = product.inputs[:2]
     assert left is not None
     assert left.shape is not None
     assert weight is not None
-    integers, *grid = _operands(left.producer())
+    dequantize = left.producer()
+    assert dequantize is not None
+    integers, *grid = [each for each in dequantize.inputs if each is not None]
     old, leading = last.outputs[0], list(left.shape)[:-1]
-    name, (columns, depth) = str(old.name), size
+    name, (columns, depth) = str(old.name), size[:2]
     # Every row becomes a pixel, while it is uint8.
     place = Place(writer, last, [product, last])
     pixels = place.reshaped(integers, [1, -1, 1, depth], f"{name}_pixels")
@@ -290,9 +274,3 @@ def _last_of(product: ir.Node) -> ir.Node:
     """Return the Add of a MatMul's bias, or the product itself."""
     found = biased_end(product) if product.op_type == "MatMul" else None
     return found or product
-
-
-def _operands(dequantize: ir.Node | None) -> list[ir.Value]:
-    """Return the integers, the scale and the zero point of a DequantizeLinear."""
-    assert dequantize is not None
-    return [each for each in dequantize.inputs if each is not None]

@@ -1,24 +1,41 @@
-"""Lint rules: can onnxruntime's CPU run a graph, and its int8 fast?"""
+"""Lint rules: can onnxruntime run a graph, its int8 fast, and as the nodes say?
 
-from collections.abc import Iterator
+Measured with onnxruntime 1.31.1 on the CPU, opsets 11 to 23. Our own measurements run
+without these rewrites (``QDQ_OFF`` of runtime/runnable.py), deployed files get them.
+"""
 
+import dataclasses
+from collections.abc import Iterator, Mapping
+
+import numpy as np
 import onnx
 import onnx_ir as ir
 
 from me2e_compress.graph import (
     CONVOLUTIONS,
     WEIGHTED,
-    array_of,
+    channel_axis,
+    input_at,
     is_standard,
     nodes_of,
     opset_of,
-    producer_of,
+    rank_of,
 )
+from me2e_compress.graph.nodes import (
+    Array,
+    Numbers,
+    array_of,
+    constant_values,
+    maker,
+    sole_reader,
+    unrenamed,
+)
+from me2e_compress.graph.shapes import open_shape
 from me2e_compress.graph.validity import ORIGINAL_DOMAIN
 from me2e_compress.operators import find
 from me2e_compress.runtime.kernel_types import remedy, without_kernel
 from me2e_compress.runtime.runnable import known_operators
-from me2e_compress.targets.base import (
+from me2e_compress.targets import (
     LintFinding,
     LintRule,
     error,
@@ -27,9 +44,281 @@ from me2e_compress.targets.base import (
     valid,
     warning,
 )
-from me2e_compress.targets.onnxruntime.int8_rewrites import int8_rewrites
 from me2e_compress.targets.onnxruntime.region import never_negative
-from me2e_compress.targets.quantized import QUANTIZE, is_dequantized
+from me2e_compress.targets.quantized import DEQUANTIZE, QUANTIZE, is_dequantized
+from me2e_compress.targets.weights import evaluate_constants, quantize_weight
+
+INT32_MAX = 2.0**31 - 1  # a bias of more steps becomes -2^31
+
+SCALES_APART = 1e-3
+"""Relative difference of two scales that are meant to be equal: twice what rounding to
+float16 moves one."""
+
+_REMEDY = "disabled_optimizers=['WeightBiasQuantization'] keeps it"
+_CLIPS = ("Clip", "Dropout", "Identity", "Relu")
+_MOVES = ("MaxPool", "Reshape", "Slice", "Squeeze", "Transpose", "Unsqueeze")
+"""Operators that onnxruntime moves a pair across, to the layer."""
+_FOLDED = ("Add", "BatchNormalization", "Mul")  # into a float weight, first
+
+Constants = Mapping[str, Array]
+
+
+@dataclasses.dataclass(frozen=True)
+class _Layer:
+    """A layer that reads a dequantized activation.
+
+    Attributes:
+        node: Conv, ConvTranspose, Gemm or MatMul.
+        end: what it makes, behind the Add of a MatMul's bias.
+        pair: the DequantizeLinear that it reads.
+        bias: its third operand, or the other one of that Add.
+    """
+
+    node: ir.Node
+    end: ir.Value
+    pair: ir.Node
+    bias: ir.Value | None
+
+    @property
+    def is_reshaped(self) -> bool:
+        """Whether the rows of a MatMul are flattened first, and its answer is not."""
+        return self.node.op_type == "MatMul" and rank_of(self.node.inputs[0]) != 2
+
+    @property
+    def weight(self) -> ir.Value:
+        """Return its weight."""
+        weight = self.node.inputs[1]
+        assert weight is not None
+        return unrenamed(weight)
+
+
+def int8_rewrites(model: ir.Model) -> Iterator[LintFinding]:
+    """Find layers that onnxruntime's int8 computes otherwise than the file says.
+
+    * ``wrapped-bias``: it rounds a float bias to int32 in steps of input times weight,
+      and more steps than int32 holds become -2^31.
+    * ``bias-scale``: its QGemm takes an int32 bias in those steps, whatever the scale
+      of the bias is.
+    * ``float-weight``: it rounds a float weight between two pairs to int8, with one
+      scale in all.
+    """
+    layers = list(_layers(model))
+    constants = _constants(model, layers)
+    for layer in layers:
+        for rule, judge in _RULES.items():
+            if message := judge(layer, constants):
+                yield LintFinding("wrong", rule, name_of(layer.node), message)
+                break
+
+
+def _layers(model: ir.Model) -> Iterator[_Layer]:
+    for node in nodes_of(model):
+        if not is_standard(node) or len(node.inputs) < 2 or node.inputs[1] is None:
+            continue
+        # The pair may stand before Identities and moves.
+        value = node.inputs[0]
+        while (moved := maker(value, "Identity", *_MOVES)) is not None:
+            value = moved.inputs[0]
+        pair = maker(value, DEQUANTIZE)
+        if pair is None:
+            continue
+        if node.op_type in ("Conv", "ConvTranspose", "Gemm"):
+            yield _Layer(node, node.outputs[0], pair, input_at(node, 2))
+        elif node.op_type == "MatMul" and rank_of(node.inputs[1]) == 2:
+            # onnxruntime makes a Gemm of a MatMul and the Add of a row behind it
+            addition = sole_reader(node.outputs[0])
+            if addition is None or addition.op_type != "Add":
+                continue
+            sides = [v for v in addition.inputs if v is not node.outputs[0]]
+            shape = open_shape(sides[0]) if len(sides) == 1 else None
+            columns = open_shape(node.inputs[1])
+            most = 2 if rank_of(node.inputs[0]) == 2 else 1
+            if shape and columns and len(shape) <= most and shape[-1] == columns[-1]:
+                yield _Layer(node, addition.outputs[0], pair, sides[0])
+
+
+def _constants(model: ir.Model, layers: list[_Layer]) -> Constants:
+    """Return the scales and biases of layers, and the float weights, by name."""
+    wanted: list[ir.Value | None] = []
+    for layer in layers:
+        stored = maker(layer.weight, DEQUANTIZE)
+        wanted += [layer.pair.inputs[1], stored.inputs[1] if stored else layer.weight]
+        scale = _scale_of_bias(layer)
+        wanted += [layer.bias if scale is None else scale]
+    values = [value for value in dict.fromkeys(wanted) if value is not None]
+    known = {str(v.name): array for v in values if (array := array_of(v)) is not None}
+    # What nodes compute of constants is folded by onnxruntime, too
+    constant = constant_values(model)
+    names = [str(v.name) for v in values if v in constant and str(v.name) not in known]
+    return {**known, **evaluate_constants(model, names)}
+
+
+def _scale_of_bias(layer: _Layer) -> ir.Value | None:
+    """Return the scale of a bias that is stored as integers."""
+    stored = None if layer.bias is None else maker(unrenamed(layer.bias), DEQUANTIZE)
+    return None if stored is None else stored.inputs[1]
+
+
+def _numbers(value: ir.Value | None, constants: Constants) -> Numbers | None:
+    array = None if value is None else constants.get(str(value.name))
+    return None if array is None else np.asarray(array, np.float64)
+
+
+def _steps(layer: _Layer, constants: Constants) -> Numbers | None:
+    """Return the step of the products: [channels], or [1] for one step everywhere."""
+    stored = maker(layer.weight, DEQUANTIZE)
+    if stored is None:
+        return None
+    left = _numbers(layer.pair.inputs[1], constants)
+    right = _numbers(stored.inputs[1], constants)
+    if left is None or right is None or left.size != 1 or right.ndim > 1:
+        return None
+    # Scales must run along the output channels
+    if right.size > 1:
+        rank, axis = rank_of(layer.weight), stored.attributes.get_int("axis", 1)
+        if rank is not None and axis % rank != channel_axis(layer.node):
+            return None
+    return left.reshape(-1) * right.reshape(-1)
+
+
+def _wrapped(layer: _Layer, constants: Constants) -> str:
+    """Say by how much a float bias exceeds int32; empty if it does not."""
+    steps, bias = _steps(layer, constants), _numbers(layer.bias, constants)
+    if steps is None or bias is None or _scale_of_bias(layer) is not None:
+        return ""
+    fits = bias.ndim == 1 and steps.size in (1, bias.size)
+    if not fits or _quantizer(layer) is None:
+        return ""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        counts = np.nan_to_num(np.abs(bias) / np.abs(steps), nan=0.0, posinf=np.inf)
+    wrapped = np.flatnonzero(counts > INT32_MAX)
+    if not wrapped.size:
+        return ""
+    worst = int(counts.argmax())
+    return (
+        "onnxruntime rounds its bias to int32 in steps of input times weight, and"
+        f" {wrapped.size} of {bias.size} do not fit: {bias[worst]:.3g} of channel"
+        f" {worst} is {counts[worst]:.1e} steps; {_REMEDY} in float"
+    )
+
+
+def _misread(layer: _Layer, constants: Constants) -> str:
+    """Say how far the scale of a product's int32 bias is from what QGemm takes."""
+    steps = _steps(layer, constants)
+    own = _numbers(_scale_of_bias(layer), constants)
+    if steps is None or own is None or not own.size or not _becomes_gemm(layer):
+        return ""
+    if own.size > 1 and 1 < steps.size != own.size:
+        return ""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ratios = own.reshape(-1) / steps
+    if np.all(np.abs(ratios - 1) <= SCALES_APART):
+        return ""
+    worst = int(np.abs(np.log(np.abs(ratios) + 1e-300)).argmax())
+    return (
+        "onnxruntime's QGemm takes its int32 bias in steps of input times weight,"
+        f" {steps[min(worst, steps.size - 1)]:.3g}, the file in steps of"
+        f" {own.reshape(-1)[min(worst, own.size - 1)]:.3g}: a bias {ratios[worst]:.3g}"
+        " times as large; lower-int8, or a float bias, mends it"
+    )
+
+
+def _becomes_gemm(layer: _Layer) -> bool:
+    """Return whether onnxruntime makes a QGemm of a product: 8 bits, no factors.
+
+    The weight's zero point must be written, even 0.
+    """
+    node, integers = layer.node, layer.pair.inputs[0]
+    factors = [node.attributes.get_float(name, 1.0) for name in ("alpha", "beta")]
+    kind = None if integers is None else integers.dtype
+    if node.op_type not in ("Gemm", "MatMul") or factors != [1.0, 1.0]:
+        return False
+    if kind not in (ir.DataType.INT8, ir.DataType.UINT8, None):
+        return False
+    stored = maker(layer.weight, DEQUANTIZE)
+    if stored is not None and input_at(stored, 2) is None:
+        return False
+    # A quantizer beside other readers hides the product
+    readers = [] if layer.is_reshaped else list(layer.end.consumers())
+    if any(each.op_type == QUANTIZE for each in readers):
+        return len(readers) == 1 and not layer.end.is_graph_output()
+    # So does a clip that one node reads, unless that is a quantizer that clips as far
+    clip = sole_reader(layer.end) if readers else None
+    if clip is None or clip.op_type not in ("Clip", "Relu"):
+        return True
+    quantizer = sole_reader(clip.outputs[0])
+    if quantizer is None or quantizer.op_type != QUANTIZE:
+        return quantizer is None
+    zero = array_of(input_at(quantizer, 2))
+    return zero is None or bool(np.all(zero == np.iinfo(zero.dtype.name).min))
+
+
+def rounded_layers(model: ir.Model) -> Iterator[tuple[ir.Node, ir.Node]]:
+    """Yield the layers of rule ``float-weight``, with the quantizers behind them."""
+    layers = list(_layers(model))
+    constants = _constants(model, layers)
+    for layer in layers:
+        if (quantizer := _quantizer_of_float(layer, constants)) is not None:
+            yield layer.node, quantizer
+
+
+def _quantizer_of_float(layer: _Layer, constants: Constants) -> ir.Node | None:
+    """Return the quantizer for which a float weight is rounded; None if it is not."""
+    weight = constants.get(str(layer.weight.name))
+    bias = _numbers(layer.bias, constants)
+    if weight is None or weight.dtype != np.float32 or not weight.size:
+        return None
+    if layer.bias is not None and (
+        bias is None or bias.ndim != 1 or _scale_of_bias(layer) is not None
+    ):
+        return None
+    folded = _FOLDED if layer.node.op_type == "Conv" else ("BatchNormalization",)
+    return _quantizer(layer, folded)
+
+
+def _rounded(layer: _Layer, constants: Constants) -> str:
+    """Say what rounding a float weight between pairs costs; empty if none is."""
+    if _quantizer_of_float(layer, constants) is None:
+        return ""
+    exact = constants[str(layer.weight.name)].astype(np.float32)
+    integers, step = quantize_weight(exact, None)
+    noise = float(np.square(exact - integers * step).sum(dtype=np.float64))
+    signal = float(np.square(exact).sum(dtype=np.float64))
+    loss = f" ({10 * np.log10(signal / noise):.1f} dB)" if noise and signal else ""
+    return (
+        "it stands between two pairs, so onnxruntime rounds its float weight to int8,"
+        f" with one scale in all{loss}; {_REMEDY}"
+    )
+
+
+def _quantizer(layer: _Layer, folded: tuple[str, ...] = ()) -> ir.Node | None:
+    """Return the QuantizeLinear that alone reads a layer, behind what is looked past.
+
+    Those are what is folded into the layer first, then clips, then moves.
+    """
+    value = layer.end
+    moves: tuple[str, ...] = _MOVES
+    if layer.node.op_type == "Gemm" and layer.bias is None:
+        moves = tuple(each for each in moves if each != "Transpose")  # fused before
+    stages = [moves] if layer.is_reshaped else [folded, _CLIPS, moves]
+    while len(value.uses()) == 1:
+        (reader,) = value.consumers()
+        if reader.op_type == QUANTIZE:
+            return reader
+        while stages and reader.op_type not in stages[0]:
+            stages.pop(0)
+        others = [v for v in reader.inputs[1:] if v is not None and v is not value]
+        if not stages or any(array_of(v) is None for v in others):
+            return None
+        value = reader.outputs[0]
+    return None
+
+
+_RULES = {"wrapped-bias": _wrapped, "bias-scale": _misread, "float-weight": _rounded}
+"""What says how a layer is computed otherwise, or nothing, by rule."""
+
+
+# Lint rules: can onnxruntime's CPU run a graph, and its int8 fast?
 
 
 def opset(model: ir.Model) -> Iterator[LintFinding]:
@@ -44,20 +333,18 @@ def operators(model: ir.Model) -> Iterator[LintFinding]:
     known = known_operators()
     for node in nodes_of(model):
         domain = "" if is_standard(node) else node.domain
-        name = f"{node.domain or 'ai.onnx'}::{node.op_type}"
         if (domain, node.op_type) in known or node.op_identifier() in model.functions:
             continue
-        said = f"{name} has no kernel and no local function"
-        yield error("operator", node, f"{said}{_remedy(node)}")
-
-
-def _remedy(node: ir.Node) -> str:
-    """Name the pass that helps a fused operator: functions need a domain."""
-    if find(node) is None:
-        return ""
-    if is_standard(node) or ORIGINAL_DOMAIN in node.metadata_props:
-        return ": expand-operators writes its body"
-    return ": attach-bodies writes one, expand-operators the body in its place"
+        # Name the pass that helps a fused operator: functions need a domain.
+        way = ""
+        if find(node) is not None:
+            way = ": attach-bodies writes one, expand-operators the body in its place"
+            if is_standard(node) or ORIGINAL_DOMAIN in node.metadata_props:
+                way = ": expand-operators writes its body"
+        name = f"{node.domain or 'ai.onnx'}::{node.op_type}"
+        yield error(
+            "operator", node, f"{name} has no kernel and no local function{way}"
+        )
 
 
 def kernels(model: ir.Model) -> Iterator[LintFinding]:
@@ -72,9 +359,10 @@ def signed_activations(model: ir.Model) -> Iterator[LintFinding]:
     Measured on AVX512-VNNI: int8 by int8 products run at 34 to 91 GOP/s, uint8 by int8
     at 850 to 1600.
     """
-    for node in _layers(model):
-        value = node.inputs[0]
-        if is_dequantized(value) and _reads(value) == ir.DataType.INT8:
+    for node in _weighted(model):
+        pair = maker(node.inputs[0], DEQUANTIZE)
+        integers = None if pair is None else pair.inputs[0]
+        if integers is not None and integers.dtype == ir.DataType.INT8:
             yield warning(
                 "signed-activation", node, "reads int8, the fast kernels read uint8"
             )
@@ -82,7 +370,7 @@ def signed_activations(model: ir.Model) -> Iterator[LintFinding]:
 
 def unanswered(model: ir.Model) -> Iterator[LintFinding]:
     """Find int8 convolutions whose output is not quantized: they run in float."""
-    for node in _layers(model):
+    for node in _weighted(model):
         quantized = all(map(is_dequantized, node.inputs[:2]))
         if node.op_type not in CONVOLUTIONS or not quantized:
             continue
@@ -104,8 +392,19 @@ def padded_pools(model: ir.Model) -> Iterator[LintFinding]:
     inputs that are never negative give the same result. Our own sessions disable it.
     """
     for node in nodes_of(model):
-        pad = producer_of(node.inputs[0]) if node.op_type == "MaxPool" else None
-        if pad is None or not is_standard(pad) or not _pads_with_zeros(pad):
+        pad = maker(node.inputs[0], "Pad") if node.op_type == "MaxPool" else None
+        if (
+            pad is None
+            or not is_standard(pad)
+            or len(list(pad.outputs[0].consumers())) != 1
+        ):
+            continue
+        # What it fills in is zero, or a constant of zeros.
+        mode = pad.attributes.get("mode")
+        if mode is not None and mode.as_string() != "constant":
+            continue
+        filled, value = input_at(pad, 2), array_of(input_at(pad, 2))
+        if filled is not None and (value is None or value.any()):
             continue
         # Without negative values the result is the same.
         image = pad.inputs[0]
@@ -119,27 +418,10 @@ def padded_pools(model: ir.Model) -> Iterator[LintFinding]:
             )
 
 
-def _pads_with_zeros(pad: ir.Node) -> bool:
-    if pad.op_type != "Pad" or len(list(pad.outputs[0].consumers())) != 1:
-        return False
-    mode = pad.attributes.get("mode")
-    if mode is not None and mode.as_string() != "constant":
-        return False
-    filled = pad.inputs[2] if len(pad.inputs) > 2 else None
-    value = None if filled is None else array_of(filled)
-    return filled is None or (value is not None and not value.any())
-
-
-def _layers(model: ir.Model) -> Iterator[ir.Node]:
+def _weighted(model: ir.Model) -> Iterator[ir.Node]:
     for node in nodes_of(model):
         if is_standard(node) and node.op_type in WEIGHTED:
             yield node
-
-
-def _reads(value: ir.Value | None) -> ir.DataType | None:
-    node = producer_of(value)
-    integers = None if node is None else node.inputs[0]
-    return None if integers is None else integers.dtype
 
 
 RULES: tuple[LintRule, ...] = (

@@ -23,10 +23,15 @@ from me2e_compress import graph
 from me2e_compress.errors import FramesError
 from me2e_compress.graph import provenance, rewrite
 from me2e_compress.graph.shapes import open_shape, static_shape
-from me2e_compress.targets.onnxruntime.int8_rewrites import rounded_layers
-from me2e_compress.targets.onnxruntime.kernels import has_average_kernel, is_average
 from me2e_compress.targets.onnxruntime.layer_forms import write_layer
-from me2e_compress.targets.onnxruntime.region import Grid, Region, find_region
+from me2e_compress.targets.onnxruntime.lint_rules import rounded_layers
+from me2e_compress.targets.onnxruntime.region import (
+    Grid,
+    Region,
+    find_region,
+    has_average_kernel,
+    is_average,
+)
 from me2e_compress.targets.quantized import QUANTIZE, is_dequantized
 from me2e_compress.targets.weights import QuantizedWeight
 from me2e_compress.targets.writer import BY, Writer
@@ -79,21 +84,18 @@ def blocks_of(node: ir.Node) -> Blocks | None:
         or options.get_string("auto_pad", "NOTSET") != "NOTSET"
     ):
         return None
+    # Along each axis: zeros, and in blocks what is covered and padded.
+    sides = []
     axes = zip(lengths, weight[2:], pads[:2], pads[2:], strict=True)
-    sides = [_side(size, *axis) for axis in axes]
-    zeros, covered, before, behind = zip(*sides, strict=True)
-    return Blocks(size, zeros, covered, (*before, *behind))
-
-
-def _side(
-    size: int, length: int, kernel: int, before: int, behind: int
-) -> tuple[int, int, int, int]:
-    """Return zeros, and in blocks what is covered and padded, along one axis."""
-    first = -(-before // size)
-    zeros = first * size - before
-    covered = -(-(zeros + kernel) // size)
-    steps = (length + before + behind - kernel) // size + 1
-    return zeros, covered, first, steps - 1 + covered - first - length // size
+    for length, kernel, before, behind in axes:
+        first = -(-before // size)
+        zeros = first * size - before
+        covered = -(-(zeros + kernel) // size)
+        steps = (length + before + behind - kernel) // size + 1
+        last = steps - 1 + covered - first - length // size
+        sides.append((zeros, covered, first, last))
+    (top, left), covers, firsts, lasts = zip(*sides, strict=True)
+    return Blocks(size, (top, left), covers, (*firsts, *lasts))
 
 
 def filter_of_blocks(weight: QuantizedWeight, cut: Blocks) -> QuantizedWeight:
@@ -176,8 +178,7 @@ def lower(draft: Draft) -> ir.Model:
     for layer, weight, step in jobs:
         write_layer(writer, layer, weight, step)
     _screen_products(writer)
-    _screen_averages(writer)
-    _screen_float_weights(writer, draft.model)
+    _screen_others(writer, draft.model)
     rewrite.sweep(draft.model)
     return draft.model
 
@@ -248,44 +249,40 @@ def _screen_products(writer: Writer) -> None:
 
     Convolutions are not affected: their output is read only through its pair.
     """
-    products = [
-        node
-        for node in writer.graph
-        if node.op_type in ("Gemm", "MatMul")
-        and all(map(is_dequantized, node.inputs[:2]))
-    ]
-    for node in products:
-        if _would_run_in_float(node):
-            _screen(writer, node)
+    for node in list(writer.graph):
+        if node.op_type not in ("Gemm", "MatMul"):
+            continue
+        if not all(map(is_dequantized, node.inputs[:2])):
+            continue
+        value = node.outputs[0]
+        readers = list(value.consumers())
+        if any(each.op_type == QUANTIZE for each in readers):
+            hidden = len(value.uses()) > 1 or value.is_graph_output()
+        elif len(readers) != 1:
+            hidden = False
+        elif node.op_type == "MatMul" and readers[0].op_type == "Add":
+            hidden = True
+        else:
+            # A Relu or Clip hides the layer, unless only pairs follow.
+            clipped = readers[0].outputs[0]
+            hidden = readers[0].op_type in ("Relu", "Clip") and (
+                clipped.is_graph_output()
+                or any(each.op_type != QUANTIZE for each in clipped.consumers())
+            )
+        if hidden:
+            rank = max(graph.rank_of(each) or 2 for each in node.inputs[:2])
+            same = writer.constant(np.zeros(rank, np.int64), f"same_{rank}")
+            _screen(writer, "Reshape", node, same)
 
 
-def _screen_averages(writer: Writer) -> None:
-    """Insert a Max of one tensor after averages that int8 would compute otherwise.
+def _screen_others(writer: Writer, model: ir.Model) -> None:
+    """Keep averages and float weights between pairs from what int8 would make of them.
 
     Given:   y = QuantizeLinear(AveragePool(DequantizeLinear(x)))
     Result:  y = QuantizeLinear(Max(AveragePool(DequantizeLinear(x))))
 
     onnxruntime (1.31) fuses the three whatever the pool's attributes are, and moves a
     QuantizeLinear through Reshape, Identity and Clip for it.
-    """
-    averages = [
-        node
-        for node in writer.graph
-        if is_average(node)
-        and is_dequantized(node.inputs[0])
-        and not has_average_kernel(node)
-    ]
-    for node in averages:
-        value = node.outputs[0]
-        screen = writer.node("Max", [value], f"{value.name}_screened", [node])
-        writer.graph.insert_after(node, screen)
-        screen.outputs[0].shape, screen.outputs[0].type = value.shape, value.type
-        rewrite.replace_value(value, screen.outputs[0])
-        screen.replace_input_with(0, value)
-
-
-def _screen_float_weights(writer: Writer, model: ir.Model) -> None:
-    """Insert a Sum of one operand behind layers that stay float between pairs.
 
     Given:   q = QuantizeLinear(Relu(ConvTranspose(DequantizeLinear(x), w)))
     Result:  q = QuantizeLinear(Sum(Relu(ConvTranspose(DequantizeLinear(x), w))))
@@ -293,6 +290,11 @@ def _screen_float_weights(writer: Writer, model: ir.Model) -> None:
     Without it onnxruntime (1.31) rounds the float weight to int8, with one scale in
     all, though it may have no int8 kernel for the layer.
     """
+    for node in list(writer.graph):
+        if not is_average(node) or not is_dequantized(node.inputs[0]):
+            continue
+        if not has_average_kernel(node):
+            _screen(writer, "Max", node)
     for layer, quantizer in list(rounded_layers(model)):
         value = quantizer.inputs[0]
         assert value is not None
@@ -302,30 +304,11 @@ def _screen_float_weights(writer: Writer, model: ir.Model) -> None:
         quantizer.replace_input_with(0, node.outputs[0])
 
 
-def _would_run_in_float(product: ir.Node) -> bool:
-    value = product.outputs[0]
-    readers = list(value.consumers())
-    if any(each.op_type == QUANTIZE for each in readers):
-        return len(value.uses()) > 1 or value.is_graph_output()
-    if len(readers) != 1:
-        return False
-    if product.op_type == "MatMul" and readers[0].op_type == "Add":
-        return True
-    # A Relu or Clip hides the layer, unless only pairs follow.
-    clipped = readers[0].outputs[0]
-    return readers[0].op_type in ("Relu", "Clip") and (
-        clipped.is_graph_output()
-        or any(each.op_type != QUANTIZE for each in clipped.consumers())
-    )
-
-
-def _screen(writer: Writer, product: ir.Node) -> None:
-    """Insert a Reshape to its own shape between a product and its readers."""
-    value = product.outputs[0]
-    rank = max(graph.rank_of(each) or 2 for each in product.inputs[:2])
-    same = writer.constant(np.zeros(rank, np.int64), f"same_{rank}")
-    node = writer.node("Reshape", [value, same], f"{value.name}_screened", [product])
-    writer.graph.insert_after(product, node)
+def _screen(writer: Writer, op: str, layer: ir.Node, *more: ir.Value) -> None:
+    """Insert a node without effect between a layer and its readers."""
+    value = layer.outputs[0]
+    node = writer.node(op, [value, *more], f"{value.name}_screened", [layer])
+    writer.graph.insert_after(layer, node)
     node.outputs[0].shape, node.outputs[0].type = value.shape, value.type
     rewrite.replace_value(value, node.outputs[0])
     node.replace_input_with(0, value)

@@ -25,9 +25,8 @@ from me2e_compress.quantization.plan import (
     share_scales,
     tensors_of,
 )
-from me2e_compress.targets.base import LintRule, Target
-from me2e_compress.targets.tensorrt.lint import rules
-from me2e_compress.targets.tensorrt.lint.support import version_of
+from me2e_compress.targets import LintRule, Target
+from me2e_compress.targets.tensorrt.lint.support import rules, version_of
 from me2e_compress.targets.weights import (
     QuantizedWeight,
     bias_by_channel,
@@ -105,9 +104,7 @@ class TensorRT(Target):
 
 
 def _with_room(
-    weights: Mapping[str, QuantizedWeight],
-    nodes: Mapping[str, ir.Node],
-    ranges: Ranges,
+    weights: Mapping[str, QuantizedWeight], nodes: Mapping[str, ir.Node], ranges: Ranges
 ) -> dict[str, QuantizedWeight]:
     """Leave room for the biases: TensorRT keeps them in float, onnxruntime does not.
 

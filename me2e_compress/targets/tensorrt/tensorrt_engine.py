@@ -4,7 +4,6 @@ import dataclasses
 import importlib
 import importlib.util
 import time
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal
 
@@ -49,15 +48,31 @@ def build_engine(path: Path, settings: EngineSettings) -> TensorRTEngine:
         PreconditionError: it lacks the precision, or refuses the graph; the message
             names the node.
     """
-    # Parse the graph with the user's plugins.
-    trt, begun = _tensorrt(), time.perf_counter()
-    log = _log(trt)
-    _load_plugins(trt, log, settings.plugins)
+    if importlib.util.find_spec("tensorrt") is None:
+        raise MissingPackageError("tensorrt")
+    try:
+        trt: Any = importlib.import_module("tensorrt")  # it has no types
+    except ImportError as error:  # its libraries are a package of their own
+        raise PreconditionError(f"tensorrt cannot be imported: {error}") from error
+    # Register TensorRT's own plugins, then those of the user.
+    begun, log = time.perf_counter(), _log(trt)
+    trt.init_libnvinfer_plugins(log, "")
+    for library in settings.plugins:
+        if not library.is_file():
+            raise PreconditionError(f"plugins library {library}: no such file")
+        if trt.get_plugin_registry().load_library(str(library)) is None:
+            raise PreconditionError(f"plugins library {library}: TensorRT refuses it")
     builder = trt.Builder(log)
     network = builder.create_network(0)
     parser = trt.OnnxParser(network, log)
     if not parser.parse_from_file(str(path)):
-        raise PreconditionError(f"{path}: {_refusal(trt, parser)}")
+        reason = "it and does not say why"
+        if parser.num_errors:
+            first, more = parser.get_error(0), parser.num_errors - 1
+            text = " ".join(str(first.desc()).split())
+            reason = f"{first.node_operator()} {first.node_name()!r}: {text}"
+            reason += f", and {more} more" if more else ""
+        raise PreconditionError(f"{path}: TensorRT {trt.__version__} refuses {reason}")
     # Set the types, and build.
     config = builder.create_builder_config()
     _set_types(trt, config, graph.load(path), settings.precision)
@@ -67,16 +82,6 @@ def build_engine(path: Path, settings: EngineSettings) -> TensorRTEngine:
         raise PreconditionError(f"{path}: TensorRT {trt.__version__}: {reason}")
     seconds = time.perf_counter() - begun
     return TensorRTEngine(bytes(built), trt.__version__, network.num_layers, seconds)
-
-
-def _tensorrt() -> Any:
-    """Import TensorRT, which has no types."""
-    if importlib.util.find_spec("tensorrt") is None:
-        raise MissingPackageError("tensorrt")
-    try:
-        return importlib.import_module("tensorrt")
-    except ImportError as error:  # its libraries are a package of their own
-        raise PreconditionError(f"tensorrt cannot be imported: {error}") from error
 
 
 def _log(trt: Any) -> Any:
@@ -92,27 +97,6 @@ def _log(trt: Any) -> Any:
                 self.lines.append(" ".join(message.split()))
 
     return Messages()
-
-
-def _load_plugins(trt: Any, log: Any, libraries: Sequence[Path]) -> None:
-    """Register TensorRT's own plugins, then those of the user."""
-    trt.init_libnvinfer_plugins(log, "")
-    for library in libraries:
-        if not library.is_file():
-            raise PreconditionError(f"plugins library {library}: no such file")
-        if trt.get_plugin_registry().load_library(str(library)) is None:
-            raise PreconditionError(f"plugins library {library}: TensorRT refuses it")
-
-
-def _refusal(trt: Any, parser: Any) -> str:
-    count = parser.num_errors
-    if not count:
-        return f"TensorRT {trt.__version__} refuses it and does not say why"
-    first = parser.get_error(0)
-    more = f", and {count - 1} more" if count > 1 else ""
-    where = f"{first.node_operator()} {first.node_name()!r}"
-    text = " ".join(str(first.desc()).split())
-    return f"TensorRT {trt.__version__} refuses {where}: {text}{more}"
 
 
 def _set_types(trt: Any, config: Any, model: ir.Model, precision: Precision) -> None:

@@ -30,7 +30,7 @@ from me2e_compress.evaluators.highway.observe import (
     scene_and_world,
     seen,
 )
-from me2e_compress.runtime.trajectory import Trajectory
+from me2e_compress.runtime.plan_adapter import Trajectory
 from me2e_compress.simulator.cameras import CameraRig, Cameras, paint_texture
 from me2e_compress.simulator.plane_geometry import Floats
 from me2e_compress.simulator.scene import Scene

@@ -25,14 +25,14 @@ from me2e_compress.passes.fold_constants import FoldConstants
 from me2e_compress.passes.import_normalize import ImportNormalize
 from me2e_compress.passes.quantize_int8 import QuantizeInt8
 from me2e_compress.quantization.plan import make_plan, tensors_of
-from me2e_compress.quantization.rules.paper_rules import PaperRules
+from me2e_compress.quantization.rules.rule_sets import PaperRules
 from me2e_compress.quantization.scheme import QuantScheme
 from me2e_compress.runtime.plan_adapter import PlanAdapter
 from me2e_compress.runtime.session import Session
 from me2e_compress.targets import onnxruntime
 from me2e_compress.targets.onnxruntime import OnnxRuntime
 from me2e_compress.targets.tensorrt import TensorRT
-from me2e_compress.targets.tensorrt.rtx import check
+from me2e_compress.targets.tensorrt.rtx_check import check
 from models.synthetic_frames import frames as drive
 from models.tests.vad.sizes import VadSize
 from models.vad.config import AGENT_MODES

@@ -39,7 +39,6 @@ def delicate(bad: int) -> ir.Model:
         weights[f"w{bad}"][3] /= 2000.0
     ports = ", ".join(f"float[32,32] w{at}" for at in range(LAYERS))
     text = (
-        '<ir_version: 9, opset_import: ["" : 17]>\n'
         f"deep (float[6,32] x, {ports}, float[32] spike, float[32] ones)"
         " => (float[1,6,2] plan) <int64[2] s = {0, 0}, int64[2] e = {6, 2},"
         " int64[1] z = {0}> {" + "\n".join(steps) + f' ["/head/cut"] c = Slice({value}'

@@ -7,8 +7,13 @@ import pytest
 
 from me2e_compress import graph
 from me2e_compress.errors import EvaluationError
-from me2e_compress.fidelity.sensitivity import Budget, Candidate, Int8Choice, search
-from me2e_compress.fidelity.sensitivity.search import nothing_fits
+from me2e_compress.fidelity.sensitivity import (
+    Budget,
+    Candidate,
+    Int8Choice,
+    nothing_fits,
+    search,
+)
 from me2e_compress.workflows.search import SearchResult
 from tests.fidelity.sensitivity.delicate import trials
 
@@ -77,7 +82,8 @@ def test_every_one_of_several_budgets_is_kept(tmp_path: Path) -> None:
 
 
 def test_what_fits_nothing_is_told_without_powers_of_ten() -> None:
-    said = nothing_fits([(1e5, "bytes")], [6_142_060.0], [[4_778_000.0]])
+    size = Budget(1e5, "bytes", weight_bytes)
+    said = nothing_fits([size], [6_142_060.0], [[4_778_000.0]])
 
     assert said == (
         "nothing fits 100,000 bytes: the float model costs 6,142,060 bytes, the least"

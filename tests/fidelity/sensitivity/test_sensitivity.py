@@ -11,9 +11,9 @@ from me2e_compress.fidelity.sensitivity import (
     Trials,
     advise,
     analyse,
+    names_of,
     write_recipe,
 )
-from me2e_compress.fidelity.sensitivity.analysis import names_of
 from me2e_compress.manager import recipe
 from me2e_compress.passes import Context
 from me2e_compress.passes.quantize_int8 import QuantizeInt8

@@ -21,10 +21,9 @@ from me2e_compress.operators.kernels import custom_ops, trampoline
 from me2e_compress.operators.kernels.kernel import CompiledKernel
 from me2e_compress.operators.kernels.machine_code import load_or_compile
 from me2e_compress.runtime.frames import Frame
-from me2e_compress.runtime.opening import open_graph
 from me2e_compress.runtime.providers import CpuProvider
 from me2e_compress.runtime.runnable import compiled_or_expanded
-from me2e_compress.runtime.session import Session
+from me2e_compress.runtime.session import Session, open_graph
 from me2e_compress.workflows.doctor import doctor
 from me2e_compress.workflows.first_opening import try_first
 from me2e_compress.workflows.listener import SILENT

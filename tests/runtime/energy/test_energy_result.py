@@ -8,12 +8,7 @@ import pytest
 
 from me2e_compress.errors import EnergyError
 from me2e_compress.runtime.energy import EnergyResult
-from me2e_compress.runtime.energy.energy_result import (
-    CountedBy,
-    DeviceState,
-    Window,
-    summarise,
-)
+from me2e_compress.runtime.energy.energy_result import DeviceState, Window, summarise
 
 NONE = EnergyResult(reason="no energy counter answers")
 FOUND = EnergyResult(
@@ -103,7 +98,7 @@ def test_what_is_no_energy_file_is_one_line(text: str, tmp_path: Path) -> None:
         EnergyResult.load(path)
 
 
-BY = CountedBy("nvml-total", "a GPU", "board", 0.1)
+BY = ("nvml-total", "a GPU", "board", 0.1)
 
 
 WINDOWS = [Window(10.0 * at, 10.0 * at + 10.0, 20, 200.0) for at in range(5)]

@@ -10,7 +10,7 @@ import pytest
 from me2e_compress.errors import EnergyError
 from me2e_compress.graph import sha256_of
 from me2e_compress.runtime.energy.energy_counter import EnergySchedule
-from me2e_compress.runtime.energy.models import measure_energy
+from me2e_compress.runtime.energy.meter import measure_energy
 from me2e_compress.runtime.frames import Array, Frame
 from tests.installed import install
 from tests.runtime.energy.clockwork import Clock

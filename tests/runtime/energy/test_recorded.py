@@ -8,8 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from me2e_compress.errors import EnergyError
-from me2e_compress.runtime.energy.energy_counter import EnergySchedule
-from me2e_compress.runtime.energy.recorded_energy import Recorded
+from me2e_compress.runtime.energy.energy_counter import EnergySchedule, Recorded
 
 SCHEDULE = EnergySchedule(warm_up_s=5, window_s=4, window_frames=10, idle_s=4)
 
@@ -98,18 +97,21 @@ def test_json_that_is_no_recording(text: str, tmp_path: Path) -> None:
         written(tmp_path / "r.json", text).open()
 
 
-def test_a_counter_that_stands_still_is_an_error(tmp_path: Path) -> None:
-    recording = written(tmp_path / "r.csv", as_csv(columns(watts=0.0))).open()
+@pytest.mark.parametrize(
+    ("watts", "schedule", "fault"),
+    [
+        (0.0, SCHEDULE, "stands still from 10 to 14 s"),
+        (None, EnergySchedule(), "3 windows of 10 s and 100 frames"),
+    ],
+)
+def test_a_recording_that_cannot_be_measured(
+    watts: float | None, schedule: EnergySchedule, fault: str, tmp_path: Path
+) -> None:
+    made = columns() if watts is None else columns(watts=watts)
+    recording = written(tmp_path / "r.csv", as_csv(made)).open()
 
-    with pytest.raises(EnergyError, match="stands still from 10 to 14 s"):
-        recording.measured(SCHEDULE)
-
-
-def test_too_short_a_recording(tmp_path: Path) -> None:
-    recording = written(tmp_path / "r.csv", as_csv(columns())).open()
-
-    with pytest.raises(EnergyError, match="3 windows of 10 s and 100 frames"):
-        recording.measured(EnergySchedule())
+    with pytest.raises(EnergyError, match=fault):
+        recording.measured(schedule)
 
 
 def test_a_recording_without_frames(tmp_path: Path) -> None:

@@ -26,7 +26,6 @@ Feeds = Mapping[str, Floats]
 FULL = QuantScheme.named("full", MODULES)
 
 BLOCK = """
-<ir_version: 9, opset_import: ["" : 17]>
 block (float[1,4,16,16] x, float[8,4,3,3] w1, float[8] b1, float[8,8,1,1] w2,
        float[8] b2, float[8,8,3,3] w3, float[8] b3, float[8,8,1,1] w4)
     => (float[1,8,8,8] y, float[1,8] pooled) {
@@ -49,7 +48,6 @@ BLOCK_SHAPES = {
 }  # fmt: skip
 
 LINEAR = """
-<ir_version: 9, opset_import: ["" : 17]>
 linear (float[2,12,8] x, float[6,5] t, float[8,16] w1, float[16] b1, float[16,8] w2,
         float[7,5] turned, float[7] b3)
     => (float[2,12,8] y, float[6,7] z, float[2,12,8] doubled) {
@@ -67,7 +65,6 @@ LINEAR_SHAPES = {
 
 
 MATMUL_RELU = """
-<ir_version: 9, opset_import: ["" : 17]>
 m (float[2,6,8] x) => (float[2,6,8] y)
 <int8[1,1] i = {3}, float s = {0.5}, int8 n = {0}, uint8 z = {128},
  int64[2] full = {8, 8}> {

@@ -174,7 +174,6 @@ def test_a_tensorrt_graph_has_the_range_of_an_average_behind_its_layout() -> Non
 
 
 ROW = """
-<ir_version: 9, opset_import: ["" : 17]>
 m (float[B,6,1,1] x, float[5,6,1,1] w, float[5] b, float[3,5,1,1] v)
     => (float[B,n,1,1] y) { BODY }
 """
@@ -220,8 +219,7 @@ def test_a_convolution_of_one_pixel_may_write_float(
 
 
 @pytest.mark.parametrize(
-    ("options", "shape"),
-    [("pads=[1,1,1,1]", (5, 6, 1, 1)), ("group=2", (6, 3, 1, 1))],
+    ("options", "shape"), [("pads=[1,1,1,1]", (5, 6, 1, 1)), ("group=2", (6, 3, 1, 1))]
 )
 def test_other_convolutions_of_a_pixel_write_uint8(
     options: str, shape: tuple[int, ...]

@@ -12,7 +12,6 @@ from tests.targets.onnxruntime.lowered import (
 )
 
 CHAIN = """
-<ir_version: 9, opset_import: ["" : 17]>
 chain (float[SHAPE8] x, float[8,16] w1, float[16,8] turned, float[16] b1,
        float[16,4] w2, float[4] b2) => (float[SHAPE4] y OUTPUTS) {
     LAYERS

@@ -25,7 +25,6 @@ from tests.targets.onnxruntime.lowered import (
 )
 
 STEM = """
-<ir_version: 9, opset_import: ["" : 17]>
 stem (float[1,{channels},{height},{width}] x, float[5,{channels},{kernel},{kernel}] w)
     => (float[?,?,?,?] y) {{
     y = Conv<{options}>(x, w)
@@ -123,7 +122,6 @@ def test_the_first_layer_of_a_backbone_reads_blocks_in_int8() -> None:
 
 def test_a_convolution_between_others_reads_their_uint8() -> None:
     text = """
-    <ir_version: 9, opset_import: ["" : 17]>
     narrow (float[1,4,8,8] x, float[3,4,1,1] w1, float[5,3,3,3] w2)
         => (float[1,5,4,4] y) {
         a = Conv(x, w1)

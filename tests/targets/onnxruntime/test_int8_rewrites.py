@@ -143,7 +143,6 @@ def test_what_lies_behind_rows_that_were_flattened() -> None:
 
 
 UP = """
-<ir_version: 9, opset_import: ["" : 17]>
 up (float[1,8,6,6] x, float[8,8,1,1] w, float[8,8,2,2] t, float[8] b, float[8,8,1,1] v)
     => (float[1,8,12,12] y) {
     c = Conv(x, w)

@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 
 from me2e_compress import graph
 from me2e_compress.quantization.plan import make_plan
-from me2e_compress.quantization.rules.paper_rules import PaperRules
+from me2e_compress.quantization.rules.rule_sets import PaperRules
 from me2e_compress.targets.onnxruntime import OnnxRuntime
 from tests.nets import net
 from tests.profiles import scaled
@@ -48,7 +48,6 @@ def test_numbers_are_those_of_rounding_both_operands(seed: int, reach: float) ->
 
 def test_weights_are_stored_as_int8_once_and_biases_as_int32() -> None:
     text = """
-    <ir_version: 9, opset_import: ["" : 17]>
     twice (float[3,4] x, float[4,4] w, float[4] b) => (float[3,4] y) {
         h = Gemm(x, w, b)
         y = Gemm(h, w, b)
@@ -68,7 +67,6 @@ def test_weights_are_stored_as_int8_once_and_biases_as_int32() -> None:
 
 def test_a_bias_too_large_for_its_channel_keeps_its_value() -> None:
     text = """
-    <ir_version: 9, opset_import: ["" : 17]>
     loud (float[3,4] x, float[4,2] w, float[2] b) => (float[3,2] y) {
         y = Gemm(x, w, b)
     }
@@ -92,7 +90,6 @@ def test_a_bias_too_large_for_its_channel_keeps_its_value() -> None:
 )
 def test_layers_without_a_kernel_stay_float(layer: str) -> None:
     text = f"""
-    <ir_version: 9, opset_import: ["" : 17]>
     odd (float[1,3,6,6] x, float[3] add, float[3,3,2,2] w) => (float[?,?,?,?] y) {{
         r = Sigmoid(x)
         late = Abs(add)
@@ -107,7 +104,6 @@ def test_layers_without_a_kernel_stay_float(layer: str) -> None:
 @pytest.mark.parametrize("attributes", ["alpha=0.5", "beta=2.0", "transA=1"])
 def test_a_gemm_with_factors_stays_float(attributes: str) -> None:
     text = f"""
-    <ir_version: 9, opset_import: ["" : 17]>
     odd (float[4,4] x, float[4,4] w, float[4] b) => (float[4,4] y) {{
         y = Gemm<{attributes}>(x, w, b)
     }}
@@ -120,7 +116,6 @@ def test_a_gemm_with_factors_stays_float(attributes: str) -> None:
 @pytest.mark.parametrize("shape", ["B,12,8", "B,T,8", "B,T,3,8"])
 def test_open_dimensions_stay_open(shape: str) -> None:
     text = f"""
-    <ir_version: 9, opset_import: ["" : 17]>
     open (float[{shape}] x, float[8,5] w, float[5] b) => (float[{shape[:-1]}5] y) {{
         m = MatMul(x, w)
         y = Add(m, b)
@@ -141,7 +136,6 @@ def test_open_dimensions_stay_open(shape: str) -> None:
 
 def test_a_constant_that_lends_a_product_its_columns_is_no_bias() -> None:
     text = """
-    <ir_version: 9, opset_import: ["" : 17]>
     lends (float[4,8] x, float[8,1] w, float[5] b) => (float[4,5] y) {
         m = MatMul(x, w)
         y = Add(m, b)

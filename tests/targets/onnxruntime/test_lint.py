@@ -1,5 +1,4 @@
 import numpy as np
-import onnx_ir as ir
 import pytest
 
 from me2e_compress.calibration.ranges import Ranges
@@ -7,10 +6,9 @@ from me2e_compress.quantization.plan import make_plan
 from me2e_compress.quantization.scheme import QuantScheme
 from me2e_compress.targets import TARGETS
 from me2e_compress.targets.onnxruntime import OnnxRuntime
-from tests.nets import MODULES, PAPER, net
+from tests.nets import MODULES, PAPER, net, parsed
 
 LAYER = """
-<ir_version: 9, opset_import: ["" : 17]>
 m (float[1,1,4,4] x, %(kind)s[1,1,4,4] ignored) => (float[1,1,4,4] y)
 <int8[1,1,1,1] w = {3}, float s = {0.5}, int8 n = {0}, %(kind)s z = {%(zero)d}> {
     q = QuantizeLinear(x, s, z)
@@ -39,7 +37,7 @@ def test_convolutions_that_run_slowly(
 ) -> None:
     text = LAYER % {"kind": kind, "zero": zero, "answer": answer}
 
-    found = OnnxRuntime().lint(ir.from_onnx_text(text))
+    found = OnnxRuntime().lint(parsed(text))
 
     assert [each.rule for each in found] == rules
     assert {each.severity for each in found} <= {"warning"}
@@ -57,7 +55,7 @@ def test_convolutions_that_run_slowly(
     ],
 )
 def test_operators_without_a_kernel(operator: str, remedy: str) -> None:
-    model = ir.from_onnx_text(
+    model = parsed(
         '<ir_version: 9, opset_import: ["" : 17, "trt" : 1]>'
         f"m (float[1,2,3,3] x) => (float[1,2,3,3] y) {{ y = {operator}(x) }}"
     )
@@ -69,7 +67,7 @@ def test_operators_without_a_kernel(operator: str, remedy: str) -> None:
 
 
 def test_contrib_operators_are_known() -> None:
-    model = ir.from_onnx_text(
+    model = parsed(
         '<ir_version: 9, opset_import: ["" : 17, "com.microsoft" : 1]>'
         "m (float[2] x) => (float[2] y) { y = com.microsoft.Gelu(x) }"
     )
@@ -77,7 +75,7 @@ def test_contrib_operators_are_known() -> None:
 
 
 def test_opsets_nobody_has_released() -> None:
-    model = ir.from_onnx_text(
+    model = parsed(
         '<ir_version: 9, opset_import: ["" : 99]>'
         "m (float[2] x) => (float[2] y) { y = Relu(x) }"
     )
@@ -86,7 +84,6 @@ def test_opsets_nobody_has_released() -> None:
 
 def test_a_float_convolution_behind_an_int8_one_needs_no_answer() -> None:
     text = """
-    <ir_version: 9, opset_import: ["" : 17]>
     up (float[1,8,4,4] x, float[8,8,1,1] w, float[8,8,2,2] t) => (float[1,8,8,8] y) {
         c = Conv(x, w)
         r = Relu(c)
@@ -115,8 +112,7 @@ def test_a_float_convolution_behind_an_int8_one_needs_no_answer() -> None:
 def test_pads_that_onnxruntime_folds_into_a_pool(
     before: str, pad: str, found: list[str]
 ) -> None:
-    model = ir.from_onnx_text(
-        '<ir_version: 9, opset_import: ["" : 17]>\n'
+    model = parsed(
         "m (float[1,1,2,2] x) => (float[1,1,2,2] y)\n"
         "<int64[8] p = {0,0,1,1,0,0,1,1}, float zero = {0.0}, float one = {1.0}>\n"
         f"{{ a = {before}(x) [edge] b = Pad(a, p{pad})"
@@ -136,7 +132,7 @@ SAMPLE = """
 
 
 def no_kernels(opset: int, signature: str, body: str) -> list[str]:
-    model = ir.from_onnx_text(
+    model = parsed(
         f'<ir_version: 9, opset_import: ["" : {opset}]> m {signature} {{ {body} }}'
     )
     return [

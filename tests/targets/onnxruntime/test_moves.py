@@ -8,13 +8,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 from onnx import helper
 
-from me2e_compress.targets.onnxruntime.kernels import (
+from me2e_compress.targets.onnxruntime.region import (
     MOVES,
     has_average_kernel,
     is_average,
     is_move,
+    never_negative,
 )
-from me2e_compress.targets.onnxruntime.region import never_negative
 from tests.targets.onnxruntime.draws import (
     AVERAGED,
     MOVED,

@@ -141,7 +141,6 @@ def test_a_missing_range_is_named() -> None:
 
 def test_a_matrix_with_leading_ones_is_one_matrix_with_a_bias() -> None:
     text = """
-    <ir_version: 9, opset_import: ["" : 17]>
     biased (float[2,4,32] x, float[1,32,16] w, float[16] b) => (float[2,4,16] y) {
         m = MatMul(x, w)
         y = Add(m, b)
@@ -157,7 +156,6 @@ def test_a_matrix_with_leading_ones_is_one_matrix_with_a_bias() -> None:
 
 def test_what_is_new_is_called_like_nothing_that_is_there() -> None:
     text = """
-    <ir_version: 9, opset_import: ["" : 17]>
     clash (float[1,4,8,8] x, float[8,4,1,1] w, float[8,8,1,1] x_float)
         => (float[1,8,8,8] y) {
         x_scale = Conv(x, w)
@@ -175,7 +173,6 @@ def test_what_is_new_is_called_like_nothing_that_is_there() -> None:
 
 
 KEPT = """
-<ir_version: 9, opset_import: ["" : 17]>
 kept (float[1,8,4,4] x, float[8,8,1,1] w, float[8,8,2,2] up, float[8,4,4] many)
     => (float[1,8,4,4] s, float[1,8,8,8] u, float[1,8,4,4] m) {
     c = Conv(x, w)

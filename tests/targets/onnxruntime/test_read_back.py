@@ -4,6 +4,7 @@ import onnx_ir as ir
 import pytest
 
 from me2e_compress.targets.onnxruntime import OnnxRuntime
+from tests.nets import parsed
 from tests.targets.onnxruntime.lowered import (
     MATMUL_RELU,
     calibrated,
@@ -116,7 +117,7 @@ def test_every_layer_of_a_form_runs_in_int8(name: str) -> None:
 
 
 def test_a_layer_that_onnxruntime_runs_in_float_is_named_as_in_the_file() -> None:
-    (found,) = OnnxRuntime().read_back(ir.from_onnx_text(MATMUL_RELU))
+    (found,) = OnnxRuntime().read_back(parsed(MATMUL_RELU))
 
     assert (found.severity, found.rule, found.node) == (
         "warning",

@@ -16,7 +16,6 @@ from tests.targets.onnxruntime.lowered import (
 )
 
 NECK = """
-<ir_version: 9, opset_import: ["" : 17]>
 neck (float[1,4,8,8] fine, float[1,4,4,4] coarse, float[6,4,1,1] w1, float[6,4,1,1] w2,
       float[6,6,3,3] w3) => (float[1,6,8,8] y)
 <float[4] scales = {1, 1, 2, 2}> {
@@ -77,7 +76,6 @@ def test_a_sum_that_no_layer_reads_stays_float() -> None:
 
 
 BODY = """
-<ir_version: 9, opset_import: ["" : 17]>
 body (float[1,4,8,8] fine, float[6,4,1,1] w1, float[6,6,1,1] w2)
     => (float[1,6,8,8] y) {
     c = Conv(fine, w1)
@@ -109,7 +107,6 @@ def test_a_relu_in_a_body_is_no_part_of_the_convolution_before_it() -> None:
 
 def test_a_bias_in_a_body_is_none_of_the_product_before_it() -> None:
     text = """
-    <ir_version: 9, opset_import: ["" : 17]>
     body (float[4,8] x, bool seen, float[8,6] w, float[6] b) => (float[4,6] y) {
         m = MatMul(x, w)
         y = If (seen) <then_branch = then () => (float[4,6] t) { t = Add(m, b) },

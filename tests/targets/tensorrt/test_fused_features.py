@@ -13,7 +13,7 @@ from me2e_compress.quantization.rules import RULE_SETS
 from me2e_compress.quantization.scheme import QuantScheme
 from me2e_compress.runtime.session import Session
 from me2e_compress.targets.tensorrt import TensorRT
-from me2e_compress.targets.tensorrt.rtx import check
+from me2e_compress.targets.tensorrt.rtx_check import check
 from tests.nets import MODULES, net
 
 SPARSE_DRIVE_V2 = """

@@ -13,14 +13,14 @@ from me2e_compress.quantization.rules import RULE_SETS
 from me2e_compress.quantization.scheme import QuantScheme
 from me2e_compress.targets import LintFinding
 from me2e_compress.targets.tensorrt import TensorRT
-from tests.nets import MODULES, conv_attention, net
+from tests.nets import MODULES, conv_attention, net, parsed
 
 FULL = QuantScheme.named("full", MODULES)
 RUNTIME = TensorRT(version="10.7")
 
 
 def found(text: str, opset: int = 17) -> list[tuple[str, str, str]]:
-    model = ir.from_onnx_text(f'<ir_version: 9, opset_import: ["" : {opset}]>' + text)
+    model = parsed(f'<ir_version: 9, opset_import: ["" : {opset}]>' + text)
     return [shown(each) for each in RUNTIME.lint(model)]
 
 
@@ -238,7 +238,6 @@ def test_a_rounded_projection_is_a_residual_branch() -> None:
 def test_graphs_of_other_quantizers_are_judged_the_same() -> None:
     """A pair on every input and on a weight that stays float, as AddQDQPairToWeight."""
     text = """
-    <ir_version: 9, opset_import: ["" : 17]>
     m (float[4,16] x, float[16,16] w) => (float[4,16] y)
     <float s = {0.5}, int8 z = {0}> {
         a = QuantizeLinear(x, s, z)

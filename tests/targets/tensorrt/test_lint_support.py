@@ -6,11 +6,7 @@ import pytest
 
 from me2e_compress.targets import TARGETS, LintFinding
 from me2e_compress.targets.tensorrt import TensorRT
-from me2e_compress.targets.tensorrt.lint.support import (
-    LATER,
-    SUPPORTED,
-    UNSUPPORTED,
-)
+from me2e_compress.targets.tensorrt.lint.support import LATER, SUPPORTED, UNSUPPORTED
 
 
 def found(text: str, opset: int = 17) -> list[LintFinding]:

@@ -11,7 +11,7 @@ from me2e_compress.calibration.ranges import Ranges
 from me2e_compress.errors import PreconditionError
 from me2e_compress.graph import provenance
 from me2e_compress.quantization.plan import make_plan, tensors_of
-from me2e_compress.quantization.rules.safe_rules import SafeRules
+from me2e_compress.quantization.rules.rule_sets import SafeRules
 from me2e_compress.quantization.scheme import QuantScheme
 from me2e_compress.runtime.session import run_once
 from me2e_compress.targets.tensorrt import TensorRT
@@ -118,7 +118,6 @@ def test_numbers_are_those_of_rounding_both_operands(seed: int, reach: float) ->
 
 def test_a_weight_two_layers_share_is_stored_once() -> None:
     text = """
-    <ir_version: 9, opset_import: ["" : 17]>
     twice (float[3,4] x, float[4,4] w) => (float[3,4] y) {
         h = MatMul(x, w)
         y = MatMul(h, w)
@@ -132,7 +131,6 @@ def test_a_weight_two_layers_share_is_stored_once() -> None:
 
 def test_a_weight_that_is_also_read_in_float_stays() -> None:
     text = """
-    <ir_version: 9, opset_import: ["" : 17]>
     tied (float[3,4] x, float[4,4] w) => (float[3,4] y, float[4,4] z) {
         y = MatMul(x, w)
         z = Relu(w)
@@ -144,7 +142,6 @@ def test_a_weight_that_is_also_read_in_float_stays() -> None:
 
 
 BLOCK = """
-<ir_version: 9, opset_import: ["" : 17]>
 block (float[1,4,5,5] x, float[4,4,3,3] w, float[4,4,1,1] v) => (float[1,4,5,5] y) {
     r = Relu(x)
     a = Conv<kernel_shape=[3,3], pads=[1,1,1,1]>(r, w)
@@ -172,7 +169,6 @@ def test_a_residual_branch_shares_the_pair_of_its_other_readers() -> None:
 
 def test_what_a_concat_joins_is_on_one_scale() -> None:
     text = """
-    <ir_version: 9, opset_import: ["" : 17]>
     join (float[9,16] a, float[9,16] b, float[16,16] w, float[32,16] v)
         => (float[9,16] k, float[9,16] m) {
         k = MatMul(a, w)
@@ -197,7 +193,6 @@ def test_what_a_concat_joins_is_on_one_scale() -> None:
 
 
 BATCHED = """
-<ir_version: 9, opset_import: ["" : 17]>
 batched (float[3,4,32] x, float[2,32] t, float[1,32,16] one, float[3,32,16] many,
          float[1,32,8] lends) => (float[3,4,16] a, float[3,4,16] b, float[1,2,8] c) {
     a = MatMul(x, one)
@@ -243,7 +238,6 @@ def test_products_by_batches_run_with_all_of_onnxruntimes_fusions() -> None:
 
 
 TIED = """
-<ir_version: 9, opset_import: ["" : 17]>
 tied (float[8,8] x, float[8,8] w) => (float[8,8] y) {
     x_scale = Gemm(x, w)
     x_DequantizeLinear = Relu(x_scale)

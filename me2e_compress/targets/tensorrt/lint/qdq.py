@@ -5,7 +5,8 @@ quantization". What TensorRT-RTX's parser accepts silently (scales by channel on
 activations, uint8) is an error here.
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
+from typing import TypeAlias
 
 import numpy as np
 import onnx_ir as ir
@@ -14,7 +15,7 @@ from me2e_compress import graph
 from me2e_compress.graph import CONVOLUTIONS, WEIGHTED, is_standard, nodes_of
 from me2e_compress.graph.shapes import extent
 from me2e_compress.operators import find, int8_inputs
-from me2e_compress.targets.base import LintFinding, error, warning
+from me2e_compress.targets import LintFinding, LintRule, error, warning
 from me2e_compress.targets.quantized import (
     DEQUANTIZE,
     PAIR,
@@ -24,30 +25,54 @@ from me2e_compress.targets.quantized import (
     pairs_of,
 )
 
+Check: TypeAlias = Callable[[ir.Node], str | None]
+"""Says what is wrong about one node; None if nothing is."""
+
+
+def _rule(
+    rule: str,
+    finding: Callable[[str, ir.Node | None, str], LintFinding],
+    nodes: Callable[[ir.Model], Iterable[ir.Node]] = pairs_of,
+) -> Callable[[Check], LintRule]:
+    """Make a rule of a check of one node: by default of every node of a pair."""
+
+    def of(check: Check) -> LintRule:
+        def lint(model: ir.Model) -> Iterator[LintFinding]:
+            for node in nodes(model):
+                if message := check(node):
+                    yield finding(rule, node, message)
+
+        return lint
+
+    return of
+
 
 def stored(value: ir.Value | None) -> bool:
     """Return whether a value is an initializer or a Constant."""
     return graph.array_of(value) is not None
 
 
-def scales(model: ir.Model) -> Iterator[LintFinding]:
+@_rule("scale", error)
+def scales(node: ir.Node) -> str | None:
     """Check that scales are constants, finite and above 0."""
-    for node in pairs_of(model):
-        scale = graph.array_of(node.inputs[1])
-        if scale is None:
-            yield error("scale", node, "the scale is computed, must be a constant")
-            continue
-        numbers = scale.astype(np.float64)
-        if not np.isfinite(numbers).all() or not (numbers > 0).all():
-            worst = float(numbers.min())
-            yield error("scale", node, f"scale {worst:g}, must be finite and above 0")
+    scale = graph.array_of(node.inputs[1])
+    if scale is None:
+        return "the scale is computed, must be a constant"
+    numbers = scale.astype(np.float64)
+    if np.isfinite(numbers).all() and (numbers > 0).all():
+        return None
+    return f"scale {float(numbers.min()):g}, must be finite and above 0"
 
 
 def zero_points(model: ir.Model) -> Iterator[LintFinding]:
     """Check that quantization is symmetric: zero points are 0, of type int8."""
     for node in pairs_of(model):
-        value = graph.input_at(node, 2)
-        kind = _integer_type(node, value)
+        value, source = graph.input_at(node, 2), node.inputs[0]
+        # The integer type is that of the tensor, else the zero point's, else uint8.
+        kind = None if value is None else value.dtype
+        stored_as = None if source is None else source.dtype
+        if node.op_type == DEQUANTIZE and stored_as is not None:
+            kind = stored_as
         if kind != ir.DataType.INT8:
             name = "uint8" if kind is None else kind.name.lower()
             yield error("quantized-type", node, f"{name}, must be int8")
@@ -59,20 +84,20 @@ def zero_points(model: ir.Model) -> Iterator[LintFinding]:
             yield error("zero-point", node, f"zero point {found}, must be 0")
 
 
-def biases(model: ir.Model) -> Iterator[LintFinding]:
+@_rule("bias-pair", error, nodes_of)
+def biases(node: ir.Node) -> str | None:
     """Check that biases are float: no pair, no int32 before a DequantizeLinear."""
-    for node in nodes_of(model):
-        if node.op_type not in (*graph.CONVOLUTIONS, "Gemm"):
-            continue
-        if is_dequantized(graph.bias_of(node)):
-            yield error("bias-pair", node, "the bias is quantized, must be float")
+    biased = node.op_type in (*graph.CONVOLUTIONS, "Gemm")
+    if biased and is_dequantized(graph.bias_of(node)):
+        return "the bias is quantized, must be float"
+    return None
 
 
-def scalars(model: ir.Model) -> Iterator[LintFinding]:
+@_rule("scalar-pair", error)
+def scalars(node: ir.Node) -> str | None:
     """Check that quantized tensors have at least one dimension."""
-    for node in pairs_of(model):
-        if graph.static_shape(node.inputs[0]) == ():
-            yield error("scalar-pair", node, f"{node.op_type} of a 0-D tensor")
+    scalar = graph.static_shape(node.inputs[0]) == ()
+    return f"{node.op_type} of a 0-D tensor" if scalar else None
 
 
 def completeness(model: ir.Model) -> Iterator[LintFinding]:
@@ -81,119 +106,95 @@ def completeness(model: ir.Model) -> Iterator[LintFinding]:
     A plugin that takes int8, and its scale as another input, may also read it.
     """
     for node in pairs_of(model):
-        if node.op_type == QUANTIZE:
-            yield from _readers(node)
-        elif not stored(node.inputs[0]) and not is_quantized(node.inputs[0]):
-            made = graph.producer_of(node.inputs[0])
+        for message in _unpaired(node):
+            yield error("unpaired", node, message)
+
+
+def _unpaired(node: ir.Node) -> Iterator[str]:
+    """Say what lacks of one node of a pair."""
+    source, result = node.inputs[0], node.outputs[0]
+    if node.op_type != QUANTIZE:
+        if not stored(source) and not is_quantized(source):
+            made = graph.producer_of(source)
             what = "a graph input" if made is None else made.op_type
-            yield error("unpaired", node, f"reads integers of {what}")
-
-
-def _readers(node: ir.Node) -> Iterator[LintFinding]:
-    result = node.outputs[0]
+            yield f"reads integers of {what}"
+        return
     if result.is_graph_output():
-        yield error("unpaired", node, "its integers are a graph output")
+        yield "its integers are a graph output"
     readers = list(result.consumers())
     for reader in readers:
-        if _takes_integers(reader):
+        # A plugin may take int8 features, and have their scale.
+        plugin = find(reader) if int8_inputs(reader) else None
+        at = None if plugin is None else plugin[1].int8_scale
+        if at is not None and graph.input_at(reader, at) is not None:
             continue
         if reader.op_type != DEQUANTIZE or not is_standard(reader):
-            yield error("unpaired", node, f"its integers are read by {reader.op_type}")
-        elif not _same_scale(node, reader):
-            yield error("unpaired", node, "quantized and dequantized on two scales")
-    if not readers and not result.is_graph_output():
-        yield error("unpaired", node, "nothing reads its integers")
-
-
-def _takes_integers(plugin: ir.Node) -> bool:
-    """Return whether a plugin takes int8 features and has their scale."""
-    found = find(plugin) if int8_inputs(plugin) else None
-    at = None if found is None else found[1].int8_scale
-    return at is not None and graph.input_at(plugin, at) is not None
-
-
-def integers(model: ir.Model) -> Iterator[LintFinding]:
-    """Check that indices and shapes are not computed from dequantized numbers."""
-    whole = {ir.DataType.INT32.value, ir.DataType.INT64.value}
-    for node in nodes_of(model):
-        if node.op_type != "Cast" or not is_dequantized(node.inputs[0]):
+            yield f"its integers are read by {reader.op_type}"
             continue
-        if node.attributes.get_int("to", 0) in whole:
-            yield error(
-                "integer-pair",
-                node,
-                "a dequantized tensor is cast to an index or shape",
-            )
+        left, right = (graph.array_of(each.inputs[1]) for each in (node, reader))
+        if left is not None and right is not None and not np.array_equal(left, right):
+            yield "quantized and dequantized on two scales"
+    if not readers and not result.is_graph_output():
+        yield "nothing reads its integers"
 
 
-def _same_scale(one: ir.Node, other: ir.Node) -> bool:
-    left, right = graph.array_of(one.inputs[1]), graph.array_of(other.inputs[1])
-    return left is None or right is None or np.array_equal(left, right)
-
-
-def _integer_type(node: ir.Node, zero: ir.Value | None) -> ir.DataType | None:
-    """Return the integer type: the zero point's, else the tensor's, else uint8."""
-    if node.op_type == DEQUANTIZE and node.inputs[0] is not None:
-        kind = node.inputs[0].dtype
-        if kind is not None:
-            return kind
-    if zero is not None and zero.dtype is not None:
-        return zero.dtype
-    return ir.DataType.UINT8 if zero is None else None
+@_rule("integer-pair", error, nodes_of)
+def integers(node: ir.Node) -> str | None:
+    """Check that indices and shapes are not computed from dequantized numbers."""
+    if node.op_type != "Cast" or not is_dequantized(node.inputs[0]):
+        return None
+    whole = (ir.DataType.INT32.value, ir.DataType.INT64.value)
+    if node.attributes.get_int("to", 0) not in whole:
+        return None
+    return "a dequantized tensor is cast to an index or shape"
 
 
 def channel_scales(model: ir.Model) -> Iterator[LintFinding]:
     """Check that activations have one scale, and weights one or one per channel."""
     for node in pairs_of(model):
-        scale = graph.static_shape(node.inputs[1])
+        scale, value = graph.static_shape(node.inputs[1]), node.inputs[0]
         # One scale is always allowed.
         if not scale or scale == (1,):
             continue
+        of_weight = stored(value) or (is_quantized(value) and _only_stored(value))
         if len(scale) > 1:
             yield error(
                 "channel-scale", node, f"scales of shape {list(scale)}: by block"
             )
-        elif not _is_weight(node):
+        elif not of_weight:
             yield error("channel-scale", node, "an activation has one scale a channel")
         elif "axis" not in node.attributes:
             yield error("weight-axis", node, "no axis: ONNX takes 1, TensorRT takes 0")
         elif node.op_type == DEQUANTIZE:
-            yield from _axis(node)
+            for message in _wrong_axes(node, scale):
+                yield error("weight-axis", node, message)
 
 
-def _axis(node: ir.Node) -> Iterator[LintFinding]:
-    shape, scale = (
-        graph.static_shape(node.inputs[0]),
-        graph.static_shape(node.inputs[1]),
-    )
-    axis = node.attributes.get_int("axis", 1)
-    if shape is None or scale is None:
+def _wrong_axes(node: ir.Node, scale: tuple[int, ...]) -> Iterator[str]:
+    """Say where scales run along another axis than that of the output channels."""
+    shape, axis = graph.static_shape(node.inputs[0]), node.attributes.get_int("axis", 1)
+    if shape is None:
         return
-    # Scales must match the axis, and that the output channels.
     axis += len(shape) if axis < 0 else 0
     if axis >= len(shape) or shape[axis] != scale[0]:
-        yield error(
-            "weight-axis", node, f"{scale[0]} scales along axis {axis} of {list(shape)}"
-        )
+        yield f"{scale[0]} scales along axis {axis} of {list(shape)}"
         return
     # The axis must be that of each reader's channels.
     for reader in node.outputs[0].consumers():
         if reader.op_type in WEIGHTED and reader.inputs[1] is node.outputs[0]:
             wanted = graph.channel_axis(reader)
             if axis != wanted:
-                yield error(
-                    "weight-axis",
-                    node,
+                yield (
                     f"scales along axis {axis}; output channels of {reader.op_type}"
-                    f" run along {wanted}",
+                    f" run along {wanted}"
                 )
 
 
-def repeated_pairs(model: ir.Model) -> Iterator[LintFinding]:
+@_rule("repeated-pair", warning)
+def repeated_pairs(node: ir.Node) -> str | None:
     """Find tensors that are quantized twice in a row."""
-    for node in pairs_of(model):
-        if node.op_type == QUANTIZE and is_dequantized(node.inputs[0]):
-            yield warning("repeated-pair", node, "quantizes what was just dequantized")
+    repeated = node.op_type == QUANTIZE and is_dequantized(node.inputs[0])
+    return "quantizes what was just dequantized" if repeated else None
 
 
 def outputs(model: ir.Model) -> Iterator[LintFinding]:
@@ -205,61 +206,53 @@ def outputs(model: ir.Model) -> Iterator[LintFinding]:
             )
 
 
-def branches(model: ir.Model) -> Iterator[LintFinding]:
+@_rule("residual-branch", warning, nodes_of)
+def branches(node: ir.Node) -> str | None:
     """Find pairs between a convolution and its Add: only the residual may have one."""
-    for node in nodes_of(model):
-        if node.op_type != "Add" or not is_standard(node):
+    if node.op_type != "Add" or not is_standard(node):
+        return None
+    if any(map(_is_convolution, node.inputs)):
+        return None
+    for value in node.inputs:
+        # A pair of a convolution that nothing else reads.
+        if value is None or not is_dequantized(value) or len(value.uses()) != 1:
             continue
-        # One operand may be quantized: the residual.
-        rounded = [_rounds_convolution(value) for value in node.inputs]
-        if any(rounded) and not any(_is_convolution(value) for value in node.inputs):
-            yield warning(
-                "residual-branch",
-                node,
-                "a pair between a convolution and its Add keeps the two from fusing",
-            )
+        dequantize = value.producer()
+        assert dequantize is not None
+        quantize = graph.producer_of(dequantize.inputs[0])
+        source = None if quantize is None else quantize.inputs[0]
+        if _is_convolution(source) and source is not None and len(source.uses()) == 1:
+            return "a pair between a convolution and its Add keeps the two from fusing"
+    return None
 
 
-def half_quantized(model: ir.Model) -> Iterator[LintFinding]:
+@_rule("half-quantized", warning, nodes_of)
+def half_quantized(node: ir.Node) -> str | None:
     """Find layers with only one int8 operand.
 
     A matrix-vector product may have a float activation: its weight decides its speed.
     """
-    for node in nodes_of(model):
-        if node.op_type not in WEIGHTED or not is_standard(node):
-            continue
-        # Tell which operand is float: the remedy differs.
-        sides = [is_dequantized(value) for value in node.inputs[:2]]
-        if sides == [True, False]:
-            yield warning(
-                "half-quantized", node, "its weight is float: it runs in float"
-            )
-        elif sides == [False, True] and not _only_stored(node.inputs[1]):
-            yield warning("half-quantized", node, "only one operand is int8")
-        elif sides == [False, True] and not _is_vector(node):
-            yield warning(
-                "half-quantized", node, "its activation is float: it runs in float"
-            )
+    if node.op_type not in WEIGHTED or not is_standard(node):
+        return None
+    # Tell which operand is float: the remedy differs.
+    sides = [is_dequantized(value) for value in node.inputs[:2]]
+    if sides == [True, False]:
+        return "its weight is float: it runs in float"
+    if sides != [False, True]:
+        return None
+    if not _only_stored(node.inputs[1]):
+        return "only one operand is int8"
+    product = node.op_type in ("Gemm", "MatMul")
+    if product and extent(node, weight=True).is_vector:
+        return None
+    return "its activation is float: it runs in float"
 
 
-def float_weights(model: ir.Model) -> Iterator[LintFinding]:
+@_rule("float-weight", warning)
+def float_weights(node: ir.Node) -> str | None:
     """Find weights stored as float and quantized when the engine is built."""
-    for node in pairs_of(model):
-        value = node.inputs[0]
-        if node.op_type == QUANTIZE and stored(value):
-            yield warning("float-weight", node, "the weight is stored as float")
-
-
-def _is_vector(node: ir.Node) -> bool:
-    """Return whether a layer is a matrix-vector product."""
-    products = ("Gemm", "MatMul")
-    return node.op_type in products and extent(node, weight=True).is_vector
-
-
-def _is_weight(node: ir.Node) -> bool:
-    """Return whether a pair quantizes a constant."""
-    value = node.inputs[0]
-    return stored(value) or (is_quantized(value) and _only_stored(value))
+    floats = node.op_type == QUANTIZE and stored(node.inputs[0])
+    return "the weight is stored as float" if floats else None
 
 
 def _only_stored(value: ir.Value | None) -> bool:
@@ -270,16 +263,22 @@ def _only_stored(value: ir.Value | None) -> bool:
     return stored(value)
 
 
-def _rounds_convolution(value: ir.Value | None) -> bool:
-    """Return whether a value is a pair of a convolution without other readers."""
-    if value is None or not is_dequantized(value) or len(value.uses()) != 1:
-        return False
-    node = value.producer()
-    quantize = None if node is None else graph.producer_of(node.inputs[0])
-    source = quantize.inputs[0] if quantize is not None else None
-    return _is_convolution(source) and source is not None and len(source.uses()) == 1
-
-
 def _is_convolution(value: ir.Value | None) -> bool:
     node = graph.producer_of(value)
     return node is not None and node.op_type in CONVOLUTIONS
+
+
+RULES: tuple[LintRule, ...] = (
+    scales,
+    zero_points,
+    biases,
+    scalars,
+    completeness,
+    integers,
+    channel_scales,
+    repeated_pairs,
+    outputs,
+    branches,
+    half_quantized,
+    float_weights,
+)

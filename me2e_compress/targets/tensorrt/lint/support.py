@@ -27,8 +27,9 @@ from me2e_compress.graph.nodes import is_plugin
 from me2e_compress.graph.shapes import unshaped_plugins
 from me2e_compress.operators import OWN_DOMAIN, Dialect, operators
 from me2e_compress.operators.dialect import INT32
-from me2e_compress.targets.base import LintFinding, error, warning
+from me2e_compress.targets import LintFinding, LintRule, error, of_opset, valid, warning
 from me2e_compress.targets.quantized import PAIR
+from me2e_compress.targets.tensorrt.lint import qdq
 
 _FLOAT = frozenset({ir.DataType.FLOAT, ir.DataType.FLOAT16, ir.DataType.BFLOAT16})
 _HALF = _FLOAT - {ir.DataType.BFLOAT16}
@@ -80,7 +81,7 @@ LATER: dict[str, str] = {
 """Operators that TensorRT 10.1 did not support, and the version that brought them."""
 
 TYPES_LATER: dict[str, tuple[frozenset[ir.DataType], str]] = {
-    "Pow": (_NUMBER - _FLOAT, "10.12"),
+    "Pow": (_NUMBER - _FLOAT, "10.12")
 }
 """Element types that came to an operator after 10.1, and the version that did it."""
 
@@ -220,7 +221,10 @@ class Parser:
         """Find data of a type that its operator does not accept."""
         for node in nodes_of(model):
             taken = SUPPORTED.get(node.op_type) if is_standard(node) else None
-            kind = _data_type(node)
+            value = input_at(node, _DATA_INPUT.get(node.op_type, 0))
+            if node.op_type in _TYPE_OF_OUTPUT:
+                value = node.outputs[0]
+            kind = None if value is None else value.dtype
             if taken is None or kind is None:
                 continue
             what = f"{node.op_type} of {kind.name.lower()}"
@@ -256,11 +260,8 @@ def one_type(model: ir.Model) -> Iterator[LintFinding]:
         kinds = {each.dtype for each in node.inputs if each is not None}
         found = [each.name.lower() for each in floats if each in kinds]
         if len(found) > 1:
-            yield error(
-                "mixed-types",
-                node,
-                f"{node.op_type} of {' and '.join(found)}: cast one of them",
-            )
+            message = f"{node.op_type} of {' and '.join(found)}: cast one of them"
+            yield error("mixed-types", node, message)
 
 
 def plugins(model: ir.Model) -> Iterator[LintFinding]:
@@ -275,7 +276,8 @@ def plugins(model: ir.Model) -> Iterator[LintFinding]:
         # A local function makes an unknown operator acceptable.
         plugin = known.get(node.op_type)
         if plugin is not None:
-            yield from _call(node, plugin)
+            for message in _misfits(node, plugin):
+                yield error("plugin", node, message)
         elif node.op_identifier() not in model.functions:
             yield error(
                 "plugin",
@@ -285,55 +287,40 @@ def plugins(model: ir.Model) -> Iterator[LintFinding]:
             )
 
 
-def plugin_shapes(model: ir.Model) -> Iterator[LintFinding]:
-    """Find known plugins whose outputs have no shape, nor what follows them."""
-    known = known_plugins()
-    for node in unshaped_plugins(model):
-        if node.op_type not in known:
-            continue
-        yield warning(
-            "plugin-shape",
-            node,
-            f"{node.op_type} tells no shape of what it gives: written as value_info,"
-            " folding, MACs and int8 go on behind it",
-        )
-
-
-def _call(node: ir.Node, plugin: Plugin) -> Iterator[LintFinding]:
+def _misfits(node: ir.Node, plugin: Plugin) -> Iterator[str]:
+    """Say where a node does not fit the plugin of its name."""
     name, (least, most) = f"{node.op_type} of {plugin.source}", plugin.inputs
     if not least <= len(node.inputs) <= most:
         wanted = f"{least}" if least == most else f"{least} to {most}"
-        yield error(
-            "plugin", node, f"{name} takes {wanted} inputs, not {len(node.inputs)}"
-        )
+        yield f"{name} takes {wanted} inputs, not {len(node.inputs)}"
         return
     # Check attributes, then type and rank of the first input.
     if missing := [each for each in plugin.attributes if each not in node.attributes]:
-        yield error("plugin", node, f"{name} needs attributes {', '.join(missing)}")
+        yield f"{name} needs attributes {', '.join(missing)}"
     first = node.inputs[0]
-    kind = None if first is None else first.dtype
+    kind, rank = None if first is None else first.dtype, rank_of(first)
     if kind is not None and kind not in plugin.types:
-        yield error("plugin", node, f"{name} does not take {kind.name.lower()}")
-    rank = rank_of(first)
+        yield f"{name} does not take {kind.name.lower()}"
     if None not in (rank, plugin.rank) and rank != plugin.rank:
-        yield error("plugin", node, f"{name} takes rank {plugin.rank}, not {rank}")
+        yield f"{name} takes rank {plugin.rank}, not {rank}"
     # Indices must be int32.
     for index in plugin.integers:
         value = node.inputs[index]
         if value is not None and value.dtype not in (None, ir.DataType.INT32):
-            yield error(
-                "plugin",
+            yield f"input {index} of {name} must be int32, not {value.dtype}"
+
+
+def plugin_shapes(model: ir.Model) -> Iterator[LintFinding]:
+    """Find known plugins whose outputs have no shape, nor what follows them."""
+    known = known_plugins()
+    for node in unshaped_plugins(model):
+        if node.op_type in known:
+            yield warning(
+                "plugin-shape",
                 node,
-                f"input {index} of {name} must be int32, not {value.dtype}",
+                f"{node.op_type} tells no shape of what it gives: written as"
+                " value_info, folding, MACs and int8 go on behind it",
             )
-
-
-def _data_type(node: ir.Node) -> ir.DataType | None:
-    if node.op_type in _TYPE_OF_OUTPUT:
-        return node.outputs[0].dtype
-    index = _DATA_INPUT.get(node.op_type, 0)
-    value = input_at(node, index)
-    return None if value is None else value.dtype
 
 
 MAX_K = 3840
@@ -399,6 +386,10 @@ def _no_reduction(node: ir.Node) -> str | None:
     return None if found == "none" else f"reduction {found}, must be none"
 
 
+def _no_layout(node: ir.Node) -> str | None:
+    return "layout must be 0" if node.attributes.get_int("layout", 0) else None
+
+
 def _resize(node: ir.Node) -> str | None:
     text = node.attributes.get_string
     mode = text("mode", "nearest")
@@ -419,10 +410,6 @@ def _even_pads(node: ir.Node) -> str | None:
     if pads[:half] == pads[half:]:
         return None
     return f"pads {list(pads)} differ between begin and end"
-
-
-def _no_layout(node: ir.Node) -> str | None:
-    return "layout must be 0" if node.attributes.get_int("layout", 0) else None
 
 
 _CHECKS: dict[str, tuple[Callable[[ir.Node], str | None], ...]] = {
@@ -450,3 +437,11 @@ _CHECKS: dict[str, tuple[Callable[[ir.Node], str | None], ...]] = {
         )
     },
 }  # fmt: skip
+
+
+def rules(version: Version | None) -> tuple[LintRule, ...]:
+    """Return the rules for a version of TensorRT; None for any since 10.1."""
+    parser = Parser(version)
+    tables = (parser.opset, parser.operators, parser.element_types)
+    shapes = (one_type, plugins, plugin_shapes, restrictions)
+    return (valid, of_opset, *tables, *shapes, *qdq.RULES)

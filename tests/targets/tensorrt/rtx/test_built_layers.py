@@ -1,8 +1,4 @@
-from me2e_compress.targets.tensorrt.rtx.check import (
-    Kernel,
-    read_kernels,
-    without_int8,
-)
+from me2e_compress.targets.tensorrt.rtx_check import Kernel, read_kernels, without_int8
 
 PLAN = (
     b'\x00\x01 t={ name="in" shape={ 1 3 } type=int8 } t={ name="w" type=int8 }'

@@ -11,8 +11,8 @@ from me2e_compress.errors import MissingExtraError, RecipeError
 from me2e_compress.quantization.plan import make_plan, stamp_plan, tensors_of
 from me2e_compress.quantization.scheme import QuantScheme
 from me2e_compress.targets.tensorrt import TensorRT
-from me2e_compress.targets.tensorrt.rtx import check
-from tests.nets import MODULES, PAPER, conv_attention, net
+from me2e_compress.targets.tensorrt.rtx_check import check
+from tests.nets import MODULES, PAPER, conv_attention, net, parsed
 from tests.targets.tensorrt.layers import layers
 
 RTX = pytest.mark.skipif(
@@ -48,7 +48,6 @@ def test_every_kind_of_layer_is_taken_with_its_channels() -> None:
 
 def residual() -> ir.Model:
     text = """
-    <ir_version: 9, opset_import: ["" : 17]>
     block (float[1,4,5,5] x, float[4,4,3,3] w) => (float[1,4,5,5] y) {
         r = Relu(x)
         a = Conv<kernel_shape=[3,3], pads=[1,1,1,1]>(r, w)
@@ -83,7 +82,6 @@ def test_a_plan_that_the_graph_does_not_keep_is_found_out() -> None:
 @RTX
 def test_what_the_parser_refuses_is_named() -> None:
     text = """
-    <ir_version: 9, opset_import: ["" : 17]>
     m (float[2,4] x) => (float[2,4] y)
     <float s = {0.5}, int8 z = {3}> {
         q = QuantizeLinear(x, s, z)
@@ -91,7 +89,7 @@ def test_what_the_parser_refuses_is_named() -> None:
         y = Relu(d)
     }
     """
-    found = check(ir.from_onnx_text(text), build=False)
+    found = check(parsed(text), build=False)
 
     assert not found.passed
     assert found.built is None

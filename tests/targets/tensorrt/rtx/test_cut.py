@@ -3,7 +3,7 @@ import pytest
 
 from me2e_compress import graph
 from me2e_compress.errors import PreconditionError
-from me2e_compress.targets.tensorrt.rtx.check import cut
+from me2e_compress.targets.tensorrt.rtx_check import cut
 
 HEAD = '<ir_version: 9, opset_import: ["" : 17, "trt" : 1]>'
 ROTATED = (

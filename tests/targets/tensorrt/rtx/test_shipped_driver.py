@@ -15,7 +15,7 @@ from me2e_compress.quantization.rules import RULE_SETS
 from me2e_compress.quantization.scheme import QuantScheme
 from me2e_compress.shipped.drivers import shipped
 from me2e_compress.targets.tensorrt import TensorRT
-from me2e_compress.targets.tensorrt.rtx import check
+from me2e_compress.targets.tensorrt.rtx_check import check
 
 SCHEMES = ("feature-ext", "prediction", "full")
 

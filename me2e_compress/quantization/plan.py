@@ -1,4 +1,4 @@
-"""Decide for every node of a graph."""
+"""The plan: for every node, int8 or float, by which rule, and why."""
 
 import dataclasses
 import functools
@@ -19,24 +19,55 @@ from me2e_compress.graph import (
 from me2e_compress.graph.shapes import is_one_matrix
 from me2e_compress.operators import int8_inputs
 from me2e_compress.quantization.costs import CostsOf
-from me2e_compress.quantization.plan.decision import (
+from me2e_compress.quantization.decision import (
     FLOAT,
     INT8,
+    NONE,
     RESIDUAL,
     Decision,
+    KeptFloat,
+    Overrides,
+    Pins,
+    PlanDifference,
     QuantPlan,
     ScaleGroup,
+    differences,
+    load_plan,
+    plan_of,
+    save_plan,
+    stamp_plan,
 )
-from me2e_compress.quantization.plan.overrides import NONE, Overrides, Pins
 from me2e_compress.quantization.rules import (
     DEFAULT_RULES,
     RULE_SETS,
+    Objection,
     Rule,
     RuleFacts,
     RuleSet,
 )
-from me2e_compress.quantization.rules.base import Objection
 from me2e_compress.quantization.scheme import QuantScheme
+
+__all__ = [
+    "FLOAT",
+    "INT8",
+    "RESIDUAL",
+    "Decision",
+    "KeptFloat",
+    "Overrides",
+    "PlanDifference",
+    "QuantPlan",
+    "ScaleGroup",
+    "SharingCost",
+    "differences",
+    "load_plan",
+    "make_plan",
+    "plan_of",
+    "save_plan",
+    "share_scales",
+    "sharing_costs",
+    "stamp_plan",
+    "tensors_of",
+]
 
 # Find tensors whose scales are decided together.
 
@@ -96,26 +127,26 @@ def _concats(
             for value in (result, *node.inputs):
                 if value is not None:
                     join(head, value)
-    found = (_concat(head, values, readers) for head, values in members.items())
-    return [group for group in found if len(group.tensors) > 1]
-
-
-def _concat(
-    head: ir.Node, values: list[ir.Value], readers: Mapping[ir.Value, list[str]]
-) -> ScaleGroup:
-    read = [value for value in values if value in readers]
-    nodes = dict.fromkeys(name for value in read for name in readers[value])
-    tensors = tuple(str(value.name) for value in read)
-    return ScaleGroup(CONCAT, head.name or tensors[0], tensors, tuple(nodes))
+    # of each group what is read as int8, and by whom
+    groups = list[ScaleGroup]()
+    for head, values in members.items():
+        read = [value for value in values if value in readers]
+        nodes = dict.fromkeys(name for value in read for name in readers[value])
+        tensors = tuple(str(value.name) for value in read)
+        if len(tensors) > 1:
+            name = head.name or tensors[0]
+            groups.append(ScaleGroup(CONCAT, name, tensors, tuple(nodes)))
+    return groups
 
 
 def share_scales(plan: QuantPlan, ranges: Ranges) -> Ranges:
     """Widen ranges so that the tensors of a concat group have one."""
     widened = dict(ranges.tensors)
-    for group in _shared(plan, ranges):
-        bounds = [widened[name] for name in group.tensors]
-        low, high = min(low for low, _ in bounds), max(high for _, high in bounds)
-        widened.update(dict.fromkeys(group.tensors, (low, high)))
+    for group in plan.groups:
+        if group.kind == CONCAT and all(name in widened for name in group.tensors):
+            bounds = [widened[name] for name in group.tensors]
+            whole = min(low for low, _ in bounds), max(high for _, high in bounds)
+            widened.update(dict.fromkeys(group.tensors, whole))
     return dataclasses.replace(ranges, tensors=widened)
 
 
@@ -134,30 +165,21 @@ class SharingCost:
 
 def sharing_costs(plan: QuantPlan, ranges: Ranges) -> tuple[SharingCost, ...]:
     """Return what each concat group costs: ``20 log10(shared step / own step)``."""
-    wide = share_scales(plan, ranges).tensors
+    wide, own = share_scales(plan, ranges).tensors, ranges.tensors
     costs = []
-    for group in _shared(plan, ranges):
+    for group in plan.groups:
+        if group.kind != CONCAT or any(name not in own for name in group.tensors):
+            continue
+        # what is always zero has no step of its own, and loses nothing
         losses = {
-            name: _decibels(wide[name], ranges.tensors[name]) for name in group.tensors
+            name: 20 * math.log10(float(scale_of(*wide[name])) / float(scale_of(*each)))
+            if (each := own[name]) != (0.0, 0.0)
+            else 0.0
+            for name in group.tensors
         }
         worst = max(losses, key=lambda name: losses[name])
         costs.append(SharingCost(group, worst, losses[worst]))
     return tuple(costs)
-
-
-def _shared(plan: QuantPlan, ranges: Ranges) -> list[ScaleGroup]:
-    return [
-        group
-        for group in plan.groups
-        if group.kind == CONCAT
-        and all(name in ranges.tensors for name in group.tensors)
-    ]
-
-
-def _decibels(wide: tuple[float, float], own: tuple[float, float]) -> float:
-    if own == (0.0, 0.0):  # it has no step of its own, and loses nothing
-        return 0.0
-    return 20 * math.log10(float(scale_of(*wide)) / float(scale_of(*own)))
 
 
 _EGO = "encodes the ego status {}, sensitive to int8; rules safe keep it float"
@@ -200,7 +222,18 @@ def make_plan(
     }
     # what depends on other decisions
     for rule in in_order:
-        decided.update(_second_thoughts(rule, decided, facts, pins))
+        int8 = {node: None for node, each in decided.items() if each.dtype == INT8}
+        for node, reason in rule.objections(int8, facts).items():
+            if node in int8 and (rule.firm or pins.get(node) is None):
+                decided[node] = dataclasses.replace(
+                    decided[node],
+                    dtype=FLOAT,
+                    rule=rule.name,
+                    reason=reason,
+                    activations=(),
+                    weight=None,
+                    axis=None,
+                )
     decided.update(_residuals(main, decided, facts, pins))
     pins.check(decided)
     decisions = tuple(decided.values())
@@ -236,7 +269,8 @@ def _decide(
     if node.graph is not main:
         return decision(rule="body", reason="in the body of an If, Loop or Scan")
     # the first rule that objects decides, unless the user has and it is not firm
-    close = _borderline(node, facts, rules)
+    remarks = (rule.borderline(node, facts) for rule in rules)
+    close = next((remark for remark in remarks if remark), "")
     pin = pins.get(node)
     for rule in rules:
         objection = rule.objection(node, facts)
@@ -251,36 +285,20 @@ def _decide(
         rule_id, reason = "override", pin.why
     elif node in facts.ego_layers:
         close = f"ego-input: {_EGO.format(facts.ego_layers[node])}"
+    # Kernels apply the scales of output channels to the result of one product: that of
+    # a MatMul by a batch of matrices, or by a vector, has one scale in all.
     activations, weight = layout
+    one_scale = node.op_type == "MatMul" and not is_one_matrix(node)
+    axis = None if weight is None or one_scale else channel_axis(node)
     return decision(
         dtype=INT8,
         rule=rule_id,
         reason=reason,
         activations=activations,
         weight=weight,
-        axis=None if weight is None else _scale_axis(node),
+        axis=axis,
         borderline=close,
     )
-
-
-def _second_thoughts(
-    rule: Rule, decided: Mapping[ir.Node, Decision], facts: RuleFacts, pins: Pins
-) -> dict[ir.Node, Decision]:
-    """Return the decisions that a rule takes back, knowing all the others."""
-    int8 = {node: None for node, each in decided.items() if each.dtype == INT8}
-    return {
-        node: dataclasses.replace(
-            decided[node],
-            dtype=FLOAT,
-            rule=rule.name,
-            reason=reason,
-            activations=(),
-            weight=None,
-            axis=None,
-        )
-        for node, reason in rule.objections(int8, facts).items()
-        if node in int8 and (rule.firm or pins.get(node) is None)
-    }
 
 
 def _int8(
@@ -299,22 +317,6 @@ def _int8(
     return "layer", f"{node.op_type} with a constant weight", layout
 
 
-def _borderline(node: ir.Node, facts: RuleFacts, rules: Sequence[Rule]) -> str:
-    remarks = (rule.borderline(node, facts) for rule in rules)
-    return next((remark for remark in remarks if remark), "")
-
-
-def _scale_axis(node: ir.Node) -> int | None:
-    """Return the axis of a weight's scales; None if it has one scale in all.
-
-    Kernels apply the scales of output channels to the result of one product: that of a
-    MatMul by a batch of matrices, or by a vector, has no such channels.
-    """
-    if node.op_type == "MatMul" and not is_one_matrix(node):
-        return None
-    return channel_axis(node)
-
-
 def _residuals(
     graph: ir.Graph, decided: Mapping[ir.Node, Decision], facts: RuleFacts, pins: Pins
 ) -> dict[ir.Node, Decision]:
@@ -326,7 +328,11 @@ def _residuals(
     shorter the residual (a down-sampling projection), as NVIDIA's quantizer decides.
     Returns new decisions for those Adds alone.
     """
-    depth = _depths(graph)
+    # the longest path to every value, in nodes
+    depth: dict[ir.Value | None, int] = {}
+    for node in graph:
+        below = 1 + max((depth.get(each, 0) for each in node.inputs), default=0)
+        depth.update(dict.fromkeys(node.outputs, below))
     found: dict[ir.Node, Decision] = {}
     for node in graph:
         if node.op_type != "Add" or not is_standard(node):
@@ -339,23 +345,22 @@ def _residuals(
             continue
         # the longer path is fused, the other is the residual
         main = max(fused, key=lambda at: depth.get(node.inputs[at], 0))
-        found[node] = _residual(decided[node], node, 1 - main, pins)
+        pin = pins.get(node)
+        if pin is not None and pin.dtype == FLOAT:
+            found[node] = dataclasses.replace(
+                decided[node], rule="override", reason=pin.why
+            )
+            continue
+        names = ["" if each is None else each.name for each in node.inputs]
+        found[node] = dataclasses.replace(
+            decided[node],
+            dtype=INT8,
+            rule=RESIDUAL,
+            reason=f"computed with the convolution that gives {names[main]}; its"
+            f" residual branch {names[1 - main]} is read as int8",
+            activations=(1 - main,),
+        )
     return found
-
-
-def _residual(old: Decision, node: ir.Node, residual: int, pins: Pins) -> Decision:
-    pin = pins.get(node)
-    if pin is not None and pin.dtype == FLOAT:
-        return dataclasses.replace(old, rule="override", reason=pin.why)
-    main, branch = node.inputs[1 - residual], node.inputs[residual]
-    return dataclasses.replace(
-        old,
-        dtype=INT8,
-        rule=RESIDUAL,
-        reason=f"computed with the convolution that gives {_name(main)}; its residual"
-        f" branch {_name(branch)} is read as int8",
-        activations=(residual,),
-    )
 
 
 def _ends_convolution(
@@ -372,16 +377,3 @@ def _ends_convolution(
         and node.op_type in CONVOLUTIONS
         and decided[node].dtype == INT8
     )
-
-
-def _depths(graph: ir.Graph) -> dict[ir.Value | None, int]:
-    """Count the nodes on the longest path to every value."""
-    depth: dict[ir.Value | None, int] = {}
-    for node in graph:
-        below = 1 + max((depth.get(each, 0) for each in node.inputs), default=0)
-        depth.update(dict.fromkeys(node.outputs, below))
-    return depth
-
-
-def _name(value: ir.Value | None) -> str:
-    return "" if value is None else str(value.name)

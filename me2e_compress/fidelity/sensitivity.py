@@ -1,7 +1,9 @@
-"""Measure the loss of int8 module by module, and find the nodes to blame."""
+"""Which modules and nodes int8 hurts, and which assignment fits a budget."""
 
 import dataclasses
-from collections.abc import Callable, Sequence
+import itertools
+import math
+from collections.abc import Callable, Iterable, Sequence
 from functools import partial
 from pathlib import Path
 
@@ -9,10 +11,12 @@ import onnx_ir as ir
 
 from me2e_compress import graph
 from me2e_compress.calibration.ranges import Ranges
+from me2e_compress.display import significant
+from me2e_compress.errors import EvaluationError
 from me2e_compress.fidelity.compare import Fidelity, Reference
 from me2e_compress.graph.modules import ModuleMap
+from me2e_compress.quantization.decision import keep_float, overrides_text
 from me2e_compress.quantization.plan import RESIDUAL, Overrides, QuantPlan, make_plan
-from me2e_compress.quantization.plan.overrides import keep_float, overrides_text
 from me2e_compress.quantization.rules import RuleSet
 from me2e_compress.quantization.scheme import QuantScheme
 from me2e_compress.registry import drafts
@@ -22,6 +26,20 @@ from me2e_compress.runtime.frames import Frames
 from me2e_compress.runtime.providers import CPU, Provider
 from me2e_compress.runtime.session import Session
 from me2e_compress.targets import Target
+
+__all__ = [
+    "Budget",
+    "Candidate",
+    "Int8Choice",
+    "ModuleSensitivity",
+    "Score",
+    "Sensitivity",
+    "Trials",
+    "advise",
+    "analyse",
+    "search",
+    "write_recipe",
+]
 
 # Judge many int8 variants of one float model that is calibrated once.
 
@@ -101,12 +119,7 @@ class Trials:
         scheme = QuantScheme.of(choice.modules, self.modules)
         pins, target = choice.overrides(), self._target
         return make_plan(
-            self.model,
-            scheme,
-            self._rules,
-            pins,
-            target.costs,
-            target.fused_objection,
+            self.model, scheme, self._rules, pins, target.costs, target.fused_objection
         )
 
     def variant(self, choice: Int8Choice) -> ir.Model:
@@ -253,13 +266,17 @@ def advise(trials: Trials, found: Sensitivity, limit: float) -> Int8Choice:
         return not choice.modules or trials.score(choice).loss <= limit
 
     # give up nodes and modules until the limit is kept
-    order, given = _sacrifices(found), list[_Sacrifice]()
+    order, given = list[_Sacrifice](), list[_Sacrifice]()
+    for each in found.findings:
+        name, own = each.module, each.score.loss
+        order += [_Sacrifice(name, (node,), loss) for node, loss in each.blamed]
+        order.append(_Sacrifice(name, None, own))
     while not fits(given):
         given.append(order[len(given)])
     # take back what turns out not to matter
-    for each in reversed(given):
-        kept = [other for other in given if other is not each]
-        if each.loss <= limit and fits(kept):
+    for last in reversed(given):
+        kept = [other for other in given if other is not last]
+        if last.loss <= limit and fits(kept):
             given = kept
     return _without(trials, found, given)
 
@@ -271,16 +288,6 @@ class _Sacrifice:
     module: str
     nodes: tuple[str, ...] | None
     loss: float
-
-
-def _sacrifices(found: Sensitivity) -> list[_Sacrifice]:
-    """List everything in the order in which it is given up."""
-    order = []
-    for each in found.findings:
-        name, own = each.module, each.score.loss
-        order += [_Sacrifice(name, (node,), loss) for node, loss in each.blamed]
-        order.append(_Sacrifice(name, None, own))
-    return order
 
 
 def _without(
@@ -305,11 +312,7 @@ def _without(
 
 
 def write_recipe(
-    path: Path,
-    choice: Int8Choice,
-    passes: Sequence[str],
-    rules: str,
-    target: str,
+    path: Path, choice: Int8Choice, passes: Sequence[str], rules: str, target: str
 ) -> Path | None:
     """Write a recipe and, if nodes stay float, the overrides beside it.
 
@@ -323,7 +326,7 @@ def write_recipe(
         options = [
             "[[pass]]",
             'name = "quantize-int8"',
-            f"modules = {_array(choice.modules)}",
+            f"modules = [{', '.join(map(toml_string, choice.modules))}]",
             f"rules = {toml_string(rules)}",
             f"target = {toml_string(target)}",
         ]
@@ -340,5 +343,133 @@ def write_recipe(
     return overrides
 
 
-def _array(names: tuple[str, ...]) -> str:
-    return f"[{', '.join(toml_string(name) for name in names)}]"
+# Choose the modules to make int8 under budgets of time, size and energy.
+
+
+MOST_MODULES = 16
+"""All 2^16 assignments are weighed; a map of more modules must be coarser."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Budget:
+    """What a variant may cost.
+
+    ``unit`` is that of the cost, e.g. ``bytes`` or ``s``; ``cost`` measures a graph.
+    """
+
+    limit: float
+    unit: str
+    cost: Callable[[ir.Model], float]
+
+
+@dataclasses.dataclass(frozen=True)
+class Candidate:
+    """One assignment: the modules that are int8, and what they cost.
+
+    Attributes:
+        loss: predicted: the root of the sum of squares of its modules' own losses, as
+            errors of different modules are taken to be independent.
+        costs: predicted, one per budget; those of the float model less what each module
+            alone saves.
+        score: measured; None, like the costs, if it was not tried.
+        measured_costs: one per budget.
+    """
+
+    modules: tuple[str, ...]
+    loss: float
+    costs: tuple[float, ...]
+    score: Score | None = None
+    measured_costs: tuple[float, ...] | None = None
+
+
+def search(
+    trials: Trials,
+    modules: Sequence[str],
+    budgets: Sequence[Budget],
+    *,
+    most_tried: int = 8,
+    progress: Callable[[int, int, str], None] | None = None,
+) -> tuple[Candidate, ...]:
+    """Find the assignment with the least loss within every budget.
+
+    Every module is scored and weighed alone, which predicts all assignments. The best
+    of those that should fit, at most ``most_tried``, are built, scored and weighed in
+    turn until one does fit, the cheapest of all last. Returns what was tried, the fit
+    last; ``progress`` is called with modules done and in all, and the next one.
+
+    Raises:
+        EvaluationError: too many modules, or nothing fits; it gives the least costs
+            found.
+    """
+
+    def weighed(made: ir.Model) -> tuple[float, ...]:
+        return tuple(each.cost(made) for each in budgets)
+
+    active = [name for name in modules if names_of(trials, name)]
+    if len(active) > MOST_MODULES:
+        raise EvaluationError(
+            f"{len(active)} modules are more than {MOST_MODULES}: use a coarser map"
+        )
+    # 1. every module alone: what it loses, what it saves
+    whole = weighed(trials.model)
+    losses, savings = dict[str, float](), dict[str, tuple[float, ...]]()
+    for done, name in enumerate(active):
+        if progress:
+            progress(done, len(active), name)
+        losses[name] = trials.score(Int8Choice((name,))).loss
+        alone = weighed(trials.variant(Int8Choice((name,))))
+        savings[name] = tuple(a - b for a, b in zip(whole, alone, strict=True))
+    # 2. every assignment, predicted from that; the least loss first, then the cheapest
+    ranked = [
+        Candidate(
+            subset,
+            math.sqrt(sum(losses[name] ** 2 for name in subset)),
+            tuple(
+                cost - sum(savings[name][at] for name in subset)
+                for at, cost in enumerate(whole)
+            ),
+        )
+        for size in range(len(active) + 1)
+        for subset in itertools.combinations(active, size)
+    ]
+    ranked.sort(key=lambda each: (each.loss, each.costs, each.modules))
+    # 3. the best that should fit, and the cheapest, measured until one does
+    fitting = [each for each in ranked if _share(budgets, each.costs) <= 1]
+    cheapest = min(ranked, key=lambda each: _share(budgets, each.costs))
+    tried: list[Candidate] = []
+    for candidate in dict.fromkeys((*fitting[: most_tried - 1], cheapest)):
+        if not fitting:
+            break
+        choice = Int8Choice(candidate.modules)
+        costs = weighed(trials.variant(choice))
+        score = trials.score(choice)
+        tried.append(dataclasses.replace(candidate, score=score, measured_costs=costs))
+        if _share(budgets, costs) <= 1:
+            return tuple(tried)
+    least = [each.costs for each in ranked]
+    least += [each.measured_costs for each in tried if each.measured_costs]
+    raise EvaluationError(nothing_fits(budgets, whole, least))
+
+
+def nothing_fits(
+    budgets: Sequence[Budget], whole: Sequence[float], costs: Sequence[Sequence[float]]
+) -> str:
+    """Return the message that nothing is within the budgets, with the least costs."""
+
+    def words(numbers: Iterable[float]) -> str:
+        pairs = zip(numbers, budgets, strict=True)
+        return " and ".join(
+            f"{significant(number, 6)} {budget.unit}" for number, budget in pairs
+        )
+
+    apart = "; each alone" if len(budgets) > 1 else ""
+    return (
+        f"nothing fits {words(each.limit for each in budgets)}: the float model costs"
+        f" {words(whole)}, the least found is about"
+        f" {words(map(min, zip(*costs, strict=True)))}{apart}"
+    )
+
+
+def _share(budgets: Sequence[Budget], costs: Sequence[float]) -> float:
+    """Return the share spent of the tightest budget; 1 is all of it."""
+    return max(cost / budget.limit for cost, budget in zip(costs, budgets, strict=True))

@@ -1,4 +1,8 @@
-"""Parse and build a graph, and check the result against its quantization plan.
+"""Check graphs with the ONNX parser and builder of TensorRT-RTX, on a CPU.
+
+Its parser is of the same family as TensorRT's, and its builder compiles for a GPU that
+is not present. It is not TensorRT: timings and fusions do not carry over, and it lacks
+the plugin library, so the graph is cut at plugins.
 
 A built plan is a binary file with readable text for each kernel, in an undocumented
 form. It is read only to confirm the quantization plan: if the form changes, no kernels
@@ -26,7 +30,7 @@ from me2e_compress.errors import (
 )
 from me2e_compress.graph import rewrite
 from me2e_compress.graph.nodes import is_plugin
-from me2e_compress.quantization.plan import INT8, QuantPlan, plan_of
+from me2e_compress.quantization.plan import INT8, plan_of
 from me2e_compress.runtime.children import run_script
 
 SM = (75, 80, 86, 89, 120, 121)
@@ -130,6 +134,15 @@ def check(model: ir.Model, sm: int = 86, *, build: bool = True) -> BuildResult:
         answer, plan = _ask(part, Path(scratch), sm, build=build)
     # Confirm that the planned nodes are int8 kernels.
     kernels = () if plan is None else read_kernels(plan)
+    planned = None if plan is None else plan_of(model)
+    missing = None
+    if planned is not None:
+        wanted = [
+            each.node or f"node_of_{each.output}"  # what the parser calls it
+            for each in planned.decisions
+            if each.dtype == INT8 and each.op == "Conv"
+        ]
+        missing = without_int8(wanted, kernels)
     well = answer["parsed"] and answer["built"] is not False
     errors = [] if well else [*answer["errors"], *answer["log"]]
     return BuildResult(
@@ -140,7 +153,7 @@ def check(model: ir.Model, sm: int = 86, *, build: bool = True) -> BuildResult:
         int(answer["layers"]),
         tuple(" ".join(str(each).split()) for each in errors),
         kernels,
-        _missing(plan_of(model), kernels) if plan is not None else None,
+        missing,
     )
 
 
@@ -161,19 +174,6 @@ def _ask(
         )
     found = json.loads(answer.read_text(encoding="utf-8"))
     return found, plan.read_bytes() if plan.is_file() else None
-
-
-def _missing(
-    plan: QuantPlan | None, kernels: tuple[Kernel, ...]
-) -> tuple[str, ...] | None:
-    if plan is None:
-        return None
-    wanted = [
-        each.node or f"node_of_{each.output}"  # what the parser calls it
-        for each in plan.decisions
-        if each.dtype == INT8 and each.op == "Conv"
-    ]
-    return without_int8(wanted, kernels)
 
 
 def read_kernels(plan: bytes) -> tuple[Kernel, ...]:
@@ -201,7 +201,7 @@ LACKING = frozenset({"DeformConv", "NonMaxSuppression", "NonZero", "RoiAlign"})
 
 
 def cut(model: ir.Model) -> tuple[ir.Model, tuple[str, ...]]:
-    """Cut a graph at plugins: tport outputs become inputs, tport inputs outputs.
+    """Cut a graph at plugins: their outputs become inputs, their inputs outputs.
 
     Nodes with a local function are not plugins: the parser reads the function. Types
     and shapes must be known. Returns the copy, and the names of the nodes that were cut
@@ -209,18 +209,20 @@ def cut(model: ir.Model) -> tuple[ir.Model, tuple[str, ...]]:
     """
     copy = model.clone()
     copy.metadata_props.clear()  # it speaks of inputs and outputs that change
-    gone = [node for node in copy.graph if _is_missing(node, copy)]
+    gone = [
+        node
+        for node in copy.graph
+        if (
+            node.op_identifier() not in copy.functions
+            if is_plugin(node)
+            else node.op_type in LACKING
+        )
+    ]
     names = tuple(node.name or str(node.outputs[0].name) for node in gone)
     for node in gone:
         _detach(copy.graph, node)
     rewrite.sweep(copy)
     return copy, names
-
-
-def _is_missing(node: ir.Node, model: ir.Model) -> bool:
-    if is_plugin(node):
-        return node.op_identifier() not in model.functions
-    return node.op_type in LACKING
 
 
 def _detach(where: ir.Graph, node: ir.Node) -> None:

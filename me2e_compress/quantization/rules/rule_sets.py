@@ -1,0 +1,386 @@
+"""The two rule sets: the paper's operators, modules and stages, and ``safe``."""
+
+import dataclasses
+from collections.abc import Collection, Mapping
+from typing import ClassVar
+
+import onnx_ir as ir
+
+from me2e_compress.calibration.observers import DEFAULT_METHOD
+from me2e_compress.graph import (
+    CONVOLUTIONS,
+    WEIGHTED,
+    is_standard,
+    provenance,
+    static_shape,
+)
+from me2e_compress.graph.shapes import PRODUCTS, extent
+from me2e_compress.operators import int8_inputs
+from me2e_compress.quantization.find_attention import is_fused
+from me2e_compress.quantization.rules import Rule, RuleFacts, RuleSet
+
+
+@dataclasses.dataclass(frozen=True)
+class WeightedOperator(Rule):
+    """Convolutions and matrix products may be int8, and features that are sampled."""
+
+    name: ClassVar[str] = "operator"
+    firm: ClassVar[bool] = True
+
+    def objection(self, node: ir.Node, facts: RuleFacts) -> str | None:
+        """Object to every other operator, and to what the target cannot read."""
+        if is_standard(node) and node.op_type in WEIGHTED:
+            return None
+        if int8_inputs(node):
+            return None if facts.fused is None else facts.fused(node)
+        if node not in facts.attention:
+            return f"{node.op_type} is not a weighted layer"
+        if not is_fused(node):
+            return f"{node.op_type} in an attention has no int8 kernel"
+        size = facts.attention[node]
+        return (
+            f"{node.op_type} is a whole attention of {size.queries} queries and"
+            f" {size.keys} keys, its products cannot be reached"
+        )
+
+
+@dataclasses.dataclass(frozen=True)
+class FusedOperator(Rule):
+    """Fused operators stay as they are, the features too that they sample."""
+
+    name: ClassVar[str] = "fused-operator"
+
+    def objection(self, node: ir.Node, facts: RuleFacts) -> str | None:
+        """Object to every fused operator."""
+        if not int8_inputs(node):
+            return None
+        return f"{node.op_type} is fused: only convolutions and products become int8"
+
+
+@dataclasses.dataclass(frozen=True)
+class ModuleScope(Rule):
+    """Modules outside the scheme stay as they are."""
+
+    name: ClassVar[str] = "module"
+
+    def objection(self, node: ir.Node, facts: RuleFacts) -> str | None:
+        """Object to a node of another module, or of none."""
+        module = provenance.module_of(node)
+        if module in facts.modules:
+            return None
+        return f"module {module or '(none)'} is not in the scheme"
+
+
+@dataclasses.dataclass(frozen=True)
+class WeightOperand(Rule):
+    """The right operand is a weight in float32 or float16, or of an attention."""
+
+    name: ClassVar[str] = "weight"
+    firm: ClassVar[bool] = True
+
+    def objection(self, node: ir.Node, facts: RuleFacts) -> str | None:
+        """Object to computed weights, constants on the left, other element types."""
+        left, right = node.inputs[0], node.inputs[1]
+        if int8_inputs(node):
+            if left is None or left in facts.constants:
+                return "what it samples is constant"
+            floats = left.dtype in (ir.DataType.FLOAT, None)
+            return None if floats else "what it samples is not float32"
+        # operands of floats, and not all constant
+        types = {each.dtype for each in (left, right) if each is not None}
+        if not types <= {ir.DataType.FLOAT, ir.DataType.FLOAT16, None}:
+            return "neither float32 nor float16"
+        if left in facts.constants and right in facts.constants:
+            return "both operands are constant: computed once, when the graph is loaded"
+        if left in facts.constants and node in facts.attention:
+            return "the queries are constant"
+        if left in facts.constants:
+            return "the left operand is constant: coordinate arithmetic, not a layer"
+        # a weight, or the product of an attention
+        if right in facts.constants:
+            return None
+        if node.op_type != "MatMul":
+            return "the weight is computed"
+        if node in facts.attention:
+            return None
+        return "both operands are computed, and no softmax follows: not a layer"
+
+
+@dataclasses.dataclass(frozen=True)
+class AttentionLength(Rule):
+    """Stage 1: long attention stays float.
+
+    TensorRT fuses int8 attention up to 512 queries and 512 keys, and errors of the
+    product of queries and keys grow with the length in the softmax.
+
+    Attributes:
+        limit: longest attention that becomes int8, in tokens.
+    """
+
+    limit: int = 512
+    name: ClassVar[str] = "attention-length"
+
+    def objection(self, node: ir.Node, facts: RuleFacts) -> str | None:
+        """Object if queries or keys are more than the limit, or unknown in number."""
+        attention = facts.attention.get(node)
+        if attention is None:
+            return None
+        queries, keys = attention.queries, attention.keys
+        if queries is None or keys is None:
+            return f"attention of unknown length, limit {self.limit}"
+        if max(queries, keys) <= self.limit:
+            return None
+        return f"attention of {queries} queries and {keys} keys, more than {self.limit}"
+
+    def borderline(self, node: ir.Node, facts: RuleFacts) -> str | None:
+        """Return what is close about a node: a reader may want to decide it otherwise.
+
+        Close is within an eighth of the limit; or only one of queries and keys beyond
+        it, so that tools which look at one of the two decide otherwise.
+        """
+        attention = facts.attention.get(node)
+        if attention is None or attention.queries is None or attention.keys is None:
+            return None
+        sizes = f"{attention.queries} queries, {attention.keys} keys"
+        longest = max(attention.queries, attention.keys)
+        if abs(longest - self.limit) <= self.limit // 8:
+            return f"{sizes}: close to the limit of {self.limit}"
+        if min(attention.queries, attention.keys) <= self.limit < longest:
+            return f"{sizes}: one within the limit of {self.limit}, one beyond"
+        return None
+
+
+@dataclasses.dataclass(frozen=True)
+class MatrixVector(Rule):
+    """Stage 2: a product that degenerates to GEMV gains nothing."""
+
+    name: ClassVar[str] = "gemv"
+
+    def objection(self, node: ir.Node, facts: RuleFacts) -> str | None:
+        """Object if one side of the product is a single row or column."""
+        if node.op_type not in PRODUCTS:
+            return None
+        size = extent(node, weight=node.inputs[1] in facts.constants)
+        if not size.is_vector:
+            return None
+        return f"{size.rows} rows by {size.columns} columns: a matrix-vector product"
+
+
+@dataclasses.dataclass(frozen=True)
+class PaperRules(RuleSet):
+    """The two stages of the paper alone, and what is no layer at all.
+
+    Attributes:
+        attention_limit: longest attention that becomes int8, in tokens.
+        without: names of rules that are switched off, e.g. ``gemv``.
+        extra: more rules, asked last.
+    """
+
+    name: ClassVar[str] = "paper"
+    method: ClassVar[str] = "max-min"  # section III-C, equation 3
+    attention_limit: int = 512
+
+    def own_rules(self) -> tuple[Rule, ...]:
+        """Return six rules, the stages last."""
+        return (
+            WeightedOperator(),
+            FusedOperator(),
+            ModuleScope(),
+            WeightOperand(),
+            AttentionLength(self.attention_limit),
+            MatrixVector(),
+        )
+
+
+# The rule set ``safe``: what a model drives by, what kernels are too coarse for, cost.
+#
+# Bounds of int8 kernels are those of NVIDIA's own quantizer (ModelOpt 0.47,
+# ``modelopt/onnx/quantization/graph_utils.py``): int8 tensor cores work on tiles of 16
+# and on channels in groups of 8, and a layer that fills neither is padded until it is
+# slower than in half precision.
+
+
+@dataclasses.dataclass(frozen=True)
+class CostGate(Rule):
+    """Int8 that takes longer than float on the target stays float.
+
+    Int8 saves arithmetic, which grows with a layer's multiply-accumulates, and costs
+    time where it begins and ends, which grows with the tensors there. Both are
+    estimated by the target; a target that estimates nothing keeps everything.
+    """
+
+    name: ClassVar[str] = "cost"
+
+    def objection(self, node: ir.Node, facts: RuleFacts) -> str | None:
+        """Object to nothing: what a node costs depends on its neighbours."""
+        return None
+
+    def objections(
+        self, int8: Collection[ir.Node], facts: RuleFacts
+    ) -> Mapping[ir.Node, str]:
+        """Object to the layers that pay more at their borders than they save."""
+        costs = None if facts.costs is None else facts.costs(facts.model, int8)
+        if costs is None:
+            return {}
+        losses = costs.losses(int8)
+        return {node: f"{loss} on {costs.machine}" for node, loss in losses.items()}
+
+
+@dataclasses.dataclass(frozen=True)
+class SmallProduct(Rule):
+    """A product whose inner or outer dimension is below one tile stays float.
+
+    Attributes:
+        minimum: smallest inner and outer dimension, in elements.
+    """
+
+    minimum: int = 16
+    name: ClassVar[str] = "small-product"
+
+    def objection(self, node: ir.Node, facts: RuleFacts) -> str | None:
+        """Object if K or N is below the minimum."""
+        if node.op_type not in PRODUCTS:
+            return None
+        size = extent(node, weight=node.inputs[1] in facts.constants)
+        for name, found in (("K", size.depth), ("N", size.columns)):
+            if found is not None and found < self.minimum:
+                return f"{name} = {found}, below {self.minimum}: less than one tile"
+        return None
+
+
+@dataclasses.dataclass(frozen=True)
+class NarrowConvolution(Rule):
+    """A convolution of few channels stays float, unless a kernel takes it as it is.
+
+    Below ``minimum`` channels on either side (inputs counted within a group), it is
+    int8 only if ungrouped with a square kernel, one side a multiple of ``packing`` and
+    one side wide enough or the input an image; or grouped with outputs a multiple of
+    ``packing`` and every kernel dimension at least 3.
+
+    Attributes:
+        minimum: channels on either side that any kernel takes.
+        packing: channels that a kernel reads together.
+    """
+
+    minimum: int = 16
+    packing: int = 8
+    name: ClassVar[str] = "narrow-convolution"
+
+    def objection(self, node: ir.Node, facts: RuleFacts) -> str | None:
+        """Object to narrow convolutions without a kernel."""
+        shape = static_shape(node.inputs[1])
+        if node.op_type not in CONVOLUTIONS or shape is None:
+            return None
+        group = node.attributes.get_int("group", 1)
+        inputs, outputs = shape[1], shape[0]
+        if node.op_type == "ConvTranspose":
+            inputs, outputs = shape[0] // group, shape[1] * group
+        if min(inputs, outputs) >= self.minimum:
+            return None
+        kernel = shape[2:]
+        if group > 1:
+            fits = outputs % self.packing == 0 and min(kernel, default=1) >= 3
+        else:
+            first = node.inputs[0] is not None and node.inputs[0].is_graph_input()
+            packed = 0 in (inputs % self.packing, outputs % self.packing)
+            wide = first or max(inputs, outputs) >= self.minimum
+            fits = packed and wide and len(set(kernel)) == 1
+        if fits:
+            return None
+        return (
+            f"{inputs} to {outputs} channels in {group} groups, kernel {list(kernel)}:"
+            " too narrow for int8 kernels"
+        )
+
+
+@dataclasses.dataclass(frozen=True)
+class Geometry(Rule):
+    """What multiplies camera matrices, poses, points, pixels or metres stays float.
+
+    One scale for pixel coordinates of thousands, or for metres and a homogeneous 1,
+    leaves steps of tens of pixels: the features are sampled elsewhere. On VAD-tiny the
+    projection by ``lidar2img`` alone takes the BEV from 19 dB to 0.
+    """
+
+    name: ClassVar[str] = "geometry"
+
+    def objection(self, node: ir.Node, facts: RuleFacts) -> str | None:
+        """Object to what :func:`~me2e_compress.quantization.geometry` found."""
+        return facts.geometry.get(node)
+
+
+@dataclasses.dataclass(frozen=True)
+class Coordinates(Rule):
+    """Layers that positions come from stay float: offsets, reference points.
+
+    A position is right to a fraction of a cell or wrong; 8 bits over a map of 100
+    cells leave half a cell. Sampling weights that read the same tensor as the offsets
+    go with them: neither then needs it in int8.
+    """
+
+    name: ClassVar[str] = "coordinates"
+
+    def objection(self, node: ir.Node, facts: RuleFacts) -> str | None:
+        """Object to what :func:`~me2e_compress.quantization.geometry` found."""
+        return facts.coordinates.get(node)
+
+
+@dataclasses.dataclass(frozen=True)
+class EgoInput(Rule):
+    """Small encoders of the ego car's status stay float.
+
+    They cost nothing, and of 106 modules of SparseDrive that NVIDIA measured, the
+    status encoder lost most in int8: over four times as much as the next.
+    """
+
+    name: ClassVar[str] = "ego-input"
+
+    def objection(self, node: ir.Node, facts: RuleFacts) -> str | None:
+        """Object to what :func:`~me2e_compress.quantization.rules` found."""
+        source = facts.ego_layers.get(node)
+        return None if source is None else f"encodes the ego status {source}"
+
+
+@dataclasses.dataclass(frozen=True)
+class AttentionWeights(Rule):
+    """Attention weights are never int8: what a softmax gives is read as float.
+
+    Weights of many tokens are small numbers beside a few large ones, and most round to
+    zero. The product that the softmax reads goes with the one that reads the softmax:
+    TensorRT fuses both, in one precision.
+    """
+
+    name: ClassVar[str] = "attention-weights"
+
+    def objection(self, node: ir.Node, facts: RuleFacts) -> str | None:
+        """Object to both products of an attention, and to other readers of weights."""
+        return facts.attention_weights.get(node)
+
+
+@dataclasses.dataclass(frozen=True)
+class SafeRules(PaperRules):
+    """The paper's rules and the limits of kernels; what a model drives by stays float.
+
+    Geometry, positions, attention weights and ego status stay float; the default of
+    every target.
+
+    Attributes:
+        attention_limit: longest attention that the paper's stage 1 would make int8, in
+            tokens; without ``attention-weights`` it counts.
+        balance: as in every rule set; here weights are balanced unless it is off.
+    """
+
+    name: ClassVar[str] = "safe"
+    share_concat: ClassVar[bool] = True
+    method: ClassVar[str] = DEFAULT_METHOD
+    balance: bool = dataclasses.field(default=True, kw_only=True)
+
+    def own_rules(self) -> tuple[Rule, ...]:
+        """Return rules of operators, safety, the paper's stages, kernels and cost."""
+        operator, _, module, weight, length, vector = super().own_rules()
+        return (
+            *(operator, module, weight),
+            *(Geometry(), Coordinates(), EgoInput()),
+            *(length, AttentionWeights(), vector),
+            *(SmallProduct(), NarrowConvolution(), CostGate()),
+        )
