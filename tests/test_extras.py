@@ -34,7 +34,7 @@ ALL, EVERY_TOOL = "all at once", "+".join(TOOLS)
 ROOMS: Mapping[str, tuple[str, ...]] = {
     "highway": ("evaluators.highway", "simulator", "study", "workflows.latency_figure"),
     "fast": ("operators.kernels",),
-    "trt-check": ("targets.tensorrt.rtx.rtx_main",),
+    "trt-check": ("targets.tensorrt.rtx_main",),
 }
 """Rooms, or modules, in which something cannot be imported without an extra."""
 

@@ -48,7 +48,7 @@ _OPERAND, _ANSWER = "piece/operand", "piece/answer"
 
 
 @dataclasses.dataclass(frozen=True)
-class Step:
+class Jump:
     """A step that both graphs have, by the names of its outputs.
 
     ``operands`` are the places of those inputs that are not one constant in both.
@@ -62,7 +62,7 @@ Errors: TypeAlias = dict[str, float]
 """max|a-b|/max|a| by output, and by operand of a step (`operand_names`)."""
 
 
-def operand_names(steps: Sequence[Step]) -> dict[str, str]:
+def operand_names(steps: Sequence[Jump]) -> dict[str, str]:
     """Map what a graph gives of the operands of steps to how messages call them."""
     return {
         _name(_OPERAND, index, place): f"operand {place} of {step.outputs[0]}"
@@ -74,7 +74,7 @@ def operand_names(steps: Sequence[Step]) -> dict[str, str]:
 def piece_errors(
     before: ir.Model,
     others: Sequence[tuple[ir.Model, VerificationInputs]],
-    steps: Sequence[Step],
+    steps: Sequence[Jump],
     inputs: VerificationInputs,
 ) -> tuple[list[Errors], Errors]:
     """Run a graph once, and others on what its steps gave; nodes run as they stand.
@@ -130,13 +130,13 @@ def nudged_weights(model: ir.Model, seed: int) -> ir.Model:
     return copy
 
 
-def steps_behind_changes(before: ir.Model, after: ir.Model) -> tuple[Step, ...]:
+def steps_behind_changes(before: ir.Model, after: ir.Model) -> tuple[Jump, ...]:
     """Return the steps of both graphs that read what a pass changed, first ones alone.
 
     Behind a step nothing counts as changed, until another node is.
     """
     makers = {value.name: node for node in before.graph for value in node.outputs}
-    changed, steps = set[ir.Value](), list[Step]()
+    changed, steps = set[ir.Value](), list[Jump]()
     for node in after.graph:
         twin = makers.get(node.outputs[0].name) if node.outputs else None
         moved = not changed.isdisjoint(reads_of(node))
@@ -146,7 +146,7 @@ def steps_behind_changes(before: ir.Model, after: ir.Model) -> tuple[Step, ...]:
             if operands is not None:
                 if moved or _reads_others(twin, node):
                     outputs = tuple(str(v.name) for v in node.outputs if v.name)
-                    steps.append(Step(outputs, operands))
+                    steps.append(Jump(outputs, operands))
                 continue
         if moved or twin is None or not alike or _reads_others(twin, node):
             changed.update(node.outputs)
@@ -213,7 +213,7 @@ def _operands(twin: ir.Node, node: ir.Node) -> tuple[int, ...] | None:
 
 
 def _observed(
-    model: ir.Model, steps: Sequence[Step], *, answers: bool = True
+    model: ir.Model, steps: Sequence[Jump], *, answers: bool = True
 ) -> ir.Model:
     """Return a copy that also gives what each step reads, and what it gives."""
     copy = model.clone()
@@ -228,7 +228,7 @@ def _observed(
     return copy
 
 
-def _continued(model: ir.Model, steps: Sequence[Step]) -> ir.Model:
+def _continued(model: ir.Model, steps: Sequence[Jump]) -> ir.Model:
     """Return a copy that gives what each step reads, and is fed what each gives."""
     copy = _observed(model, steps, answers=False)
     values = {value.name: value for node in copy.graph for value in node.outputs}

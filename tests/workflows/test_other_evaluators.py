@@ -44,7 +44,7 @@ class Lanes:
 def lanes(monkeypatch: pytest.MonkeyPatch) -> None:
     entry = EntryPoint("lanes", f"{__name__}:Lanes", EVALUATORS.group)
     found = {EVALUATORS.group: (entry,)}
-    monkeypatch.setattr(registry, "_found", lambda path: found)
+    monkeypatch.setattr(registry, "_all_installed", lambda path: found)
     monkeypatch.setattr(EntryPoint, "load", _load)
 
 
