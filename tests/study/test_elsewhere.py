@@ -47,7 +47,8 @@ def lanes(monkeypatch: pytest.MonkeyPatch) -> None:
     module = sys.modules[__name__]
     monkeypatch.setitem(sys.modules, "lanes_of_a_test", module)
     entry = EntryPoint("lanes", "lanes_of_a_test:Lanes", EVALUATORS.group)
-    monkeypatch.setattr(registry, "_all_installed", lambda path: {EVALUATORS.group: (entry,)})
+    installed = {EVALUATORS.group: (entry,)}
+    monkeypatch.setattr(registry, "_all_installed", lambda path: installed)
     DRIVEN.clear()
 
 
