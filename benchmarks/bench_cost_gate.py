@@ -33,7 +33,7 @@ from me2e_compress.targets.onnxruntime import OnnxRuntime
 from me2e_compress.targets.onnxruntime.costs import costs_of
 from me2e_compress.targets.onnxruntime.region import end_of, objection
 from me2e_compress.targets.weights import biased_end
-from me2e_compress.workflows.prepare_int8 import PreparedGraph
+from me2e_compress.workflows.plan import PreparedGraph
 from models.export import export
 
 NEAR = 0.05

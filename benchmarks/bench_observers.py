@@ -216,7 +216,7 @@ def _crests(seen: Statistics) -> str:
 def scenes(folder: Path) -> None:
     """Compare the ranges of recordings, and of a few scenes with those of all."""
     from me2e_compress.workflows.checks import model_path
-    from me2e_compress.workflows.prepare_int8 import PreparedGraph
+    from me2e_compress.workflows.plan import PreparedGraph
 
     path = model_path("highway")
     ready = PreparedGraph.of(path, graph.load(path), None)

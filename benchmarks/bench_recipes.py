@@ -22,7 +22,8 @@ from me2e_compress.fidelity.compare import Reference
 from me2e_compress.fidelity.liveness import LivenessTally
 from me2e_compress.manager import recipe
 from me2e_compress.runtime.session import Session
-from me2e_compress.workflows.compress import CompressOptions, compress
+from me2e_compress.workflows.compress import compress
+from me2e_compress.workflows.options import CompressOptions
 from models.export import export
 from models.frames import record
 

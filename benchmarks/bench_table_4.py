@@ -32,8 +32,9 @@ from me2e_compress.quantization.plan import make_plan, stamp_plan
 from me2e_compress.quantization.rules import RULE_SETS
 from me2e_compress.quantization.scheme import QuantScheme
 from me2e_compress.targets import TARGETS
-from me2e_compress.workflows.compress import CompressOptions, compress
-from me2e_compress.workflows.lint import LintOptions, lint
+from me2e_compress.workflows.compress import compress
+from me2e_compress.workflows.lint import lint
+from me2e_compress.workflows.options import CompressOptions, LintOptions
 
 PRESETS = {"uniad-tiny": "uniad", "vad-tiny": "vad"}
 PAPER = {"uniad-tiny": "UniAD", "vad-tiny": "VAD"}

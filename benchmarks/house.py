@@ -22,7 +22,7 @@ from typing import Any
 import grimp
 
 from benchmarks.files_entered import CALLS
-from me2e_compress.cli.app import COMMANDS
+from me2e_compress.cli.app import COMMANDS, options_of
 
 ROOT = Path(__file__).parents[1]
 PACKAGE = "me2e_compress"
@@ -86,10 +86,8 @@ def pages(root: Path) -> Iterator[Path]:
 
 def options() -> Iterator[str]:
     """List the options of all commands."""
-    for name, entry in COMMANDS.items():
-        for parameter in entry.load().params:
-            if parameter.param_type_name == "option":
-                yield f"{name} {parameter.opts[0]}"
+    for name in COMMANDS:
+        yield from (f"{name} {option}" for option in options_of(name))
 
 
 def circles(graph: grimp.ImportGraph) -> Iterator[str]:

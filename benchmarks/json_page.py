@@ -13,51 +13,17 @@ from functools import cache
 from pathlib import Path
 from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
 
-from me2e_compress.calibration.ranges import Ranges
-from me2e_compress.calibration.review import RangeFinding
-from me2e_compress.driving.adapter.outputs import PortUse
-from me2e_compress.fidelity.compare import Fidelity, SetFidelity
-from me2e_compress.fidelity.first_difference import FirstDifference
-from me2e_compress.fidelity.liveness import Liveness
-from me2e_compress.fidelity.sensitivity import Candidate, Sensitivity
-from me2e_compress.manager import Step, Verification
-from me2e_compress.quantization.plan import Decision, QuantPlan
-from me2e_compress.registry.registry import Entry
+import me2e_compress
 from me2e_compress.runtime.atomic import write_bytes
-from me2e_compress.runtime.energy import EnergyResult
 from me2e_compress.runtime.latency_trace import TimeShare
-from me2e_compress.targets import LintFinding
-from me2e_compress.workflows.check_model import ModelCheck
-from me2e_compress.workflows.compare_dump import DumpResult
-from me2e_compress.workflows.doctor import Checkup
-from me2e_compress.workflows.inspect_result import InspectResult
-from me2e_compress.workflows.int8_outcome import Int8Outcome
-from me2e_compress.workflows.join import JoinResult
 from me2e_compress.workflows.lint import RuleSummary
-from me2e_compress.workflows.measured_loss import MeasuredLoss
-from me2e_compress.workflows.runtime_loss import RuntimeLoss
-from me2e_compress.workflows.split import SplitResult
+from me2e_compress.workflows.listing import DoctorResult, ListResult
+from me2e_compress.workflows.result import Result
 
 PAGE = Path(__file__).parents[1] / "docs" / "json.md"
 FORMS = Path(__file__).with_name("json_forms.txt")
-NAMED = (
-    *(
-        Ranges,
-        PortUse,
-        Fidelity,
-        SetFidelity,
-        Liveness,
-        Step,
-        Verification,
-        Decision,
-        QuantPlan,
-    ),
-    *(Entry, EnergyResult, TimeShare, Candidate, Sensitivity),
-    *(LintFinding, ModelCheck, MeasuredLoss, Checkup, InspectResult),
-    *(Int8Outcome, RuleSummary, RangeFinding, DumpResult),
-    *(FirstDifference, RuntimeLoss, JoinResult, SplitResult),
-)
-"""Classes that the forms name; what their fields name is found."""
+NAMED = (DoctorResult, ListResult, RuleSummary, TimeShare)
+"""Classes that the forms name beside the public results and what those name."""
 HEAD = """\
 # What `--json` prints
 
@@ -138,7 +104,9 @@ def _is_object(title: str) -> bool:
 @cache
 def _classes() -> dict[str, type]:
     """Find the classes by name: those of the forms, and all that their fields name."""
-    found, waiting = dict[str, type](), list[Any](NAMED)
+    public = (getattr(me2e_compress, name) for name in me2e_compress.__all__)
+    results = (e for e in public if isinstance(e, type) and issubclass(e, Result))
+    found, waiting = dict[str, type](), list[Any]([*NAMED, *results])
     while waiting:
         each = waiting.pop()
         waiting += get_args(each)

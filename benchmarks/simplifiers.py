@@ -63,7 +63,8 @@ class Taken:
 
 
 def ours(job: Job, verify_frames: int = 0) -> Work:
-    from me2e_compress.workflows.compress import CompressOptions, compress
+    from me2e_compress.workflows.compress import compress
+    from me2e_compress.workflows.options import CompressOptions
 
     module_map: str | Path = job.preset
     if not job.preset:

@@ -22,9 +22,10 @@ from benchmarks import bev_head, original_patterns, original_tcp, resnet50
 from benchmarks.subject import Subject, at
 from me2e_compress import graph
 from me2e_compress.shipped.drivers import SHIPPED
-from me2e_compress.workflows.compress import CompressOptions, compress
-from me2e_compress.workflows.export import export_stack
-from me2e_compress.workflows.frames import FramesOptions, record_frames
+from me2e_compress.workflows.compress import compress
+from me2e_compress.workflows.files import export_stack
+from me2e_compress.workflows.frames import record_frames
+from me2e_compress.workflows.options import CompressOptions, FramesOptions
 from models.export import export
 from models.frames import record
 
@@ -79,7 +80,9 @@ def write_source(name: str, path: Path) -> None:
 def write_frames(name: str, folder: Path, count: int, seed: int) -> None:
     """Record frames of a driver that ships, or of a stack of models/."""
     if name in SHIPPED:
-        record_frames(name, folder, FramesOptions(count, seed, SCENE))
+        record_frames(
+            name, folder, FramesOptions(count=count, seed=seed, scene_length=SCENE)
+        )
     else:
         record(name, folder, count, seed=seed, scene_length=SCENE)
 

@@ -24,43 +24,63 @@ if TYPE_CHECKING:
     from me2e_compress.passes import PASSES, Context, Pass, PassResult
     from me2e_compress.study import StudyResult, load_study, run_study
     from me2e_compress.study.write import write_study
-    from me2e_compress.workflows.build import BuildOptions, EngineResult, build
-    from me2e_compress.workflows.calibrate import calibrate
-    from me2e_compress.workflows.calibrate_options import CalibrateOptions
-    from me2e_compress.workflows.calibrate_result import CalibrateResult
+    from me2e_compress.workflows.calibrate import (
+        CalibrateResult,
+        RangesResult,
+        calibrate,
+        ranges,
+    )
     from me2e_compress.workflows.check_model import ModelCheck, check_model
-    from me2e_compress.workflows.compare import CompareResult, compare
+    from me2e_compress.workflows.compare import (
+        CompareResult,
+        FirstDifferenceResult,
+        compare,
+        first_difference,
+    )
     from me2e_compress.workflows.compare_dump import DumpResult, compare_dump
-    from me2e_compress.workflows.compress import CompressOptions, compress
-    from me2e_compress.workflows.compress_result import CompressResult
+    from me2e_compress.workflows.compress import CompressResult, compress
     from me2e_compress.workflows.evaluate import (
         EvaluateOptions,
         EvaluateResult,
         evaluate,
     )
-    from me2e_compress.workflows.first_difference import (
-        FirstDifferenceResult,
-        first_difference,
+    from me2e_compress.workflows.files import (
+        EngineResult,
+        JoinResult,
+        SplitResult,
+        build,
+        join,
+        split,
     )
-    from me2e_compress.workflows.frames import FramesOptions, record_frames
-    from me2e_compress.workflows.inspect import inspect
-    from me2e_compress.workflows.inspect_result import InspectResult
-    from me2e_compress.workflows.join import JoinResult, join
-    from me2e_compress.workflows.lint import LintOptions, LintResult, lint
-    from me2e_compress.workflows.listener import Listener
-    from me2e_compress.workflows.plan import PlanOptions, PlanResult, plan
-    from me2e_compress.workflows.profile import ProfileOptions, profile
-    from me2e_compress.workflows.profile_result import ProfileResult
-    from me2e_compress.workflows.ranges import RangesResult, ranges
-    from me2e_compress.workflows.score import ScoreResult, score
-    from me2e_compress.workflows.score_eer import EerOptions
-    from me2e_compress.workflows.search import SearchOptions, SearchResult, search
-    from me2e_compress.workflows.sensitivity import (
+    from me2e_compress.workflows.frames import record_frames
+    from me2e_compress.workflows.inspect import InspectResult, inspect
+    from me2e_compress.workflows.lint import LintResult, lint
+    from me2e_compress.workflows.options import (
+        BuildOptions,
+        CalibrateOptions,
+        CompareOptions,
+        CompressOptions,
+        EerOptions,
+        FramesOptions,
+        GraphOptions,
+        InspectOptions,
+        LintOptions,
+        PlanOptions,
+        ProfileOptions,
+        SearchOptions,
         SensitivityOptions,
+        WriteOptions,
+    )
+    from me2e_compress.workflows.plan import PlanResult, plan
+    from me2e_compress.workflows.profile import ProfileResult, profile
+    from me2e_compress.workflows.result import Listener
+    from me2e_compress.workflows.score import ScoreResult, score
+    from me2e_compress.workflows.search import (
+        SearchResult,
         SensitivityResult,
         measure_sensitivity,
+        search,
     )
-    from me2e_compress.workflows.split import SplitResult, split
 
 __all__ = [
     "PASSES",
@@ -68,6 +88,7 @@ __all__ = [
     "CalibrateOptions",
     "CalibrateResult",
     "CalibrationSet",
+    "CompareOptions",
     "CompareResult",
     "CompressOptions",
     "CompressResult",
@@ -79,6 +100,8 @@ __all__ = [
     "EvaluateResult",
     "FirstDifferenceResult",
     "FramesOptions",
+    "GraphOptions",
+    "InspectOptions",
     "InspectResult",
     "JoinResult",
     "LintOptions",
@@ -105,6 +128,7 @@ __all__ = [
     "Step",
     "StudyResult",
     "Verification",
+    "WriteOptions",
     "__version__",
     "build",
     "calibrate",
@@ -143,45 +167,38 @@ _MODULES = (
 """Packages and modules whose names are public; they load when they are asked for."""
 
 _ROOMS = {
-    "calibration.dataset": ("CalibrationSet",),
-    "errors": ("Me2eError",),
-    "manager": ("PassManager", "Report", "Step", "Verification"),
-    "graph.modules": ("ModuleMap",),
-    "passes": ("PASSES", "Context", "Pass", "PassResult"),
-    "study": ("StudyResult", "load_study", "run_study"),
-    "study.write": ("write_study",),
-    "workflows.build": ("BuildOptions", "EngineResult", "build"),
-    "workflows.calibrate": ("calibrate",),
-    "workflows.calibrate_options": ("CalibrateOptions",),
-    "workflows.calibrate_result": ("CalibrateResult",),
-    "workflows.check_model": ("ModelCheck", "check_model"),
-    "workflows.compare": ("CompareResult", "compare"),
-    "workflows.compare_dump": ("DumpResult", "compare_dump"),
-    "workflows.compress": ("CompressOptions", "compress"),
-    "workflows.compress_result": ("CompressResult",),
-    "workflows.evaluate": ("EvaluateOptions", "EvaluateResult", "evaluate"),
-    "workflows.first_difference": ("FirstDifferenceResult", "first_difference"),
-    "workflows.frames": ("FramesOptions", "record_frames"),
-    "workflows.inspect": ("inspect",),
-    "workflows.inspect_result": ("InspectResult",),
-    "workflows.join": ("JoinResult", "join"),
-    "workflows.lint": ("LintOptions", "LintResult", "lint"),
-    "workflows.listener": ("Listener",),
-    "workflows.plan": ("PlanOptions", "PlanResult", "plan"),
-    "workflows.profile": ("ProfileOptions", "profile"),
-    "workflows.profile_result": ("ProfileResult",),
-    "workflows.ranges": ("RangesResult", "ranges"),
-    "workflows.score": ("ScoreResult", "score"),
-    "workflows.score_eer": ("EerOptions",),
-    "workflows.search": ("SearchOptions", "SearchResult", "search"),
-    "workflows.sensitivity": (
-        "SensitivityOptions",
-        "SensitivityResult",
-        "measure_sensitivity",
+    "calibration.dataset": "CalibrationSet",
+    "errors": "Me2eError",
+    "graph.modules": "ModuleMap",
+    "manager": "PassManager Report Step Verification",
+    "passes": "Context PASSES Pass PassResult",
+    "study": "StudyResult load_study run_study",
+    "study.write": "write_study",
+    "workflows.calibrate": "CalibrateResult RangesResult calibrate ranges",
+    "workflows.check_model": "ModelCheck check_model",
+    "workflows.compare": (
+        "CompareResult FirstDifferenceResult compare first_difference"
     ),
-    "workflows.split": ("SplitResult", "split"),
+    "workflows.compare_dump": "DumpResult compare_dump",
+    "workflows.compress": "CompressResult compress",
+    "workflows.evaluate": "EvaluateOptions EvaluateResult evaluate",
+    "workflows.files": "EngineResult JoinResult SplitResult build join split",
+    "workflows.frames": "record_frames",
+    "workflows.inspect": "InspectResult inspect",
+    "workflows.lint": "LintResult lint",
+    "workflows.options": (
+        "BuildOptions CalibrateOptions CompareOptions CompressOptions "
+        "EerOptions FramesOptions GraphOptions InspectOptions LintOptions "
+        "PlanOptions ProfileOptions SearchOptions SensitivityOptions "
+        "WriteOptions"
+    ),
+    "workflows.plan": "PlanResult plan",
+    "workflows.profile": "ProfileResult profile",
+    "workflows.result": "Listener",
+    "workflows.score": "ScoreResult score",
+    "workflows.search": "SearchResult SensitivityResult measure_sensitivity search",
 }
-_HOMES = {name: room for room, names in _ROOMS.items() for name in names}
+_HOMES = {name: room for room, names in _ROOMS.items() for name in names.split()}
 
 
 if not TYPE_CHECKING:  # else every name would be one for a type checker

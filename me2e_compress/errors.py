@@ -56,8 +56,11 @@ FORMER = {
     "--smaller": f"--smaller {_NOW} a recipe's fold-constants{{bytes_per_node=0}}",
     "--allow-empty": f"--allow-empty {_NOW} -r exact, which writes no int8",
     "compress --alive": "--alive is of compare alone since 0.3.0",
+    "--pick": f"--pick {_NOW} --examine, which looks at all routes",
+    "routes --routes": f"routes --routes {_NOW} --examine, which looks at all",
     "--tactic-source": "--tactic-source is gone since 0.3.0: TensorRT chooses",
-    "--seed": "--seed is of evaluate, frames and routes alone since 0.3.0",
+    "--seed": "--seed is of compress, evaluate, frames and routes since 0.3.0",
+    "--unproven": f"--unproven {_NOW} --verify-frames 0, which asks for no proof",
     "--threads": "--threads is of calibrate and profile since 0.3.0",
     "--energy-out": f"--energy-out {_NOW} TRACE.energy.json beside the trace",
     "inspect --frames": f"inspect --frames {_NOW} --trace, of profile --by-module",
@@ -110,6 +113,12 @@ FORMER = {
 """Names of 0.2, by kind, and what replaces them; to be deleted with 0.4.0."""
 
 
+def names_former(error: BaseException) -> bool:
+    """Return whether an error answers a name that is gone: the user's words are old."""
+    said = str(error)
+    return any(line in said for line in FORMER.values())
+
+
 class Me2eError(Exception):
     """Base class: the command line prints these on one line, without a traceback."""
 
@@ -132,6 +141,10 @@ class ModuleMapError(Me2eError):
 
 class RecipeError(Me2eError):
     """A recipe or pipeline names an unknown pass or option."""
+
+
+class OptionError(RecipeError):
+    """An option is missing or takes no such value: a usage error."""
 
 
 class PreconditionError(Me2eError):

@@ -20,14 +20,14 @@ from typing import TYPE_CHECKING
 import onnx
 
 from me2e_compress import graph
+from me2e_compress.display import megabytes
 from me2e_compress.errors import GraphError, Me2eError, RecipeError
 from me2e_compress.graph import file_bytes
 from me2e_compress.operators.deformable_attention import DeformableAttention
 from me2e_compress.registry.drafts import PRODUCER
 from me2e_compress.shipped.drivers import write
-from me2e_compress.workflows.checks import check_count
-from me2e_compress.workflows.claims import writing
-from me2e_compress.workflows.result import megabytes
+from me2e_compress.workflows.checks import writing
+from me2e_compress.workflows.options import check_count
 from models.construct import construct, draw
 from models.dialect import in_dialect
 from models.published_weights import PublishedWeights, published_weights

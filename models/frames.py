@@ -12,8 +12,8 @@ from me2e_compress.calibration.recording import Begin, partial_of, write_recordi
 from me2e_compress.errors import Me2eError
 from me2e_compress.runtime.frames import Frame
 from me2e_compress.version import __version__
-from me2e_compress.workflows.checks import check_count, check_folder
-from me2e_compress.workflows.claims import writing
+from me2e_compress.workflows.checks import check_folder, writing
+from me2e_compress.workflows.options import check_count
 from models.stacks import STACKS, find
 from models.synthetic_frames import frames
 

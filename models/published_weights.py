@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from me2e_compress.errors import GraphError
-from me2e_compress.workflows.weights_record import RECORD, WeightsRecord
+from me2e_compress.workflows.inspect import RECORD, WeightsRecord
 from models.construct import construct
 from models.published_names import PUBLISHED, Mismatch, NameMatch
 from models.stacks import Stack, find

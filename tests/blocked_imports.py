@@ -75,7 +75,7 @@ def main() -> None:
     Not onnxruntime: its threads would not be there after a fork.
     """
     cases = json.loads(Path(sys.argv[1]).read_text())
-    base = ("numpy", "onnx_ir", "pydantic", "scipy.optimize", "rich", "typer")
+    base = ("numpy", "onnx_ir", "pydantic", "scipy.optimize", "rich", "cyclopts")
     for name in (*base, "torch", "numba", "highway_env", "matplotlib.pyplot"):
         importlib.import_module(name)
     answers = {}

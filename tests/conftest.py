@@ -7,7 +7,7 @@ import pytest
 
 from me2e_compress.graph.modules import ModuleMap
 from me2e_compress.passes.base import Context
-from me2e_compress.workflows import first_opening
+from me2e_compress.workflows import checks
 from tests import profiles
 
 DRIVER = """
@@ -67,7 +67,7 @@ def opened_before(request: pytest.FixtureRequest) -> Iterator[None]:
         yield
         return
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(first_opening, "CPU", None)  # no provider is that one
+        patch.setattr(checks, "CPU", None)  # no provider is that one
         yield
 
 

@@ -5,6 +5,7 @@ from typing import Literal
 
 from benchmarks.paper.drives import ModelFacts, PaperDrives
 from benchmarks.paper.published import PublishedDrive
+from me2e_compress.display import Cell
 from me2e_compress.driving.realtime import DT_US, skipped_decisions
 from me2e_compress.metrics.eer import (
     POINTS,
@@ -16,7 +17,6 @@ from me2e_compress.metrics.eer import (
 from me2e_compress.metrics.measure import Estimate, Measure
 from me2e_compress.metrics.route_summary import DS, ROOM
 from me2e_compress.study.cells import MISSING, estimate_cell, number
-from me2e_compress.workflows.result import Cell
 
 GIVEN = ("paper's DS", "paper's DE %", "paper's DC")
 GIVEN_ENERGY = ("paper's J/frame", "paper's EER")

@@ -6,9 +6,9 @@ from enum import StrEnum
 from benchmarks.paper.drives import PaperDrives
 from benchmarks.paper.evidence import Found, evidence
 from benchmarks.paper.questions import BEFORE, PaperQuestion, PaperQuestions
+from me2e_compress.display import Cell, Table
 from me2e_compress.metrics.route_summary import holm
 from me2e_compress.study.cells import MISSING, estimate_cell
-from me2e_compress.workflows.result import Cell, Table
 
 FIRST = "first form"
 """Of a question whose drives do not know it, and that nobody changed."""

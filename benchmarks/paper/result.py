@@ -16,9 +16,9 @@ from benchmarks.paper.findings import (
     told_of_questions,
 )
 from benchmarks.paper.tables import all_paper_tables
+from me2e_compress.display import Table
 from me2e_compress.study.report.page import Drawing, Page, Section
 from me2e_compress.study.report.style import styled, svg
-from me2e_compress.workflows.result import Table
 
 
 @dataclass(frozen=True)

@@ -25,11 +25,11 @@ from benchmarks.paper.cells import (
 from benchmarks.paper.counts import partners, table_4
 from benchmarks.paper.drives import PaperDrives
 from benchmarks.paper.published import PublishedDrive
+from me2e_compress.display import Cell, Table
 from me2e_compress.metrics.route_summary import PERCENTS
 from me2e_compress.study.cells import MISSING
 from me2e_compress.study.study_blocks import StudyBlock
 from me2e_compress.study.workload import held_frames
-from me2e_compress.workflows.result import Cell, Table
 
 OURS = (
     "Means with their 95 % intervals over these scenario types. The paper's figures"

@@ -27,8 +27,9 @@ from me2e_compress.study.outcome import this_machine
 from me2e_compress.study.prepared import PreparedVariant
 from me2e_compress.study.timing import Clock
 from me2e_compress.workflows.inspect import inspect
-from me2e_compress.workflows.listener import Listener
-from me2e_compress.workflows.profile import ProfileOptions, profile
+from me2e_compress.workflows.options import InspectOptions, ProfileOptions
+from me2e_compress.workflows.profile import profile
+from me2e_compress.workflows.result import Listener
 
 PROFILED = 100
 """Inferences under a profiler, for the figure of modules."""
@@ -118,7 +119,7 @@ def _facts_of(
         )
     # otherwise count the graph anew
     module_map = prepared.variant.module_map
-    found = inspect(prepared.model, module_map)
+    found = inspect(prepared.model, InspectOptions(module_map=module_map))
     return ModelFacts(
         name,
         prepared.sha256,

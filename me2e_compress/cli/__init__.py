@@ -1,4 +1,4 @@
-"""The ``me2e-compress`` command, one file per command; the only package that prints."""
+"""The ``me2e-compress`` command; the only package that prints."""
 
 import os
 import sys
@@ -7,7 +7,7 @@ from pathlib import Path
 
 from me2e_compress.cli.signals import INTERRUPTED, TERMINATED, signals_in_order
 from me2e_compress.display import printable
-from me2e_compress.errors import Me2eError
+from me2e_compress.errors import Me2eError, OptionError, names_former
 
 AGAIN = "run again to go on"
 RESUMES = {
@@ -47,26 +47,28 @@ def _commands() -> None:
     # not imported above: processes that evaluate spawns import this module, not these
     from me2e_compress.cli.app import app
 
-    app(standalone_mode=True, prog_name="me2e-compress")
+    app.meta(sys.argv[1:])
 
 
 def _run(run: Callable[[], None]) -> int:
-    from me2e_compress.cli.console import errors
-    from me2e_compress.cli.verbosity import Verbosity, set_verbosity
+    from cyclopts import CycloptsError
+
+    from me2e_compress.cli.console import Verbosity, errors, set_verbosity
     from me2e_compress.extras import explained
 
     set_verbosity(Verbosity.NORMAL)
     try:
         _check_place()
         run()
-    except (Me2eError, OSError, ImportError) as error:
+    except (CycloptsError, Me2eError, OSError, ImportError) as error:
         told = explained(error)
         if isinstance(told, ImportError):
             raise  # of no optional package: a defect of ours, which needs its traceback
         # an error of the user's is one line, without a traceback
         line = printable(" ".join(_told(told).split()))
         errors.print(f"me2e-compress: {line}", soft_wrap=True, markup=False)
-        return 1
+        usage = isinstance(error, CycloptsError | OptionError) or names_former(error)
+        return 2 if usage else 1
     return 0
 
 

@@ -1,9 +1,10 @@
-"""Printing for all commands: results, tables, progress, JSON."""
+"""What is printed, and how: results, tables, progress, JSON; ``-q``, ``-v``."""
 
+import enum
 import json
 import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Literal
 
@@ -18,13 +19,51 @@ from rich.progress import (
 from rich.table import Table as Shown
 from rich.text import Text
 
-from me2e_compress.cli.verbosity import is_json, is_quiet, is_verbose
-from me2e_compress.display import duration, printable
-from me2e_compress.workflows.listener import SILENT, Listener
-from me2e_compress.workflows.result import Cell, Result, Table
+from me2e_compress.display import Cell, Table, duration, printable
+from me2e_compress.workflows.result import SILENT, Listener, Result
 
 console = Console(record=True)
 errors = Console(stderr=True, highlight=False)
+
+
+class Verbosity(enum.Enum):
+    """How much is printed besides results and errors."""
+
+    QUIET = enum.auto()
+    NORMAL = enum.auto()
+    VERBOSE = enum.auto()
+
+
+_chosen = Verbosity.NORMAL
+_as_json = False
+
+
+def set_verbosity(wanted: Verbosity) -> None:
+    """Set how much is printed, until the next call."""
+    global _chosen
+    _chosen = wanted
+
+
+def set_json(wanted: bool) -> None:
+    """Set whether results are printed as JSON, until the next call."""
+    global _as_json
+    _as_json = wanted
+
+
+def is_json() -> bool:
+    """Return whether a result is printed as one JSON document."""
+    return _as_json
+
+
+def is_quiet() -> bool:
+    """Return whether only results and errors are printed."""
+    return _chosen is Verbosity.QUIET
+
+
+def is_verbose() -> bool:
+    """Return whether notes and node lists are printed too."""
+    return _chosen is Verbosity.VERBOSE
+
 
 WIDE = 120
 """Columns that a terminal must have for intervals beside the numbers."""
@@ -84,7 +123,7 @@ def tell(line: str) -> None:
         errors.print(printable(line), soft_wrap=True, markup=False)
 
 
-def show(found: Result, tables: Sequence[Table] | None = None) -> None:
+def show(found: Result, tables: Iterable[Table] | None = None) -> None:
     """Print a result as tables and lines, or as one JSON document if asked to.
 
     `tables` are printed instead of the result's own.
@@ -99,6 +138,14 @@ def show(found: Result, tables: Sequence[Table] | None = None) -> None:
         say(line)
     for line in found.alerts():
         console.print(Text(printable(line), "bold"), soft_wrap=True)
+
+
+def show_of(workflow: Callable[..., Result], *words: object) -> None:
+    """Call a workflow with a listener, and show what it gives, refused or not."""
+    with listening() as listener:
+        result = workflow(*words, listener)
+    show(result)
+    result.check()
 
 
 def say(line: str) -> None:

@@ -10,8 +10,8 @@ import numpy as np
 from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.calibration.engine_dump import EngineDump
 from me2e_compress.errors import EvaluationError
+from me2e_compress.fidelity import ALIVE
 from me2e_compress.fidelity.compare import decibels
-from me2e_compress.fidelity.floor import ALIVE
 from me2e_compress.fidelity.liveness import OutputTally
 from me2e_compress.runtime.frames import Array, Frame
 from me2e_compress.runtime.session import DTYPES, Session

@@ -12,9 +12,9 @@ import onnx_ir as ir
 
 from me2e_compress import graph
 from me2e_compress.errors import EvaluationError
+from me2e_compress.fidelity import SQNR_FLOOR_DB
 from me2e_compress.fidelity.compare import decibels
 from me2e_compress.fidelity.engine_loss import EngineRun
-from me2e_compress.fidelity.floor import SQNR_FLOOR_DB
 from me2e_compress.graph.nodes import constant_values, nodes_of, reads_of
 from me2e_compress.graph.provenance import module_of
 from me2e_compress.runtime.frames import Array, Frame
@@ -75,7 +75,7 @@ def find_first_difference(
 
     The last of the frames is compared; the state of both graphs is what the source gave
     on those before. The floor is :data:`ROUNDING_DB`, or
-    :data:`me2e_compress.fidelity.floor.SQNR_FLOOR_DB` where a graph holds int8 or
+    :data:`me2e_compress.fidelity.SQNR_FLOOR_DB` where a graph holds int8 or
     mostly narrow floats.
 
     Raises:

@@ -7,6 +7,7 @@ from typing import Self
 import numpy as np
 import onnx_ir as ir
 
+from me2e_compress.fidelity import SQNR_FLOOR_DB
 from me2e_compress.fidelity.compare import Fidelity, Reference
 from me2e_compress.graph.nodes import (
     FLOATS,
@@ -17,15 +18,8 @@ from me2e_compress.graph.nodes import (
 )
 from me2e_compress.runtime.frames import Frame
 
-SQNR_FLOOR_DB = 20.0
-"""Noise of a tenth of the signal's amplitude."""
-
 PLAN_FLOOR_M = 0.5
 """A car 1.9 m wide in the middle of a lane of 3.5 m still keeps 0.3 m to its lines."""
-
-ALIVE = 0.01
-"""Least standard deviation over frames, as a share of the uncompressed graph's, of an
-output that is not dead."""
 
 MOST_EXCESS = 1e6
 """Excess of an output that should be zero and is not."""

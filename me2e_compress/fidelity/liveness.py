@@ -13,7 +13,7 @@ from typing import Literal, TypeAlias
 import numpy as np
 
 from me2e_compress.display import Table, number, table
-from me2e_compress.fidelity.floor import ALIVE
+from me2e_compress.fidelity import ALIVE
 from me2e_compress.runtime.frames import Array, Frame
 from me2e_compress.runtime.session import Session
 

@@ -1,1 +1,4 @@
 """Scores of driven episodes, independent of any simulator, model or pass."""
+
+BUDGET_MS = 50.0
+"""What a decision may take: a frame at 20 Hz."""

@@ -1,16 +1,16 @@
 """Share of decisions that exceed their latency budget."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from statistics import fmean
 from typing import Any
 
+from me2e_compress.display import Table, counted, not_measured, number, table
+from me2e_compress.metrics import BUDGET_MS
 from me2e_compress.metrics.episode import FRAME_US, Episode
 from me2e_compress.metrics.measure import Measure, percentile, too_few
 from me2e_compress.metrics.route_scores import TTC_CRITICAL_S
 
-BUDGET_MS = FRAME_US / 1000
-"""One frame at 20 Hz."""
 PERCENTILES = (50.0, 99.0, 99.9)
 UNSEEN = Measure(None, "ms", "nobody looked at the road")
 
@@ -118,3 +118,31 @@ def _mean(latencies_us: Sequence[int], why: str) -> Measure:
     if not latencies_us:
         return Measure(None, "ms", why)
     return Measure(fmean(latencies_us) / 1e3, "ms")
+
+
+def _percentile(latencies_us: Sequence[int], percent: float, samples: int) -> Measure:
+    if why := too_few(percent, samples):
+        return Measure(None, "ms", why)
+    return Measure(percentile(latencies_us, percent) / 1e3, "ms")
+
+
+def deadlines_table(title: str, found: Deadlines) -> Table:
+    """Return percentiles, and how many decisions took longer than the budget."""
+    rows = [(n, number(each.value, ".2f"), each.unit) for n, each in _each(found)]
+    why = {name: each.reason for name, each in _each(found) if each.value is None}
+    return table(
+        f"{title}: {counted(found.count, 'decision')}",
+        ("latency", "", "unit"),
+        rows,
+        not_measured(why),
+    )
+
+
+def _each(found: Deadlines) -> Iterator[tuple[str, Measure]]:
+    yield from ((f"p{p:g}", each) for p, each in found.percentiles_ms.items())
+    yield "max", found.worst_ms
+    yield "mean", found.mean_ms
+    yield f"over {found.budget_ms:g} ms", found.over_percent
+    if found.critical_ms.value is not None:
+        yield "mean, TTC below 1.5 s", found.critical_ms
+        yield "mean, other frames", found.other_ms

@@ -78,10 +78,6 @@ EXPERT_S: dict[str, int] = {str(name): int(seconds) for name, seconds, *_ in _TY
 """Scenario type to how long it typically takes. Only the order in which routes begin
 and the length of recorded scenes depend on it, never a result."""
 
-VARIANTS = 5
-"""Routes of each type, as in Bench2Drive's 220."""
-
-
 Parameter = bool | int | float | str
 
 SHIPPED = Path(__file__).with_name("routes_220.json")

@@ -5,7 +5,7 @@ from me2e_compress.study.definition import Study, Timing, Variant
 from me2e_compress.study.file import load_study
 from me2e_compress.study.run import run_study
 from me2e_compress.study.study_result import StudyResult
-from me2e_compress.workflows.listener import Listener
+from me2e_compress.workflows.result import Listener
 
 __all__ = [
     "Condition",

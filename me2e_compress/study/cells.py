@@ -1,9 +1,9 @@
 """Cells of a study's tables: one content for the terminal, Markdown and HTML."""
 
+from me2e_compress.display import Cell
+from me2e_compress.display import number as plain_number
 from me2e_compress.metrics.measure import Estimate, Measure
 from me2e_compress.study.plan_fidelity import EXACT
-from me2e_compress.workflows.result import Cell
-from me2e_compress.workflows.result import number as plain_number
 
 MISSING = "\N{EN DASH}"
 """Shown if nothing was measured."""

@@ -1,7 +1,7 @@
 """The demo with a driver: compress it, then drive the same routes with both."""
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 from me2e_compress.evaluators.highway.engine import LocalEngine
@@ -16,16 +16,14 @@ from me2e_compress.study.verdict import before_and_after, road_verdict
 from me2e_compress.study.workspace import HTML, JSON, MARKDOWN
 from me2e_compress.study.write import StudyFiles, write_study
 from me2e_compress.targets import DEFAULT_TARGET
-from me2e_compress.workflows.checks import check_folder
-from me2e_compress.workflows.claims import check_ours
+from me2e_compress.workflows.checks import check_folder, check_ours
 from me2e_compress.workflows.compare import CompareResult, compare
-from me2e_compress.workflows.compress import CompressOptions, compress
-from me2e_compress.workflows.compress_result import CompressResult, beside
-from me2e_compress.workflows.export import export_stack
-from me2e_compress.workflows.frames import FramesOptions, record_frames
-from me2e_compress.workflows.listener import Listener
-from me2e_compress.workflows.module_changes import ModuleChanges, compare_modules
-from me2e_compress.workflows.result import Result, Table
+from me2e_compress.workflows.compress import CompressResult, beside, compress
+from me2e_compress.workflows.files import export_stack
+from me2e_compress.workflows.frames import record_frames
+from me2e_compress.workflows.inspect import ModuleChanges, compare_modules
+from me2e_compress.workflows.options import CompressOptions, FramesOptions
+from me2e_compress.workflows.result import Listener, Result, Shown
 
 CALIBRATION_FRAMES, HELD_OUT_FRAMES = 64, 24
 LATENCY_SAMPLES, WORKERS = 100, 2
@@ -43,27 +41,41 @@ class DriveResult(Result):
     variant: str
     ending: tuple[str, ...]
 
-    @property
-    def headline(self) -> str:
-        """Number of routes, and of routes in the set."""
+    def shown(self) -> Shown:
+        """Return size, time, plan and driving, before and after, and the verdict."""
         driven, whole = self.study.coverage
-        return f"{driven} of {whole} routes, before and after"
-
-    def lines(self) -> tuple[str, ...]:
-        """Return the verdict on the driving, and next steps."""
-        return (road_verdict(self.study, self.variant), *self.ending)
-
-    def alerts(self) -> tuple[str, ...]:
-        """Return warnings that cast doubt on the figures."""
-        return self.study.alerts()
-
-    def tables(self) -> tuple[Table, ...]:
-        """Return size, time, plan and driving, before and after."""
-        return (before_and_after(self.study, self.variant),)
+        return Shown(
+            f"{driven} of {whole} routes, before and after",
+            [before_and_after(self.study, self.variant)],
+            (road_verdict(self.study, self.variant), *self.ending),
+            self.study.alerts(),
+        )
 
     def to_json(self) -> object:
         """Return the whole study as JSON."""
         return self.study.to_json()
+
+
+@dataclasses.dataclass(frozen=True, repr=False)
+class DemoResult(Result):
+    """Of ``compress``, ``weigh``, ``compare`` and ``drive``, in this order."""
+
+    steps: Mapping[str, Result]
+
+    def shown(self) -> Shown:
+        """Return the verdict of the last step, and the warnings of all."""
+        *_, last = self.steps.values()
+        alerts = [line for each in self.steps.values() for line in each.alerts()]
+        return Shown(last.headline, last.tables(), last.lines(), alerts)
+
+    def to_json(self) -> object:
+        """Return the result of each step."""
+        return {name: each.to_json() for name, each in self.steps.items()}
+
+
+def figure(result: Result) -> str:
+    """Return a step's result, short enough for a line of a terminal."""
+    return result.size if isinstance(result, CompressResult) else result.headline
 
 
 @dataclasses.dataclass(frozen=True)
@@ -123,7 +135,7 @@ class DriverDemo:
     def compare(self, listener: Listener) -> CompareResult:
         """Compare the compressed graph with the driver on other frames."""
         graphs = self._source, self._small
-        found = compare(*graphs, self._held_out, listener)
+        found = compare(*graphs, self._held_out, listener=listener)
         self._told.append(Section("The outputs", found.tables()))
         return found
 
@@ -159,7 +171,7 @@ class DriverDemo:
         """Record frames to calibrate on, and others to compare on, of the next seed."""
         folders = {self._frames: CALIBRATION_FRAMES, self._held_out: HELD_OUT_FRAMES}
         for seed, (folder, count) in enumerate(folders.items()):
-            asked = FramesOptions(count, seed, force=self.force)
+            asked = FramesOptions(count=count, seed=seed, force=self.force)
             record_frames(self._source, folder, asked, listener)
 
     def _compressed(self, listener: Listener) -> CompressResult:

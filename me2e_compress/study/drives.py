@@ -19,13 +19,13 @@ from me2e_compress.study.drive_record import DriveRecord, apart
 from me2e_compress.study.prepared import PreparedVariant
 from me2e_compress.study.timing import Clock
 from me2e_compress.study.workspace import Workspace
-from me2e_compress.workflows.listener import Listener
 from me2e_compress.workflows.other_evaluators import (
     driven_episodes,
     evaluator_named,
     keep,
     kept,
 )
+from me2e_compress.workflows.result import Listener
 
 
 @dataclass(frozen=True)

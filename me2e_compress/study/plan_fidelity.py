@@ -13,7 +13,7 @@ from me2e_compress.runtime.frames import Frame
 from me2e_compress.runtime.session import Session
 from me2e_compress.study.definition import Study
 from me2e_compress.study.prepared import PreparedVariant
-from me2e_compress.workflows.listener import Listener
+from me2e_compress.workflows.result import Listener
 
 EXACT = "no noise: equal to the bit"
 """Reason why an unchanged plan has no signal-to-noise ratio."""

@@ -20,11 +20,11 @@ from me2e_compress.study.definition import Study, Variant
 from me2e_compress.study.workspace import Workspace
 from me2e_compress.targets.onnxruntime import slow_here
 from me2e_compress.version import __version__
-from me2e_compress.workflows.compress import CompressOptions, compress
-from me2e_compress.workflows.compress_result import beside
-from me2e_compress.workflows.first_opening import try_first
-from me2e_compress.workflows.listener import Listener
-from me2e_compress.workflows.weights_record import named_weights
+from me2e_compress.workflows.checks import try_first
+from me2e_compress.workflows.compress import beside, compress
+from me2e_compress.workflows.inspect import named_weights
+from me2e_compress.workflows.options import CompressOptions
+from me2e_compress.workflows.result import Listener
 
 
 @dataclass(frozen=True)

@@ -16,10 +16,10 @@ from me2e_compress.study.side_by_side import take_pictures
 from me2e_compress.study.study_result import StudyResult
 from me2e_compress.study.timing import time_all
 from me2e_compress.study.workspace import HTML, JSON, MARKDOWN, Workspace
-from me2e_compress.workflows.checks import check_folder
-from me2e_compress.workflows.claims import check_ours, writing
-from me2e_compress.workflows.frames import FramesOptions, record_frames
-from me2e_compress.workflows.listener import SILENT, Listener
+from me2e_compress.workflows.checks import check_folder, check_ours, writing
+from me2e_compress.workflows.frames import record_frames
+from me2e_compress.workflows.options import FramesOptions
+from me2e_compress.workflows.result import SILENT, Listener
 
 
 def run_study(
@@ -92,7 +92,7 @@ def _recorded(study: Study, workspace: Workspace, listener: Listener) -> Study:
         folder = workspace.folder / name
         if not (folder / "scenes.json").is_file():
             folder.parent.mkdir(parents=True, exist_ok=True)
-            options = FramesOptions(count, seed, provider=study.provider)
+            options = FramesOptions(count=count, seed=seed, provider=study.provider)
             record_frames(model, folder, options, listener)
         folders.append(folder)
     frames, held_out = folders

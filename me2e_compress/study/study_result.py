@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
+from me2e_compress.display import Cell, Table, counted
 from me2e_compress.runtime.providers import PROVIDERS
 from me2e_compress.study.cells import MISSING, estimate_cell
 from me2e_compress.study.drive_record import DriveRecord
@@ -15,7 +16,7 @@ from me2e_compress.study.tables import (
     route_table,
     scoreboards,
 )
-from me2e_compress.workflows.result import Cell, Result, Table, counted
+from me2e_compress.workflows.result import Result
 
 
 @dataclass(frozen=True, repr=False)

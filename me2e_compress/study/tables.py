@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 
+from me2e_compress.display import Cell, Table, counted
 from me2e_compress.metrics.bench2drive import ABILITIES
 from me2e_compress.metrics.route_summary import (
     COLUMNS,
@@ -15,7 +16,6 @@ from me2e_compress.study.changes import Change
 from me2e_compress.study.condition import Condition
 from me2e_compress.study.drive_record import DriveRecord
 from me2e_compress.study.outcome import StudyOutcome, VariantOutcome
-from me2e_compress.workflows.result import Cell, Table, counted
 
 SCORES = tuple(each.name for each in COLUMNS)
 MOST_ROUTES = 40

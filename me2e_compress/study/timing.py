@@ -14,7 +14,7 @@ from me2e_compress.study.condition import Condition
 from me2e_compress.study.definition import Study, Variant
 from me2e_compress.study.prepared import PreparedVariant
 from me2e_compress.study.workspace import Workspace
-from me2e_compress.workflows.listener import Listener
+from me2e_compress.workflows.result import Listener
 
 
 @dataclass(frozen=True)

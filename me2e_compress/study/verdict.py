@@ -2,13 +2,13 @@
 
 from collections.abc import Callable
 
+from me2e_compress.display import Cell, Table
 from me2e_compress.metrics.measure import Estimate, Measure
 from me2e_compress.metrics.route_summary import PairedDifference, shown_by
 from me2e_compress.metrics.scores import Scores
 from me2e_compress.study.cells import MISSING, measure_cell, number
 from me2e_compress.study.drive_record import DriveRecord
 from me2e_compress.study.outcome import StudyOutcome
-from me2e_compress.workflows.result import Cell, Table
 
 
 def before_and_after(outcome: StudyOutcome, name: str) -> Table:

@@ -7,20 +7,14 @@ from pathlib import Path
 
 import numpy as np
 
+from me2e_compress.display import Cell, Table, counted, duration, number
 from me2e_compress.driving.latency import DecisionFacts
 from me2e_compress.driving.realtime import LatencyModel, skipped_decisions
 from me2e_compress.simulator.routes import EXPERT_S, Route
 from me2e_compress.study.condition import Condition
 from me2e_compress.study.definition import Study, Variant
 from me2e_compress.study.workspace import Workspace
-from me2e_compress.workflows.result import (
-    Cell,
-    Result,
-    Table,
-    counted,
-    duration,
-    number,
-)
+from me2e_compress.workflows.result import Result
 
 FRAME_S, DECISION_S = 0.0024, 0.021
 """CPU seconds of a frame of the world, and of a decision: six pictures and one

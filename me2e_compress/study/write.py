@@ -12,7 +12,7 @@ from me2e_compress.study.report.page import Section
 from me2e_compress.study.report.study_page import study_page
 from me2e_compress.study.study_result import StudyResult
 from me2e_compress.study.workspace import HTML, JSON, MARKDOWN
-from me2e_compress.workflows.claims import writing
+from me2e_compress.workflows.checks import writing
 
 
 @dataclass(frozen=True)

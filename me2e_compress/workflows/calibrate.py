@@ -1,7 +1,8 @@
-"""Calibrate int8: measure or import the ranges of tensors."""
+"""Calibrate int8: measure or import the ranges of tensors, and look at them."""
 
 import dataclasses
 import gc
+from collections.abc import Sequence
 from pathlib import Path
 
 from me2e_compress.calibration.calibrator import Calibrator
@@ -15,30 +16,96 @@ from me2e_compress.calibration.exchange import (
 )
 from me2e_compress.calibration.observers import OBSERVERS
 from me2e_compress.calibration.ranges import Ranges, rms_of
-from me2e_compress.calibration.review import not_in, review
+from me2e_compress.calibration.review import (
+    RangeFinding,
+    factor,
+    not_in,
+    ratios_of,
+    reach_of,
+    review,
+    review_beside,
+)
 from me2e_compress.calibration.sample import FrameSubset, draw
+from me2e_compress.display import counted, number, table
 from me2e_compress.errors import FramesError
 from me2e_compress.manager import recipe
 from me2e_compress.quantization.decision import keep_readers, overrides_text
-from me2e_compress.registry import drafts
+from me2e_compress.registry import documents, drafts
 from me2e_compress.runtime.atomic import write_bytes
-from me2e_compress.workflows.calibrate_options import (
-    CalibrateOptions,
-    checkpoint_beside,
-    overrides_beside,
-    written_files,
-)
-from me2e_compress.workflows.calibrate_result import CalibrateResult
 from me2e_compress.workflows.checks import (
     check_folder,
     model_path,
     output_path,
     read_graph,
+    try_first,
+    writing,
 )
-from me2e_compress.workflows.claims import writing
-from me2e_compress.workflows.first_opening import try_first
-from me2e_compress.workflows.listener import SILENT, Listener
-from me2e_compress.workflows.prepare_int8 import PreparedGraph
+from me2e_compress.workflows.options import CalibrateOptions
+from me2e_compress.workflows.plan import PreparedGraph
+from me2e_compress.workflows.result import SILENT, Listener, Result, Shown
+
+
+def checkpoint_beside(output: Path) -> Path:
+    """Return where the progress of a calibration stands."""
+    return output.with_name(output.name + ".checkpoint")
+
+
+def overrides_beside(output: Path) -> Path:
+    """Return where the overrides stand of what an imported cache lacks."""
+    return output.with_name(f"{output.stem}.overrides.toml")
+
+
+def written_files(output: Path, options: CalibrateOptions) -> list[Path]:
+    """List the files that are written; an onnxruntime table is a folder of three."""
+    files = [output, checkpoint_beside(output)]
+    if options.imported is not None:
+        files.append(overrides_beside(output))
+    if options.tensorrt_cache is not None:
+        files.append(Path(options.tensorrt_cache))
+    if options.onnxruntime_table is not None:
+        folder = Path(options.onnxruntime_table)
+        if folder.is_dir():
+            files += (folder / name for name in TABLE_FILES)
+    return files
+
+
+@dataclasses.dataclass(frozen=True, repr=False)
+class CalibrateResult(Result):
+    """The range of every tensor.
+
+    `findings` say what of the ranges deserves a look. `overrides` is the file that
+    keeps in float what an imported cache has no range for; None where it has all.
+    """
+
+    output: Path
+    frames: int
+    ranges: Ranges
+    findings: tuple[RangeFinding, ...] = ()
+    overrides: Path | None = None
+
+    def shown(self) -> Shown:
+        """Return the ranges that deserve a look, and how to keep floats."""
+        ranges = self.ranges
+        how = f"compress --ranges {self.output} --overrides {self.overrides}"
+        headline = (
+            f"{self.output}: {counted(len(ranges.tensors), 'tensor')}, {ranges.method},"
+            f" {counted(ranges.frames, 'frame')}"
+        )
+        return Shown(
+            headline,
+            lines=(headline, *_said(self.findings, "note")),
+            alerts=(
+                *_said(self.findings, "warning"),
+                *([] if self.overrides is None else [f"These floats: {how}"]),
+            ),
+        )
+
+    def to_json(self) -> object:
+        """Return the ranges and the tensors that are always zero."""
+        found = self.ranges
+        own = {**dataclasses.asdict(found), "dead": found.dead}
+        own |= {"outliers": found.outliers, "findings": self.findings}
+        return {**own, "overrides": self.overrides}
 
 
 def calibrate(
@@ -78,10 +145,27 @@ def calibrate(
         ready, part = _ready(source, frames, options, listener)
         gc.collect()  # 150 MB of VAD-tiny as it was read; graphs are cycles
         with drafts.all_or_none():
+            missing, overrides = list[str](), overrides_beside(output)
             if options.imported is not None:
-                return _import(ready, Path(options.imported), part, output, options)
-            assert part is not None
-            return _calibrate(ready, part, output, options, listener)
+                ranges, missing = _imported(ready, part, options)
+            else:
+                assert part is not None
+                ranges = _measured(ready, part, output, options, listener)
+            ranges.save(output)
+            if options.tensorrt_cache is not None:
+                write_tensorrt_cache(ranges, Path(options.tensorrt_cache))
+            if options.onnxruntime_table is not None:
+                write_onnxruntime_table(ranges, Path(options.onnxruntime_table))
+            # what an imported cache has no range for stays in float
+            cache = Path(options.imported or "")
+            if missing:
+                absent = f"not in {cache.name}"
+                floats = (keep_readers(name, absent) for name in missing)
+                text = drafts.IN_TOML + overrides_text(floats)
+                write_bytes(overrides, text.encode())
+    findings = (*not_in(cache, missing), *review(ranges))
+    written = overrides if missing else None
+    return CalibrateResult(output, ranges.frames, ranges, findings, written)
 
 
 def _ready(
@@ -109,67 +193,137 @@ def _ready(
         listener=listener,
         file=source,
         frames=part,
-        provider=options.provider,
+        provider=options.runs_on,
     )
     passes = recipe.load(options.recipe)
     return PreparedGraph.of(source, loaded, options.module_map, passes), part
 
 
-def _calibrate(
+def _measured(
     ready: PreparedGraph,
     part: FrameSubset,
     output: Path,
     options: CalibrateOptions,
     listener: Listener,
-) -> CalibrateResult:
+) -> Ranges:
     tensors = ready.tensors()
     # a checkpoint lets a run that was killed go on
-    method = options.method or ready.method
+    method, provider = options.method or ready.method, options.runs_on
     checkpoint = checkpoint_beside(output)
     calibrator = Calibrator(
-        method, options.threads, checkpoint=checkpoint, provider=options.provider
+        method, options.threads, checkpoint=checkpoint, provider=provider
     )
     seen = calibrator.collect(
-        ready.model,
-        tensors,
-        part,
-        lambda done, of: listener.on_progress("calibrate", done, of, method),
+        ready.model, tensors, part, listener.counting("calibrate", method)
     )
-    return _written(Ranges.of(seen, OBSERVERS.parse(method)), output, options)
+    return Ranges.of(seen, OBSERVERS.parse(method))
 
 
-def _import(
-    ready: PreparedGraph,
-    path: Path,
-    part: FrameSubset | None,
-    output: Path,
-    options: CalibrateOptions,
-) -> CalibrateResult:
-    """Take another tool's ranges; keep in float what has none."""
-    cache, tensors = read_cache(path), ready.tensors()
-    found = taken_from(cache, path, ready.model, tensors)
-    missing = [name for name in tensors if name not in found.tensors]
+def _imported(
+    ready: PreparedGraph, part: FrameSubset | None, options: CalibrateOptions
+) -> tuple[Ranges, list[str]]:
+    """Take another tool's ranges; name the tensors that it has none for."""
+    path, tensors = Path(options.imported or ""), ready.tensors()
+    ranges = taken_from(read_cache(path), path, ready.model, tensors)
     # two frames show the size of every tensor; the second has a state
     if part is not None:
         few = dataclasses.replace(part, places=part.places[:2])
-        calibrator = Calibrator(threads=options.threads, provider=options.provider)
-        seen = calibrator.collect(ready.model, tuple(found.tensors), few)
-        found = dataclasses.replace(found, rms=rms_of(seen))
-    made = _written(found, output, options)
-    overrides = overrides_beside(output) if missing else None
-    if overrides is not None:
-        floats = (keep_readers(name, f"not in {path.name}") for name in missing)
-        text = drafts.IN_TOML + overrides_text(floats)
-        write_bytes(overrides, text.encode())
-    return dataclasses.replace(
-        made, findings=(*not_in(path, missing), *made.findings), overrides=overrides
-    )
+        calibrator = Calibrator(threads=options.threads, provider=options.runs_on)
+        seen = calibrator.collect(ready.model, tuple(ranges.tensors), few)
+        ranges = dataclasses.replace(ranges, rms=rms_of(seen))
+    return ranges, [name for name in tensors if name not in ranges.tensors]
 
 
-def _written(found: Ranges, output: Path, options: CalibrateOptions) -> CalibrateResult:
-    found.save(output)
-    if options.tensorrt_cache is not None:
-        write_tensorrt_cache(found, Path(options.tensorrt_cache))
-    if options.onnxruntime_table is not None:
-        write_onnxruntime_table(found, Path(options.onnxruntime_table))
-    return CalibrateResult(output, found.frames, found, findings=review(found))
+_SHOWN = 10
+"""Rows of the table; ``--json`` has all tensors."""
+
+
+@dataclasses.dataclass(frozen=True, repr=False)
+class RangesResult(Result):
+    """Saved ranges, those that they were compared with, and what deserves a look."""
+
+    path: Path
+    ranges: Ranges
+    other_path: Path | None
+    other: Ranges | None
+    findings: tuple[RangeFinding, ...]
+
+    def shown(self) -> Shown:
+        """Return the tensors that are furthest off, and what is wrong or may be."""
+        columns = ["low", "high", "rms", "crest"]
+        headlines = [f"{self.path}: {self.ranges.headline}"]
+        if self.other is not None:
+            columns += ["other", "ratio"]
+            headlines.append(f"{self.other_path}: {self.other.headline}")
+        cells = [
+            [str(row["tensor"]), *(_cell(row[each]) for each in columns)]
+            for row in self._rows()[:_SHOWN]
+        ]
+        heads = {"crest": "range / rms", "other": f"range in {self.other_path}"}
+        named = ["tensor", *(heads.get(each, each) for each in columns)]
+        return Shown(
+            headlines[0],
+            [table("Ranges, the furthest off first", named, cells)],
+            [*headlines, *_said(self.findings, "note")],
+            _said(self.findings, "warning"),
+        )
+
+    def _rows(self) -> list[dict[str, object]]:
+        """Return one row per tensor; what is not known is None."""
+        crests = self.ranges.crests
+        others = {} if self.other is None else self.other.tensors
+        ratios = {} if self.other is None else ratios_of(self.ranges, self.other)
+        rows: dict[str, dict[str, object]] = {
+            name: {
+                "tensor": name,
+                "low": low,
+                "high": high,
+                "rms": self.ranges.rms.get(name),
+                "crest": crests.get(name),
+                "other": reach_of(others[name]) if name in others else None,
+                "ratio": ratios.get(name),
+            }
+            for name, (low, high) in self.ranges.tensors.items()
+        }
+        off = {name: factor(ratio) for name, ratio in ratios.items()} or crests
+        order = sorted(rows, key=lambda name: -off.get(name, 0.0))
+        return [rows[name] for name in order]
+
+    def to_json(self) -> object:
+        """Return what was found, and every tensor."""
+        return {"findings": self.findings, "tensors": self._rows()}
+
+
+def _said(findings: Sequence[RangeFinding], severity: str) -> tuple[str, ...]:
+    return tuple(str(each) for each in findings if each.severity == severity)
+
+
+def _cell(value: object) -> str:
+    return number(value if isinstance(value, float) else None, ".4g")
+
+
+def ranges(path: str | Path, other: str | Path | None = None) -> RangesResult:
+    """Say which saved ranges deserve a look, and what to record instead.
+
+    Either file is ranges that ``calibrate`` saved, a TensorRT calibration cache, or an
+    onnxruntime ``calibration.cache``. With ``other``, ranges are also held against its
+    own: another recording's of the same graph, or another tool's.
+
+    Raises:
+        FramesError: A file does not exist, contradicts itself, or is of another graph.
+    """
+    mine = _read(Path(path))
+    if other is None:
+        return RangesResult(Path(path), mine, None, None, review(mine))
+    theirs = _read(Path(other))
+    found = (*review(mine), *review_beside(mine, theirs, str(other)))
+    return RangesResult(Path(path), mine, Path(other), theirs, found)
+
+
+def _read(path: Path) -> Ranges:
+    """Read ranges of ours, or another tool's cache."""
+    if not path.is_file():
+        raise FramesError(f"{path}: no such ranges file or calibration cache")
+    with documents.reading(path, FramesError, "not ranges"):
+        is_json = documents.content(path)[:64].lstrip().startswith(b"{")
+    return Ranges.load(path) if is_json else read_cache(path)

@@ -3,6 +3,7 @@
 import dataclasses
 from pathlib import Path
 
+from me2e_compress.display import table
 from me2e_compress.driving.adapter.adapter import Adapter
 from me2e_compress.driving.adapter.outputs import OutputUses, PortUse, input_uses
 from me2e_compress.driving.onnx_policy import OnnxPolicy, recurrent_of
@@ -11,10 +12,9 @@ from me2e_compress.errors import EvaluationError, FramesError, GraphError
 from me2e_compress.evaluators.highway.drivers import OnnxDriver
 from me2e_compress.runtime.providers import CPU, Provider
 from me2e_compress.runtime.session import Session
+from me2e_compress.workflows.checks import try_first
 from me2e_compress.workflows.evaluate import driver_of
-from me2e_compress.workflows.first_opening import try_first
-from me2e_compress.workflows.listener import SILENT, Listener
-from me2e_compress.workflows.result import Result, Status, Table, table
+from me2e_compress.workflows.result import SILENT, Listener, Result, Shown
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
@@ -34,48 +34,21 @@ class ModelCheck(Result):
     outputs: tuple[PortUse, ...]
     problems: tuple[str, ...]
 
-    @property
-    def fits(self) -> bool:
-        """Whether the model could drive."""
-        return not self.problems
-
-    @property
-    def status(self) -> Status:
-        """``ok`` if the model could drive, else ``refused``."""
-        return "ok" if self.fits else "refused"
-
-    def check(self) -> None:
-        """Raise unless the model could drive.
-
-        Raises:
-            EvaluationError: It could not; the message names the first problem.
-        """
-        if not self.fits:
-            raise EvaluationError(f"{self.policy} could not drive: {self.problems[0]}")
-
-    @property
-    def headline(self) -> str:
-        """Whether the model could drive, and by which kind of answer."""
-        if not self.fits:
-            return f"{self.policy} could not drive"
-        return f"{self.policy} could drive, by {self.drives_by}"
-
-    def alerts(self) -> tuple[str, ...]:
-        """Return the problems."""
-        return self.problems
-
-    def tables(self) -> tuple[Table, ...]:
-        """Return one table of every port of the graph."""
-        kinds = [("input", each) for each in self.inputs]
-        kinds += [("output", each) for each in self.outputs]
-        if not kinds:
-            return ()
+    def shown(self) -> Shown:
+        """Return every port of the graph, whether it could drive, and by what."""
+        ports = [("input", each) for each in self.inputs]
+        ports += [("output", each) for each in self.outputs]
         rows = [
             (kind, each.name, _shape(each), each.type, each.problem or each.use or "-")
-            for kind, each in kinds
+            for kind, each in ports
         ]
         columns = ("", "name", "shape", "type", "fed by, or used as")
-        return (table(self.policy, columns, rows, words=5),)
+        tables = [table(self.policy, columns, rows, words=5)] if rows else []
+        if not self.problems:
+            return Shown(f"{self.policy} could drive, by {self.drives_by}", tables)
+        could_not = f"{self.policy} could not drive"
+        error = EvaluationError(f"{could_not}: {self.problems[0]}")
+        return Shown(could_not, tables, alerts=self.problems, error=error)
 
 
 def check_model(

@@ -1,33 +1,54 @@
-"""Checks of what users give, before any work: files, folders, models, numbers."""
+"""Checks before any work: inputs, outputs, folders, and graphs opened apart.
 
-import math
+One rule holds for every command: an existing file is replaced only if it says that
+me2e-compress wrote it (:mod:`me2e_compress.registry.drafts`), unless forced. A command
+that works in a folder which later runs resume holds a lock on that folder. The system
+releases it when the process dies, and nothing of it lies in the folder.
+
+A graph is opened in a separate process first, because onnxruntime may crash on it:
+native code that divides the least integer by -1, or overflows the stack, kills its
+process without a message. A graph that survives is remembered by its digest: it is not
+tried again on this machine. The process runs ``opening_main.py``, which imports nothing
+of this package: so it starts in 0.3 s, not in 1.6.
+"""
+
+import contextlib
+import errno
+import fcntl
+import hashlib
 import os
+import signal
+import tempfile
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
+from time import perf_counter
 from typing import TypeAlias
 
 import onnx_ir as ir
+import onnxruntime as ort
+import platformdirs
 
 from me2e_compress import graph
+from me2e_compress.calibration.dataset import CalibrationSet, archive_of
 from me2e_compress.driving.adapter.outputs import adapted
-from me2e_compress.errors import FORMER, GraphError, RecipeError
+from me2e_compress.errors import FORMER, GraphError
 from me2e_compress.graph.modules import ModuleMap, map_of
 from me2e_compress.graph.opset import lowered
 from me2e_compress.graph.shapes import unshaped_plugins
-from me2e_compress.shipped.drivers import SHIPPED, shipped
-from me2e_compress.workflows.listener import Listener
-
-LARGEST = 1e15
-"""The largest number of an option: beyond, milliseconds are no whole microseconds."""
-MOST_THREADS = 1024
-"""Most threads of a session: onnxruntime starts all of them, beyond the cores too."""
+from me2e_compress.operators.kernels import why_not
+from me2e_compress.registry.drafts import is_marked
+from me2e_compress.runtime.atomic import write_bytes
+from me2e_compress.runtime.children import run_script
+from me2e_compress.runtime.frames import Frames
+from me2e_compress.runtime.providers import CPU, Provider
+from me2e_compress.runtime.runnable import compiled_or_expanded, unsupported
+from me2e_compress.shipped.drivers import SHIPPED, is_copy, shipped
+from me2e_compress.workflows import opening_main
+from me2e_compress.workflows.options import GraphOptions
+from me2e_compress.workflows.result import Listener
 
 Given: TypeAlias = str | Path | None
 """An input as the user names it; a word that does not name a file is harmless."""
-
-
-_MOST_DIGITS = 18
-"""Most digits of a dimension's size, which must fit into a 64-bit integer."""
 
 
 def model_path(text: str | Path, beside: Path = Path()) -> Path:
@@ -166,35 +187,177 @@ def _weights(given: Path) -> Iterator[Path]:
                 yield Path(value.const_value.path)
 
 
-def check_number(
-    option: str, value: float | None, *, zero: bool = False, most: float = LARGEST
+@contextlib.contextmanager
+def writing(
+    files: Sequence[Path | None] = (),
+    inputs: Iterable[Given] = (),
+    *,
+    trees: Sequence[Path] = (),
+    folders: Sequence[Path] = (),
+    force: bool = False,
+) -> Iterator[None]:
+    """Check outputs, and hold the folders to work in, while they are written.
+
+    Args:
+        files: files that are written.
+        inputs: files and folders that are read, and must not be overwritten.
+        trees: folders that are replaced as a whole.
+        folders: folders that one command at a time may work in; they are made if
+            needed, and their contents are not checked.
+        force: replace files and trees of the user too.
+
+    Raises:
+        GraphError: An output belongs to the user, is an input or no regular file, or
+            another process works in one of the folders.
+    """
+    check_output(files, inputs)
+    check_ours(filter(None, files), trees=trees, force=force)
+    with contextlib.ExitStack() as stack:
+        for folder in folders:
+            stack.enter_context(_alone_in(folder))
+        yield
+
+
+def check_ours(
+    files: Iterable[Path], *, trees: Iterable[Path] = (), force: bool = False
 ) -> None:
-    """Refuse anything but None, a finite number above 0, or 0 if `zero` is set."""
-    if value is None or 0 < value <= most or (zero and value == 0):
+    """Refuse early what :func:`writing` would refuse."""
+    there = [file for file in files if file.parent.is_dir()]
+    check_output(there, ())
+    for output in (*there, *trees):
+        # nothing of the user is lost with a file that we wrote, or a copy of what ships
+        ours = is_marked(output) or (not output.is_symlink() and is_copy(output))
+        if os.path.lexists(output) and not force and not ours:
+            raise GraphError(
+                f"{output} is there, and me2e-compress did not write it: choose another"
+                " name, or replace it by --force"
+            )
+
+
+@contextlib.contextmanager
+def _alone_in(folder: Path) -> Iterator[None]:
+    """Hold a folder; another process that would do so is refused."""
+    is_new = not folder.is_dir()
+    folder.mkdir(parents=True, exist_ok=True)
+    handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+    try:
+        if not _try_lock(handle):
+            raise GraphError(
+                f"{folder} is in use: another me2e-compress works there; wait for it,"
+                " or choose another folder"
+            )
+        try:
+            yield
+        finally:
+            if is_new:
+                with contextlib.suppress(OSError):  # what is not empty stays
+                    folder.rmdir()
+    finally:
+        os.close(handle)
+
+
+def _try_lock(handle: int) -> bool:
+    """Take a lock without waiting; file systems without locks grant every one."""
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError as error:
+        return error.errno not in (errno.EWOULDBLOCK, errno.EAGAIN)
+    return True
+
+
+STAGE = "first opening"
+_SCRIPT = Path(opening_main.__file__)
+_REFUSED = (0, 1)
+"""Exit codes of a script that ended by itself: an exception gives 1."""
+
+
+def try_first(
+    source: ir.Model | Path,
+    name: str,
+    frames: Frames | None = None,
+    *,
+    listener: Listener,
+    file: Path | None = None,
+    provider: Provider = CPU,
+) -> None:
+    """Open a graph in another process, and run its first frame, if it is new here.
+
+    A graph that onnxruntime refuses, or that cannot be read, passes: whoever opens it
+    next reports why. Only the plain CPU is tried: what other providers do to a graph
+    does not follow from it. The listener is told how long this took, since no other
+    time includes it. ``file`` may hold the very graph that ``source`` is; without
+    ``frames`` the graph is only opened.
+
+    Raises:
+        GraphError: onnxruntime crashes on the graph; the message has the graph, the
+            step and the signal.
+    """
+    if provider != CPU:
         return
-    least = "0 or above" if zero else "above 0"
-    above = f", {most:g} at most" if math.isfinite(value) and value > 0 else ""
-    raise RecipeError(
-        f"{option} is {value:g}: it must be a finite number {least}{above}"
+    begun = perf_counter()
+    frame = next(iter(frames or ()), None)
+    try:
+        file = source if isinstance(source, Path) else file
+        model = graph.load(source) if isinstance(source, Path) else source
+        if unsupported(model):
+            return
+        ready, needed = compiled_or_expanded(model, compiled=why_not() is None)
+    except GraphError:
+        return
+    # A verdict holds for this graph, onnxruntime and these kernels.
+    kernels = ",".join(each.op_type for each in needed)
+    key = (graph.digest(model), ort.__version__, CPU.native, *CPU.left_out, kernels)
+    folder = platformdirs.user_cache_path("me2e-compress") / "opened"
+    verdict = folder / hashlib.sha256("\n".join(key).encode()).hexdigest()
+    step = b"opened" if frame is None else b"ran"
+    with contextlib.suppress(OSError):
+        if verdict.read_bytes() in (step, b"ran"):
+            return
+    # Run the script on a file of the graph and of its inputs.
+    listener.on_progress(STAGE, 0, 1, name)
+    with tempfile.TemporaryDirectory(prefix="me2e-opening-") as scratch:
+        if file is None or ready is not model:
+            file = Path(scratch) / "model.onnx"
+            graph.save(ready, file)
+        inputs = Path(scratch) / "frame.npz"
+        if frame is not None:
+            inputs.write_bytes(archive_of(frame.arrays))
+        words = [str(file), str(inputs), kernels, *CPU.left_out]
+        done = run_script(_SCRIPT, words)
+    # Exit codes that the script does not give itself mean a crash.
+    if done.returncode not in _REFUSED:
+        last = (done.stdout.split() or ["start"])[-1]
+        raise GraphError(f"{name}: onnxruntime {_end(done.returncode)} at step {last}")
+    if "open" in done.stdout:
+        with contextlib.suppress(OSError):  # a home that cannot be written to
+            folder.mkdir(parents=True, exist_ok=True)
+            write_bytes(verdict, step)
+    listener.on_progress(STAGE, 1, 1, f"{name}: {perf_counter() - begun:.1f} s")
+
+
+def opened(
+    path: Path, recording: CalibrationSet, options: GraphOptions, listener: Listener
+) -> tuple[ir.Model, dict[str, str]]:
+    """Read a graph that takes the frames and opens in another process.
+
+    What the adapter and the map state is metadata of the graph; it is returned, too,
+    for sessions of the file, which lacks it.
+    """
+    model = graph.load(path)
+    said = adapted(model, options.adapter, options.module_map)
+    recording.check(model)
+    provider = options.runs_on
+    try_first(
+        model, path.name, recording, listener=listener, file=path, provider=provider
     )
+    return model, said
 
 
-def check_count(option: str, value: int, most: int | None = None) -> None:
-    """Refuse a count below 0, or above `most` unless that is None."""
-    if value < 0:
-        raise RecipeError(f"{option} is {value}: it must be 0 or more")
-    if most is not None and value > most:
-        raise RecipeError(f"{option} is {value}: it must be {most:,} at most")
-
-
-def sizes(texts: Iterable[str]) -> dict[str, int]:
-    """Parse sizes of open dimensions, such as ``batch=1`` or ``image:0=1``."""
-    found: dict[str, int] = {}
-    for text in texts:
-        name, _, size = text.rpartition("=")
-        if not name or not size.isdecimal() or len(size) > _MOST_DIGITS:
-            raise RecipeError(f"--set-dim is {text!r}: write NAME=SIZE, e.g. batch=1")
-        if name in found:
-            raise RecipeError(f"--set-dim gives {name} twice")
-        found[name] = int(size)
-    return found
+def _end(code: int) -> str:
+    """Describe how a process died."""
+    if code == -signal.SIGKILL:
+        return "was killed (out of memory?)"
+    if code < 0:
+        names = {each.value: each.name for each in signal.Signals}
+        return f"dies of it ({names.get(-code, f'signal {-code}')})"
+    return f"dies of it (exit code {code})"

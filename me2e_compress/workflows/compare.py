@@ -1,15 +1,15 @@
-"""Compare the outputs and plans of two graphs on the same frames."""
+"""Compare two graphs on the same frames: outputs, plans, the first difference."""
 
 import dataclasses
+import itertools
 from collections.abc import Mapping
 from pathlib import Path
 
 import onnx_ir as ir
 
-from me2e_compress import graph
 from me2e_compress.calibration.dataset import CalibrationSet
-from me2e_compress.driving.adapter.outputs import adapted
-from me2e_compress.errors import EvaluationError, GraphError
+from me2e_compress.display import Table, counted, number, table
+from me2e_compress.errors import EvaluationError, GraphError, ModuleMapError
 from me2e_compress.fidelity.compare import (
     Fidelity,
     SetFidelity,
@@ -18,21 +18,25 @@ from me2e_compress.fidelity.compare import (
     common_adapter,
 )
 from me2e_compress.fidelity.compare import compare as measure
-from me2e_compress.fidelity.floor import ALIVE
+from me2e_compress.fidelity.first_difference import (
+    BorderValue,
+    FirstDifference,
+    find_first_difference,
+)
 from me2e_compress.fidelity.liveness import Liveness, LivenessTally
+from me2e_compress.graph import provenance
+from me2e_compress.graph.modules import ModuleMap, assign, map_of
 from me2e_compress.runtime.frames import Array, Frame
-from me2e_compress.runtime.providers import CPU, Provider
 from me2e_compress.runtime.session import Session
 from me2e_compress.targets.onnxruntime import slow_here
-from me2e_compress.workflows.checks import check_number, model_path
-from me2e_compress.workflows.first_opening import try_first
-from me2e_compress.workflows.listener import SILENT, Listener
-from me2e_compress.workflows.result import Result, Status, Table, counted, table
-from me2e_compress.workflows.runtime_loss import (
+from me2e_compress.workflows.checks import model_path, opened
+from me2e_compress.workflows.measured_loss import (
     RuntimeLoss,
     RuntimeTally,
     has_int8_kernels,
 )
+from me2e_compress.workflows.options import CompareOptions, GraphOptions
+from me2e_compress.workflows.result import SILENT, Listener, Result, Shown
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
@@ -48,59 +52,38 @@ class CompareResult(Result):
     reference: Path
     candidate: Path
     fidelity: Fidelity
+    liveness: Liveness | None
     agents: SetFidelity | None = None
-    liveness: Liveness | None = None
     runtime: RuntimeLoss | None = None
     slow_here: Mapping[str, str] = dataclasses.field(default_factory=dict)
 
-    @property
-    def status(self) -> Status:
-        """``refused`` if an output of the second graph is dead."""
-        return "refused" if self.alerts() else "ok"
-
-    def check(self) -> None:
-        """Raise EvaluationError if an output of the second graph is dead."""
-        if dead := self.alerts():
-            raise EvaluationError(f"{self.candidate}: {'; '.join(dead)}")
-
-    def lines(self) -> tuple[str, ...]:
-        """Return how far the plan moved, which outputs answer, and what is slow."""
-        alive = () if self.liveness is None else self.liveness.lines()
-        runtime = () if self.runtime is None else self.runtime.lines()
-        slow = (f"{name}: {why}" for name, why in self.slow_here.items())
-        return (self.headline, *alive, *runtime, *slow)
-
-    def alerts(self) -> tuple[str, ...]:
-        """Return the outputs that are dead, and states that are not fed."""
-        return () if self.liveness is None else self.liveness.faults
-
-    @property
-    def headline(self) -> str:
-        """How far the plan moved."""
-        found = self.fidelity
-        if found.plan is None:
-            return f"plan displacement: not measured ({found.plan_reason})"
-        said = (
-            f"plan displacement: mean {found.plan.mean_m:.4f} m, largest"
-            f" {found.plan.max_m:.4f} m over {counted(found.frames, 'frame')}"
-        )
-        if found.same_choice is None:
-            return said
-        return f"{said}; the same candidate on {found.same_choice:.1%} of them"
-
-    def tables(self) -> tuple[Table, ...]:
-        """Return outputs, how they answer, and agents."""
-        found = self.fidelity
+    def shown(self) -> Shown:
+        """Return how far outputs, agents and the plan moved, and what is dead."""
+        fidelity, liveness = self.fidelity, self.liveness
         rows = [
-            *((o.name, f"{o.sqnr_db:.1f}", f"{o.error:.1e}") for o in found.outputs),
-            *((name, "removed", "") for name in found.missing),
+            *((o.name, f"{o.sqnr_db:.1f}", f"{o.error:.1e}") for o in fidelity.outputs),
+            *((name, "removed", "") for name in fidelity.missing),
         ]
-        title = f"Fidelity over {counted(found.frames, 'frame')}"
+        title = f"Fidelity over {counted(fidelity.frames, 'frame')}"
         outputs = table(title, ("output", "SQNR dB", "max|a-b|/max|a|"), rows)
-        agents = () if self.agents is None else (_agents(self.agents),)
-        alive = self.liveness is not None and self.liveness.outputs
-        lively = (self.liveness.table(),) if self.liveness and alive else ()
-        return (outputs, *lively, *agents)
+        faults = () if liveness is None else liveness.faults
+        dead = "; ".join(faults)
+        return Shown(
+            _plan_moved(fidelity),
+            (
+                outputs,
+                *([liveness.table()] if liveness and liveness.outputs else []),
+                *([] if self.agents is None else [_agents(self.agents)]),
+            ),
+            (
+                _plan_moved(fidelity),
+                *(() if liveness is None else liveness.lines()),
+                *(() if self.runtime is None else self.runtime.lines()),
+                *(f"{name}: {why}" for name, why in self.slow_here.items()),
+            ),
+            faults,
+            EvaluationError(f"{self.candidate}: {dead}") if dead else None,
+        )
 
     def to_json(self) -> object:
         """Return the fidelity, agents, and liveness."""
@@ -111,6 +94,18 @@ class CompareResult(Result):
             "runtime": self.runtime,
             "slow_here": self.slow_here,
         }
+
+
+def _plan_moved(fidelity: Fidelity) -> str:
+    if fidelity.plan is None:
+        return f"plan displacement: not measured ({fidelity.plan_reason})"
+    said = (
+        f"plan displacement: mean {fidelity.plan.mean_m:.4f} m, largest"
+        f" {fidelity.plan.max_m:.4f} m over {counted(fidelity.frames, 'frame')}"
+    )
+    if fidelity.same_choice is None:
+        return said
+    return f"{said}; the same candidate on {fidelity.same_choice:.1%} of them"
 
 
 def _agents(found: SetFidelity) -> Table:
@@ -125,36 +120,21 @@ def _agents(found: SetFidelity) -> Table:
     )
 
 
-def _set_tally(left: Session, right: Session) -> SetTally | None:
-    """Return what matches agents; None where no set is named, or one graph lacks it."""
-    shapes = {name: port.shape for name, port in left.outputs.items()}
-    outputs = SetOutputs.of(left.metadata, shapes)
-    if outputs is None or not set(outputs.names) <= set(right.outputs):
-        return None
-    return SetTally(outputs)
-
-
 def compare(
     reference: str | Path,
     candidate: str | Path,
     frames: str | Path,
+    options: CompareOptions | None = None,
     listener: Listener = SILENT,
-    *,
-    as_it_stands: bool = False,
-    alive: float = ALIVE,
-    provider: Provider = CPU,
-    adapter: str | Path | None = None,
-    module_map: str | Path | None = None,
 ) -> CompareResult:
     """Run two graphs over frames: SQNR of every output, plan displacement in metres.
 
     Each graph is an ONNX file or the name of a model that ships. Outputs that the
-    metadata ``me2e.sets`` of the first names are matched agent by agent. `as_it_stands`
-    runs the first graph without onnxruntime's optimizations and the second with all of
-    them: comparing a graph with itself shows what they change. An output is dead whose
-    standard deviation over the frames is less than a share `alive` of the first
-    graph's; 0 does not ask. The adapter's TOML says which output is the plan and which
-    are fed back, in both graphs; None leaves it to their metadata.
+    metadata ``me2e.sets`` of the first names are matched agent by agent. The option
+    ``as_it_stands`` runs the first graph without onnxruntime's optimizations and the
+    second with all of them: comparing a graph with itself shows what they change. An
+    output is dead whose standard deviation over the frames is less than a share
+    ``alive`` of the first graph's.
 
     Raises:
         GraphError: A model does not exist or run, or nothing picks one of a plan's
@@ -163,23 +143,19 @@ def compare(
         ProviderError: The provider is not available.
         EvaluationError: The graphs share no output, or one is not finite.
     """
-    check_number("--alive", alive, zero=True, most=1.0)
+    options = options or CompareOptions()
     paths = model_path(reference), model_path(candidate)
-    recording = CalibrationSet(Path(frames))
-    said, models = dict[Path, dict[str, str]](), list[ir.Model]()
-    slow = dict[str, str]()
+    recording, provider = CalibrationSet(Path(frames)), options.runs_on
     # each graph must take the frames, and open in another process first
-    for path in dict.fromkeys(paths):
-        loaded = graph.load(path)
-        said[path] = adapted(loaded, adapter, module_map)
-        models.append(loaded)
-        if why := slow_here(loaded, provider):
-            slow[path.name] = why
-        recording.check(loaded)
-        try_first(
-            loaded, path.name, recording, listener=listener, file=path,
-            provider=provider,
-        )  # fmt: skip
+    graphs = {
+        path: opened(path, recording, options, listener)
+        for path in dict.fromkeys(paths)
+    }
+    slow = {
+        path.name: why
+        for path, (model, _) in graphs.items()
+        if (why := slow_here(model, provider))
+    }
     total = len(recording)
 
     def reported(frame: Frame) -> Frame:
@@ -187,27 +163,28 @@ def compare(
         return frame
 
     # the sessions get the adapter's metadata, which the files lack
-    left = Session(
-        paths[0], optimize=not as_it_stands, release=True, provider=provider,
-        said=said[paths[0]],
-    )  # fmt: skip
-    right = Session(
-        paths[1], stock=as_it_stands, release=True, provider=provider,
-        said=said[paths[1]],
-    )  # fmt: skip
+    def session(path: Path, *, optimize: bool = True, stock: bool = False) -> Session:
+        return Session(
+            path, optimize=optimize, stock=stock, release=True, provider=provider,
+            said=graphs[path][1],
+        )  # fmt: skip
+
+    left = session(paths[0], optimize=not options.as_it_stands)
+    right = session(paths[1], stock=options.as_it_stands)
     try:
         common_adapter(left, right)
-        sets = _set_tally(left, right)
+        shapes = {name: port.shape for name, port in left.outputs.items()}
+        named = SetOutputs.of(left.metadata, shapes)
     except GraphError as error:
         raise GraphError(f"{paths[0]}: {error}") from error
-    lively = LivenessTally(left, right) if alive else None
+    # agents are matched where both graphs have the named sets
+    both = named is not None and set(named.names) <= set(right.outputs)
+    sets = SetTally(named) if named is not None and both else None
+    lively = LivenessTally(left, right) if options.alive else None
     # what onnxruntime's int8 answers, beside the nodes as they stand
-    kernels = None
-    if not as_it_stands and has_int8_kernels(models[-1], provider):
-        third = Session(
-            paths[1], stock=True, release=True, provider=provider, said=said[paths[1]]
-        )
-        kernels = RuntimeTally(third, recording)
+    kernels, judged = None, graphs[paths[1]][0]
+    if not options.as_it_stands and has_int8_kernels(judged, provider):
+        kernels = RuntimeTally(session(paths[1], stock=True), recording)
     watching = [each.add for each in (sets, lively, kernels) if each is not None]
 
     def watch(a: dict[str, Array], b: dict[str, Array], frame: Frame) -> None:
@@ -215,11 +192,109 @@ def compare(
             add(a, b, frame)
 
     fidelity = measure(left, right, map(reported, recording), watch)
-    agents = None if sets is None else sets.result()
-    found = CompareResult(*paths, fidelity, agents, slow_here=slow)
-    if kernels is not None:
-        runtime = kernels.result(models[-1], fidelity)
-        found = dataclasses.replace(found, runtime=runtime)
-    if lively is not None:
-        found = dataclasses.replace(found, liveness=lively.result(alive))
-    return found
+    return CompareResult(
+        *paths,
+        fidelity,
+        None if lively is None else lively.result(options.alive),
+        None if sets is None else sets.result(),
+        None if kernels is None else kernels.result(judged, fidelity),
+        slow,
+    )
+
+
+FRAMES = 2
+"""The second frame is compared: it reads the state of the first."""
+
+
+@dataclasses.dataclass(frozen=True, repr=False)
+class FirstDifferenceResult(Result):
+    """Where a graph begins to differ from its source."""
+
+    reference: Path
+    candidate: Path
+    found: FirstDifference
+
+    def shown(self) -> Shown:
+        """Return the worst value that each module hands on."""
+        worst: dict[str, BorderValue] = {}
+        for each in self.found.values:
+            known = worst.setdefault(each.module, each)
+            if each.sqnr_db < known.sqnr_db:
+                worst[each.module] = each
+        rows = [
+            (each.module or "-", each.value, each.node, number(each.sqnr_db, ".1f"))
+            for each in worst.values()
+        ]
+        columns = ("module", "worst value", "node", "SQNR dB")
+        note = (
+            f"Of {counted(len(self.found.values), 'value')} that modules hand on."
+            f" {self.found.unknown} of either graph have no namesake in the other."
+        )
+        modules = table("Modules", columns, rows, note, words=3)
+        return Shown(headline_of(self.found), [modules])
+
+    def to_json(self) -> object:
+        """Return all that was compared."""
+        return self.found
+
+
+def headline_of(found: FirstDifference) -> str:
+    """Name the first module that differs, or say that there is none."""
+    if found.first is not None:
+        return f"first below {found.floor_db:g} dB: {found.first}"
+    below = sum(each.sqnr_db < found.floor_db for each in found.values)
+    if not below:
+        return (
+            f"no difference: {counted(len(found.values), 'value')} at"
+            f" {found.floor_db:g} dB or more"
+        )
+    return (
+        f"{below} of {counted(len(found.values), 'value')} are below"
+        f" {found.floor_db:g} dB, but no output is"
+    )
+
+
+def first_difference(
+    reference: str | Path,
+    candidate: str | Path,
+    frames: str | Path,
+    options: GraphOptions | None = None,
+    listener: Listener = SILENT,
+) -> FirstDifferenceResult:
+    """Find the first module after which the second graph differs.
+
+    Both graphs run on one frame, their nodes as they stand, and what their modules hand
+    on is compared by name. A value differs below 80 dB, or below 20 dB where a graph
+    holds int8 or mostly narrow floats.
+
+    Raises:
+        EvaluationError: The graphs share no value.
+        FramesError: A frame does not fit one of the graphs.
+        GraphError: A model does not exist or run.
+        ProviderError: The provider is not available.
+    """
+    options = options or GraphOptions()
+    paths = model_path(reference), model_path(candidate)
+    recording = CalibrationSet(Path(frames))
+    models = {
+        path: with_modules(opened(path, recording, options, listener)[0])
+        for path in dict.fromkeys(paths)
+    }
+    shown = tuple(itertools.islice(recording, FRAMES))
+    first, second = (models[path] for path in paths)
+    found = find_first_difference(first, second, shown, options.runs_on)
+    return FirstDifferenceResult(*paths, found)
+
+
+def with_modules(model: ir.Model) -> ir.Model:
+    """Write the module of every node into its metadata, where it does not stand yet."""
+    if provenance.missing(model):
+        try:
+            placed = assign(model, map_of(model, None))
+        except ModuleMapError:  # names that the preset needs are lost
+            placed = assign(model, ModuleMap.whole())
+        for node, place in placed.placements.items():
+            if provenance.read(node) is None:
+                past = provenance.Provenance(place.module, (node.name or "",))
+                provenance.stamp(node, past)
+    return model

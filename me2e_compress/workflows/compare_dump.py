@@ -10,26 +10,22 @@ import onnx_ir as ir
 from me2e_compress import graph
 from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.calibration.engine_dump import EngineDump
-from me2e_compress.driving.adapter.outputs import adapted
+from me2e_compress.display import counted, number, table
 from me2e_compress.errors import EvaluationError, GraphError
 from me2e_compress.fidelity.engine_loss import EngineRun, OutputLoss, losses
 from me2e_compress.fidelity.first_difference import (
     FirstDifference,
     first_difference_of_engine,
 )
-from me2e_compress.fidelity.floor import ALIVE
 from me2e_compress.registry import documents
-from me2e_compress.runtime.frames import Array
-from me2e_compress.runtime.providers import CPU, Provider
 from me2e_compress.runtime.session import Session
 from me2e_compress.shipped.drivers import SHIPPED, shipped
 from me2e_compress.targets.quantized import describe_quantized
-from me2e_compress.workflows.checks import model_path
-from me2e_compress.workflows.compress_result import beside
-from me2e_compress.workflows.first_difference import headline_of, with_modules
-from me2e_compress.workflows.first_opening import try_first
-from me2e_compress.workflows.listener import SILENT, Listener
-from me2e_compress.workflows.result import Result, Status, Table, counted, number, table
+from me2e_compress.workflows.checks import model_path, opened
+from me2e_compress.workflows.compare import headline_of, with_modules
+from me2e_compress.workflows.compress import beside
+from me2e_compress.workflows.options import CompareOptions
+from me2e_compress.workflows.result import SILENT, Listener, Result, Shown
 
 SAME_DB = 60.0
 """Above, two float32 programs differ by the order of their sums (60 dB: 0.1 %)."""
@@ -59,41 +55,14 @@ class DumpResult(Result):
     notes: tuple[str, ...]
     inner: FirstDifference | None
 
-    @property
-    def headline(self) -> str:
-        """Whether compilation lost anything."""
+    def shown(self) -> Shown:
+        """Return what every output lost to what, and where the inside differs."""
         worst = min(self.outputs, key=lambda each: each.compilation_db)
-        if worst.compilation_db >= SAME_DB:
-            return (
-                "the engine answers as its graph does"
-                f" (least: {worst.name}, {worst.compilation_db:.1f} dB)"
-            )
-        return (
-            "compilation: the engine, or its host, does not answer as its graph does"
-            f" (least: {worst.name}, {worst.compilation_db:.1f} dB)"
-        )
-
-    def lines(self) -> tuple[str, ...]:
-        """Return the verdict, what differs inside, and what is worth knowing."""
-        inside = () if self.inner is None else (f"inside: {headline_of(self.inner)}",)
-        return (self.headline, *inside, *self.notes)
-
-    def alerts(self) -> tuple[str, ...]:
-        """Return the outputs that hardly move, where they should, in words."""
-        return tuple(each.dead for each in self.outputs if each.dead)
-
-    @property
-    def status(self) -> Status:
-        """``refused`` if an output of the engine is dead."""
-        return "refused" if self.alerts() else "ok"
-
-    def check(self) -> None:
-        """Raise EvaluationError if an output of the engine is dead."""
-        if dead := self.alerts():
-            raise EvaluationError(f"{self.dump}: {'; '.join(dead)}")
-
-    def tables(self) -> tuple[Table, ...]:
-        """Return one row per output."""
+        said = "the engine answers as its graph does"
+        if worst.compilation_db < SAME_DB:
+            said = "compilation: the engine, or its host, does not answer as its graph"
+            said += " does"
+        headline = f"{said} (least: {worst.name}, {worst.compilation_db:.1f} dB)"
         rows = [
             (
                 each.name,
@@ -112,28 +81,32 @@ class DumpResult(Result):
         note = f"SQNR in dB; moves: a share of what it should; state: {self.state}. "
         columns = ("output", "quantization", "compilation", "all", "moves")
         title = f"What the engine lost over {counted(self.frames, 'frame')}"
-        return (table(title, columns, rows, note + source),)
+        inside = [] if self.inner is None else [f"inside: {headline_of(self.inner)}"]
+        dead = tuple(each.dead for each in self.outputs if each.dead)
+        return Shown(
+            headline,
+            [table(title, columns, rows, note + source)],
+            [headline, *inside, *self.notes],
+            dead,
+            EvaluationError(f"{self.dump}: {'; '.join(dead)}") if dead else None,
+        )
 
 
 def compare_dump(
     model: str | Path,
     dump: str | Path,
     frames: str | Path,
-    listener: Listener = SILENT,
-    *,
     float_graph: str | Path | None = None,
-    alive: float = ALIVE,
-    provider: Provider = CPU,
-    adapter: str | Path | None = None,
-    module_map: str | Path | None = None,
+    options: CompareOptions | None = None,
+    listener: Listener = SILENT,
 ) -> DumpResult:
     """Hold what an engine answered over frames against the graph it was built from.
 
     The graph's nodes run as they are written: int8 is simulated. It is fed the state
     that the engine gave, where the dump has it, so that each frame is judged by itself;
     else that of its own run. ``float_graph`` None looks for the source that the report
-    beside the graph names. Below ``alive`` of the movement that it should have, an
-    output is dead.
+    beside the graph names. Below the share ``alive`` of the movement that it should
+    have, an output is dead.
 
     Raises:
         GraphError: A model does not exist or run.
@@ -143,26 +116,25 @@ def compare_dump(
         EvaluationError: The dump is of another graph, or an output is not finite or has
             another shape.
     """
-    path = model_path(model)
+    path, options = model_path(model), options or CompareOptions()
     recording, answered = CalibrationSet(Path(frames)), EngineDump(dump)
     answered.check(recording)
-    loaded = graph.load(path)
-    said = adapted(loaded, adapter, module_map)
-    recording.check(loaded)
-    notes, inner = _checked_names(answered, path, loaded), None
-    try_first(
-        loaded, path.name, recording, listener=listener, file=path, provider=provider
-    )
+    notes, inner = _checked_names(answered, path, graph.load(path)), None
+    loaded, said = opened(path, recording, options, listener)
+    provider = options.runs_on
     session = Session(path, optimize=False, release=True, provider=provider, said=said)
     run = EngineRun(session, recording, answered)
     source, why = _float_source(path, loaded, float_graph)
-    opened = None
+    original = None
     if source is not None:
-        opened = Session(source, release=True, provider=provider, said=said)
+        original = Session(source, release=True, provider=provider, said=said)
     total = len(recording)
     try:
         outputs = losses(
-            run, opened, alive, lambda at: listener.on_progress("frames", at, total, "")
+            run,
+            original,
+            options.alive,
+            lambda at: listener.on_progress("frames", at, total, ""),
         )
     except EvaluationError as error:
         raise EvaluationError(f"{answered.path}: {error}") from error
@@ -237,16 +209,12 @@ def _rounded(run: EngineRun) -> Iterator[str]:
         if value.dtype == np.float16:
             found.setdefault("float16", []).append(name)
         elif value.dtype == np.float32 and value.any():
-            for kind, lost in (("float16", None), ("bfloat16", 0xFFFF)):
-                if _is_rounded(value, lost):
-                    found.setdefault(kind, []).append(name)
-                    break
+            bits = np.ascontiguousarray(value).view(np.uint32)
+            with np.errstate(over="ignore"):
+                half = value.astype(np.float16).astype(np.float32)
+            if np.array_equal(value, half):
+                found.setdefault("float16", []).append(name)
+            elif not (bits & 0xFFFF).any():  # that bfloat16 has not
+                found.setdefault("bfloat16", []).append(name)
     for kind, names in found.items():
         yield f"rounded to {kind}, no fault: {', '.join(names)}"
-
-
-def _is_rounded(value: Array, lost: int | None) -> bool:
-    if lost is not None:
-        return not (np.ascontiguousarray(value).view(np.uint32) & lost).any()
-    with np.errstate(over="ignore"):
-        return bool(np.array_equal(value, value.astype(np.float16).astype(np.float32)))

@@ -1,156 +1,206 @@
 """Compress a model, from file to file."""
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
-import onnx_ir as ir
-
+from me2e_compress import graph
+from me2e_compress.display import megabytes
 from me2e_compress.errors import PreconditionError, RecipeError
-from me2e_compress.fidelity.floor import SQNR_FLOOR_DB, Floor
-from me2e_compress.graph.modules import ModuleMap
+from me2e_compress.fidelity.floor import Floor
 from me2e_compress.manager import PassManager, Report
 from me2e_compress.manager import recipe as recipes
 from me2e_compress.manager.pass_manager import collector_paused
 from me2e_compress.passes import Context, Pass
 from me2e_compress.passes.fix_shapes import with_sizes
+from me2e_compress.passes.import_normalize import with_own_domains
 from me2e_compress.passes.quantize_int8 import QuantizeInt8
-from me2e_compress.quantization.rules import RuleSet
+from me2e_compress.quantization.plan import plan_of, save_plan
+from me2e_compress.registry import drafts
+from me2e_compress.runtime.atomic import write_document
 from me2e_compress.runtime.latency_trace import cpu_seconds
-from me2e_compress.runtime.providers import CPU, Provider
 from me2e_compress.workflows.checks import (
-    check_count,
-    check_number,
     load_map,
     model_path,
     output_path,
     read_graph,
+    try_first,
+    writing,
 )
-from me2e_compress.workflows.claims import writing
-from me2e_compress.workflows.compress_fidelity import (
-    SplitFrames,
-    measure_loss,
-    open_frames,
-)
-from me2e_compress.workflows.compress_result import (
-    CompressResult,
-    write_result,
-    written_files,
-)
-from me2e_compress.workflows.first_opening import try_first
+from me2e_compress.workflows.inspect import named_weights
 from me2e_compress.workflows.int8_outcome import Int8Outcome
-from me2e_compress.workflows.lint import lint_written
-from me2e_compress.workflows.listener import SILENT, Listener
+from me2e_compress.workflows.lint import LintResult, lint_written
+from me2e_compress.workflows.measured_loss import (
+    MeasuredLoss,
+    measure_loss,
+    split_frames,
+)
+from me2e_compress.workflows.options import CompressOptions
+from me2e_compress.workflows.result import SILENT, Listener, Result, Shown, plain
 
 Recipe: TypeAlias = str | Path | Sequence[Pass]
 """A shipped recipe's name, a TOML file, or passes."""
 
 
-@dataclasses.dataclass(frozen=True)
-class CompressOptions:
-    """How a graph is compressed; None leaves it to the recipe.
+@dataclasses.dataclass(frozen=True, repr=False)
+class CompressResult(Result):
+    """A compressed graph, and how it came to be.
 
     Attributes:
-        scheme: int8 after the recipe's passes: ``feature-ext``, ``prediction``,
-            ``full``.
-        rules: rules of the int8 plan: ``safe``, ``paper``, or a set of yours.
-        target: runtime of the int8 graph: ``onnxruntime`` or ``tensorrt``.
-        overrides: TOML file of exceptions to the int8 plan.
-        ranges: file of saved ranges, instead of frames.
-        method: how ranges are read from frames, or were for ``ranges``.
-        module_map: preset or TOML file; None finds the preset.
-        verify_frames: frames that exact passes are checked on; 0 checks none.
-        unproven: write a graph that does not run here, its exact passes unchecked.
-        measure_frames: most frames that are kept out of calibration, to measure lossy
-            passes on; 0 measures nothing and calibrates on all.
-        floor: SQNR in dB below which an output is warned of.
-        allow_empty: write the graph although nothing in it became int8.
-        dims: sizes that open dimensions of the inputs are given first: ``batch`` to 1.
-        adapter: TOML file whose plan and state become metadata of the graph.
-        provider: what runs graphs, to calibrate, check and measure.
-        force: replace outputs that we did not write, too.
+        output: the file that was written, with ``STEM.report.json`` beside it and,
+            where the graph was quantized, ``STEM.plan.json``.
+        record: what ``STEM.report.json`` holds.
+        source_bytes: size with external weights, as `output_bytes` is.
+        int8: what became int8 and what did not; None where no pass quantizes.
+        loss: how true the graph stayed; None where every pass is exact.
+        seconds: CPU time of everything but the writing.
+        lint: what the target's rules say of the graph; None where nothing is int8.
     """
 
-    scheme: str | None = None
-    rules: str | RuleSet | None = None
-    target: str | None = None
-    overrides: str | Path | None = None
-    ranges: str | Path | None = None
-    method: str | None = None
-    module_map: str | Path | None = None
-    verify_frames: int = 2
-    unproven: bool = False
-    measure_frames: int = 8
-    floor: float = SQNR_FLOOR_DB
-    allow_empty: bool = False
-    dims: Mapping[str, int] = dataclasses.field(default_factory=dict)
-    adapter: str | Path | None = None
-    provider: Provider = CPU
-    force: bool = False
+    source: Path
+    output: Path
+    report: Report
+    record: Mapping[str, object]
+    source_bytes: int
+    output_bytes: int
+    int8: Int8Outcome | None = None
+    loss: MeasuredLoss | None = None
+    seconds: float = 0.0
+    lint: LintResult | None = None
 
-    def __post_init__(self) -> None:
-        check_count("--verify-frames", self.verify_frames)
-        check_count("--measure-frames", self.measure_frames)
-        check_number("--floor", self.floor, zero=True)
+    @property
+    def report_path(self) -> Path:
+        """The file of the report."""
+        return beside(self.output, "report")
 
-    def passes(self, recipe: Recipe | None) -> tuple[Pass, ...]:
-        """Build the passes of a recipe, with these options' int8.
+    @property
+    def weights(self) -> str:
+        """The checkpoint that the graph was made from; empty if not known."""
+        return named_weights(self.report.model.metadata_props)
 
-        Raises:
-            RecipeError: There is nothing to do, or the options and passes do not fit.
+    @property
+    def size(self) -> str:
+        """The size in MB, and its share of the source's."""
+        share = self.output_bytes / self.source_bytes
+        return f"{megabytes(self.output_bytes)} MB, {share:.1%} of {self.source.name}"
+
+    def shown(self) -> Shown:
+        """Return passes and checks, what the outputs lost, time and size.
+
+        An alert says that nothing became int8, that quality is below the floor, or
+        that the target refuses the graph or computes it otherwise.
         """
-        # int8 alone comes after the exact recipe
-        if isinstance(recipe, str | Path):
-            passes = recipes.load(recipe)
-        elif recipe is not None:
-            passes = tuple(recipe)
-        elif self.scheme is not None:
-            passes = recipes.load("exact")
-        else:
-            raise RecipeError(
-                f"say what to do: -r RECIPE ({', '.join(recipes.shipped())}), --passes"
-                " TEXT or --scheme"
-            )
-        # a graph is quantized once
-        quantizers = [each for each in passes if each.quantizes]
-        if len(quantizers) + (self.scheme is not None) > 1:
-            raise RecipeError(
-                f"{QuantizeInt8.name} is twice in the pipeline, a graph is quantized"
-                f" once: leave out {'--scheme' if self.scheme else 'one of them'}"
-            )
-        if self.scheme is not None:
-            passes = (*passes, QuantizeInt8(scheme=self.scheme))
-        return self._with_int8(with_sizes(passes, self.dims))
-
-    def _with_int8(self, passes: tuple[Pass, ...]) -> tuple[Pass, ...]:
-        """Set options of the passes that quantize, else of those that read ranges."""
-        named = ("rules", "target", "method")
-        given: dict[str, object] = {n: v for n in named if (v := getattr(self, n))}
-        files = {"overrides": self.overrides, "ranges": self.ranges}
-        given |= {name: Path(file) for name, file in files.items() if file is not None}
-        if not given:
-            return passes
-        # an option that no pass takes would be ignored without a word
-        readers = [each for each in passes if each.quantizes] or [
-            each for each in passes if each.reads_ranges
-        ]
-        known = {name for each in readers for name in each.option_names()}
-        if unknown := [name for name in given if name not in known]:
-            raise RecipeError(
-                f"--{unknown[0].replace('_', '-')} is for int8, and the pipeline has no"
-                f" {QuantizeInt8.name}: add --scheme"
-            )
-        # each reader gets those options that it knows
-        return tuple(
-            dataclasses.replace(
-                each, **{n: v for n, v in given.items() if n in each.option_names()}
-            )
-            if each in readers
-            else each
-            for each in passes
+        headline = f"{self.output}: {self.size}; report: {self.report_path}"
+        time = f"took {self.seconds:.0f} CPU s"
+        measured = None if self.loss is None else self.loss.table()
+        if self.loss is not None and self.loss.fidelity is not None:
+            time += f", {self.loss.seconds:.0f} of them to measure"
+        lint = self.lint
+        wrong = [] if lint is None else filter(None, (lint.refusal, lint.miscomputed))
+        error = None
+        if lint is not None and lint.asked and lint.refusal is not None:
+            error = PreconditionError(f"written, but {lint.refusal}")
+        return Shown(
+            headline,
+            (*self.report.tables(), *filter(None, [measured])),
+            filter(None, (*self.verdict(), time, headline, self.weights)),
+            (
+                *(() if self.loss is None else self.loss.alerts()),
+                *filter(None, ["" if self.int8 is None else self.int8.empty]),
+                *(f"lint: {line}" for line in wrong),
+            ),
+            error,
         )
+
+    def verdict(self) -> Iterator[str]:
+        """Yield what became int8, what is proven, and how far the outputs moved."""
+        if self.int8 is not None:
+            yield self.int8.line
+            yield from filter(None, [self.int8.slow_here])
+        yield from _proof(self.report)
+        if self.loss is not None:
+            yield from self.loss.lines()
+        if self.lint is not None:
+            yield f"lint: {self.lint.headline}"
+
+    def findings(self) -> dict[str, Any]:
+        """Return weights, int8, fidelity and verdict for the report, without times.
+
+        The same run thus writes the same file; numbers that are not finite become null.
+        """
+        found = {
+            "weights": self.weights,
+            "int8": self.int8,
+            "fidelity": None if self.loss is None else self.loss.record(),
+            "lint": None if self.lint is None else self.lint.summary(),
+            "verdict": [*self.verdict(), *self.alerts()],
+        }
+        return {name: plain(each) for name, each in found.items()}
+
+    def to_json(self) -> object:
+        """Return the report file's content except the verdict, which `lines` has."""
+        return {key: each for key, each in self.record.items() if key != "verdict"}
+
+
+def passes_of(recipe: Recipe | None, options: CompressOptions) -> tuple[Pass, ...]:
+    """Build the passes of a recipe, with int8 as the options say.
+
+    Raises:
+        RecipeError: There is nothing to do, or the options and passes do not fit.
+    """
+    # int8 alone comes after the exact recipe
+    if isinstance(recipe, str | Path):
+        passes = recipes.load(recipe)
+    elif recipe is not None:
+        passes = tuple(recipe)
+    elif options.scheme is not None:
+        passes = recipes.load("exact")
+    else:
+        raise RecipeError(
+            f"say what to do: -r RECIPE ({', '.join(recipes.shipped())}), --passes"
+            " TEXT or --scheme"
+        )
+    # a graph is quantized once
+    quantizers = [each for each in passes if each.quantizes]
+    if len(quantizers) + (options.scheme is not None) > 1:
+        raise RecipeError(
+            f"{QuantizeInt8.name} is twice in the pipeline, a graph is quantized"
+            f" once: leave out {'--scheme' if options.scheme else 'one of them'}"
+        )
+    if options.scheme is not None:
+        passes = (*passes, QuantizeInt8(scheme=options.scheme))
+    return _with_int8(with_sizes(passes, options.dims), options)
+
+
+def _with_int8(passes: tuple[Pass, ...], options: CompressOptions) -> tuple[Pass, ...]:
+    """Set options of the passes that quantize, else of those that read ranges."""
+    named = ("rules", "target", "method")
+    given: dict[str, object] = {n: v for n in named if (v := getattr(options, n))}
+    files = {"overrides": options.overrides, "ranges": options.ranges}
+    given |= {name: Path(file) for name, file in files.items() if file is not None}
+    if not given:
+        return passes
+    # an option that no pass takes would be ignored without a word
+    readers = [each for each in passes if each.quantizes] or [
+        each for each in passes if each.reads_ranges
+    ]
+    known = {name for each in readers for name in each.option_names()}
+    if unknown := [name for name in given if name not in known]:
+        raise RecipeError(
+            f"--{unknown[0].replace('_', '-')} is for int8, and the pipeline has no"
+            f" {QuantizeInt8.name}: add --scheme"
+        )
+    # each reader gets those options that it knows
+    return tuple(
+        dataclasses.replace(
+            each, **{n: v for n, v in given.items() if n in each.option_names()}
+        )
+        if each in readers
+        else each
+        for each in passes
+    )
 
 
 def compress(
@@ -177,74 +227,51 @@ def compress(
     """
     options = options or CompressOptions()
     source, output = model_path(model), output_path(output)
-    passes = options.passes(recipe)
+    passes = passes_of(recipe, options)
     read = [file for each in passes for file in each.files()]
     named = recipe if isinstance(recipe, str | Path) else None
     # claim the outputs first; Python's cycle collector would walk every node
     inputs = (source, named, frames, options.module_map, options.adapter, *read)
-    outputs = written_files(output)
+    reported = beside(output, "plan"), beside(output, "report")
+    outputs = (output, *graph.data_names(output), *reported)
     with writing(outputs, inputs, force=options.force), collector_paused():
         loaded = read_graph(source, listener, options.adapter, options.module_map)
         modules = load_map(options.module_map, loaded)
-        seen = open_frames(source, loaded, frames)
-        split = SplitFrames.of(*seen, passes, options.measure_frames)
-        run = Compression(source, output, options, listener)
-        return run.compress(loaded, passes, modules, split)
-
-
-@dataclasses.dataclass(frozen=True)
-class Compression:
-    """One graph to compress, whose outputs are claimed already."""
-
-    source: Path
-    output: Path
-    options: CompressOptions
-    listener: Listener
-
-    def compress(
-        self,
-        model: ir.Model,
-        passes: tuple[Pass, ...],
-        modules: ModuleMap,
-        frames: SplitFrames,
-    ) -> CompressResult:
-        """Try, compress, measure and write; errors are those of :func:`compress`."""
-        start, options, listener = cpu_seconds(), self.options, self.listener
-        source, provider = self.source, options.provider
+        seen = split_frames(source, loaded, frames, passes, options.measure_frames)
+        start, provider = cpu_seconds(), options.runs_on
         first = partial(try_first, listener=listener, provider=provider)
-        first(model, source.name, frames.calibration or frames.samples, file=source)
+        first(loaded, source.name, seen.calibration or seen.samples, file=source)
         # apply the passes, and refuse a result that is unproven or not int8
-        context = Context(modules, frames.calibration, provider=provider)
-        checked, folder = options.verify_frames, self.output.parent
-        manager = PassManager(passes, checked, folder, frames.samples, first)
-        report = manager.run(model, context, partial(listener.on_progress, "passes"))
-        _refuse_unproven(report, options)
+        context = Context(modules, seen.calibration, options.seed, provider)
+        checked = options.verify_frames
+        manager = PassManager(passes, checked, output.parent, seen.samples, first)
+        report = manager.run(loaded, context, partial(listener.on_progress, "passes"))
         int8 = Int8Outcome.of(report, context)
-        _refuse_empty(int8, options, listener)
+        _refuse(report, int8, options, listener)
         # measure what lossy passes cost, on the frames kept for it
-        if report.lossy and frames.measured is not None:
-            first(report.model, self.output.name)
-        floor = Floor(options.floor)
-        loss = measure_loss(report, provider, frames, floor, listener)
-        linted = lint_written(report.model, passes, self.output, options.target)
+        if report.lossy and seen.measured is not None:
+            first(report.model, output.name)
+        loss = measure_loss(report, provider, seen, Floor(options.floor), listener)
+        linted = lint_written(report.model, passes, output, options.target)
         seconds = cpu_seconds() - start
-        return write_result(report, source, self.output, int8, loss, seconds, linted)
+        return _written(report, source, output, int8, loss, seconds, linted)
 
 
-def _refuse_unproven(report: Report, options: CompressOptions) -> None:
-    """Refuse exact passes that could not be run; who asked for no check gets none."""
-    if report.lossy or options.unproven or not options.verify_frames:
-        return
-    for check in report.unproven:
+def _refuse(
+    report: Report,
+    int8: Int8Outcome | None,
+    options: CompressOptions,
+    listener: Listener,
+) -> None:
+    """Refuse exact passes that could not be run, and a graph without int8."""
+    # who asked for no check gets none
+    unproven = () if report.lossy or not options.verify_frames else report.unproven
+    for check in unproven:
         raise PreconditionError(
             f"not proven that {', '.join(check.passes)} left the outputs as they were:"
-            f" {check.unproven}; nothing is written, --unproven writes it nevertheless"
+            f" {check.unproven}; nothing is written; --verify-frames 0 writes it"
+            " unproven"
         )
-
-
-def _refuse_empty(
-    int8: Int8Outcome | None, options: CompressOptions, listener: Listener
-) -> None:
     if int8 is None or not int8.empty:
         return
     if not options.allow_empty:
@@ -252,3 +279,55 @@ def _refuse_empty(
             f"{int8.empty}; nothing is written; -r exact writes a graph without int8"
         )
     listener.on_warning(int8.empty)
+
+
+def beside(output: Path, what: str) -> Path:
+    """Return the path of the ``plan`` or ``report`` beside a compressed graph."""
+    return output.with_name(f"{output.stem}.{what}.json")
+
+
+def _proof(report: Report) -> Iterator[str]:
+    """Say how far exact passes moved the outputs, and what is not proven."""
+    judged = [
+        (check.errors[name], check.fed)
+        for check in report.verifications
+        for name in check.judged
+    ]
+    # with lossy passes in the pipeline, sameness is not the claim
+    if judged and not report.lossy:
+        worst, inputs = max(judged)
+        near = f" to within {worst:.1e} of its largest value" if worst else ""
+        yield f"every output is the same{near} ({inputs})"
+    if not any(step.changes for step in report.steps):
+        yield "every output is the same: no pass changed anything"
+    # what could not be proven is said too
+    for check in report.verifications:
+        if check.unproven is not None:
+            yield f"not proven: {', '.join(check.passes)}: {check.unproven}"
+        elif check.left_out:
+            yield f"not proven of every output: {check.left_out}"
+        yield from check.remarks
+
+
+def _written(
+    report: Report,
+    source: Path,
+    output: Path,
+    int8: Int8Outcome | None,
+    loss: MeasuredLoss | None,
+    seconds: float,
+    linted: LintResult | None,
+) -> CompressResult:
+    """Write the graph and its plan, then the report, which vouches for both."""
+    plan = plan_of(report.model)  # before writing: metadata may be malformed
+    with drafts.all_or_none():
+        graph.save(with_own_domains(report.model), output)
+        if plan is not None:
+            save_plan(plan, beside(output, "plan"))
+        sizes = graph.file_bytes(source), graph.file_bytes(output)
+        made = CompressResult(
+            source, output, report, {}, *sizes, int8, loss, seconds, linted
+        )
+        record = report.record(source, output) | made.findings()
+        write_document(beside(output, "report"), record, indent=2)
+    return dataclasses.replace(made, record=record)

@@ -4,6 +4,7 @@ import dataclasses
 from pathlib import Path
 
 from me2e_compress import graph
+from me2e_compress.display import Table, number
 from me2e_compress.driving.policies import POLICIES, Driver, driver_named
 from me2e_compress.errors import EvaluationError, GraphError
 from me2e_compress.evaluators.highway.drivers import OnnxDriver
@@ -11,18 +12,14 @@ from me2e_compress.evaluators.highway.evaluator import DrivingOptions, DrivingPr
 from me2e_compress.evaluators.highway.results import MANIFEST, log_beside
 from me2e_compress.evaluators.highway.worker import Job
 from me2e_compress.extras import need_extra
-from me2e_compress.metrics.deadlines import Deadlines, charged
+from me2e_compress.metrics.deadlines import Deadlines, charged, deadlines_table
 from me2e_compress.metrics.scores import Scores
 from me2e_compress.metrics.scores import score as score_episodes
 from me2e_compress.runtime.providers import CPU, Provider
 from me2e_compress.shipped.drivers import SHIPPED
 from me2e_compress.simulator.routes import Route, pick_routes
 from me2e_compress.targets.onnxruntime import slow_here
-from me2e_compress.workflows.checks import check_folder, model_path
-from me2e_compress.workflows.claims import writing
-from me2e_compress.workflows.deadlines_table import deadlines_table
-from me2e_compress.workflows.first_opening import try_first
-from me2e_compress.workflows.listener import SILENT, Listener
+from me2e_compress.workflows.checks import check_folder, model_path, try_first, writing
 from me2e_compress.workflows.other_evaluators import (
     HIGHWAY,
     driven_episodes,
@@ -32,7 +29,7 @@ from me2e_compress.workflows.other_evaluators import (
     is_highway,
     keep,
 )
-from me2e_compress.workflows.result import Result, Table, number
+from me2e_compress.workflows.result import SILENT, Listener, Result
 from me2e_compress.workflows.score import driving_score, scores_table
 
 _FLAGS = {"module_map": "map"}

@@ -15,6 +15,7 @@ from me2e_compress.calibration.recording import (
     partial_of,
     write_recording,
 )
+from me2e_compress.display import counted
 from me2e_compress.driving.adapter import Adapter
 from me2e_compress.driving.onnx_policy import OnnxPolicy
 from me2e_compress.driving.shipped_adapters import adapter_file
@@ -22,44 +23,13 @@ from me2e_compress.errors import FramesError
 from me2e_compress.extras import need_extra
 from me2e_compress.graph import sha256_of
 from me2e_compress.runtime.frames import Frame
-from me2e_compress.runtime.providers import CPU, Provider
 from me2e_compress.version import __version__
-from me2e_compress.workflows.checks import check_count, check_folder, model_path
-from me2e_compress.workflows.claims import writing
-from me2e_compress.workflows.first_opening import try_first
-from me2e_compress.workflows.listener import SILENT, Listener
-from me2e_compress.workflows.result import Result, counted
+from me2e_compress.workflows.checks import check_folder, model_path, try_first, writing
+from me2e_compress.workflows.options import FramesOptions
+from me2e_compress.workflows.result import SILENT, Listener, Result
 
 DRIVEN_SCENE_LENGTH = 16
 """Frames of a stretch of a route, half a second apart."""
-
-
-@dataclasses.dataclass(frozen=True)
-class FramesOptions:
-    """Which frames are made.
-
-    Attributes:
-        count: number of frames.
-        seed: seed of everything random.
-        scene_length: frames a scene; None is `DRIVEN_SCENE_LENGTH` of a driven route,
-            all that a log has.
-        force: replace outputs that we did not write, too.
-        provider: what opens the model whose frames they are.
-        log: recorded driving that they are made from; None lets the expert drive.
-        adapter: TOML file that adapts an ONNX file to the policy contract, or the name
-            of one that ships: the frames are in the model's own form.
-    """
-
-    count: int = 256
-    seed: int = 0
-    scene_length: int | None = None
-    force: bool = False
-    provider: Provider = CPU
-    log: DriveLog | None = None
-    adapter: Path | None = None
-
-    def __post_init__(self) -> None:
-        check_count("--seed", self.seed)
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
@@ -71,27 +41,32 @@ class FramesResult(Result):
     options: FramesOptions
 
     @property
-    def count(self) -> int:
-        """The number of frames written: a log may have fewer than were asked for."""
-        return sum(1 for _ in self.output.glob("*.npz"))
+    def log(self) -> str | None:
+        """The log that they were read from, as it is written."""
+        text = self.options.log
+        return None if text is None else LOGS.text(LOGS.parse(text))
 
     @property
     def headline(self) -> str:
         """The folder, its frames, the model, and the seed or log."""
-        log, seed = self.options.log, self.options.seed
-        said = f"{self.output}: {counted(self.count, 'frame')} of {self.stack}"
-        return f"{said}, {f'seed {seed}' if log is None else f'from {LOGS.text(log)}'}"
+        by = f"seed {self.options.seed}" if self.log is None else f"from {self.log}"
+        count = counted(_written(self.output), "frame")
+        return f"{self.output}: {count} of {self.stack}, {by}"
 
     def to_json(self) -> object:
         """Return the recording: stack, folder, frames, seed, log."""
-        log = self.options.log
         return {
             "stack": self.stack,
             "output": self.output,
-            "frames": self.count,
-            "seed": self.options.seed if log is None else None,
-            "log": None if log is None else LOGS.text(log),
+            "frames": _written(self.output),
+            "seed": self.options.seed if self.log is None else None,
+            "log": self.log,
         }
+
+
+def _written(folder: Path) -> int:
+    """Count the frames: a log may have fewer than were asked for."""
+    return sum(1 for _ in folder.glob("*.npz"))
 
 
 def record_frames(
@@ -117,29 +92,38 @@ def record_frames(
         MissingExtraError: Driving needs the extra ``highway``.
     """
     options, folder = options or FramesOptions(), Path(folder)
+    log = None if options.log is None else LOGS.parse(options.log)
     if not folder.name:
         raise FramesError(f"{folder}: name a folder of its own: it is written anew")
     check_folder(folder, (source, options.adapter))
     with writing(trees=[folder], folders=[partial_of(folder)], force=options.force):
-        return _recorded(source, folder, options, listener)
+        return _recorded(source, folder, log, options, listener)
 
 
 def _recorded(
-    source: str | Path, folder: Path, options: FramesOptions, listener: Listener
+    source: str | Path,
+    folder: Path,
+    log: DriveLog | None,
+    options: FramesOptions,
+    listener: Listener,
 ) -> Path:
+    model, of = model_path(source), sha256_of(model_path(source))
+    adapter = None
     pixels: Mapping[str, PixelInput] = {}
-    about: dict[str, str | int] = {"stack": str(source), "seed": options.seed}
-    # frames come from a log, or from the expert's driving
-    if options.log is not None:
-        make, of, pixels = _logged(source, options.log, options)
-        about = {"stack": str(source), "log": LOGS.text(options.log)}
-    else:
-        model = model_path(source)
-        try_first(model, model.name, listener=listener, provider=options.provider)
-        make, of = _driven(model, options), sha256_of(model)
     # a recording is continued only if the sources and the adapter are the same
     if options.adapter is not None:
-        of += f" {Adapter.digest(adapter_file(options.adapter))}"
+        adapter = adapter_file(Path(options.adapter))
+        of += f" {Adapter.digest(adapter)}"
+    # frames come from a log, or from the expert's driving
+    about: dict[str, str | int] = {"stack": str(source)}
+    if log is not None:
+        count, length, provider = options.count, options.scene_length, options.runs_on
+        request = LogRequest(model, count, length, adapter, provider)
+        make: Source = partial(log.frames, request)
+        pixels, about["log"] = log.pixels(request), LOGS.text(log)
+    else:
+        try_first(model, model.name, listener=listener, provider=options.runs_on)
+        make, about["seed"] = _driven(model, adapter, options), options.seed
 
     def reported(begin: Begin) -> Iterator[Frame]:
         for frame in make(begin):
@@ -151,35 +135,13 @@ def _recorded(
     return write_recording(folder, reported, about, key, pixels)
 
 
-def _logged(
-    source: str | Path, log: DriveLog, options: FramesOptions
-) -> tuple[Source, str, Mapping[str, PixelInput]]:
-    request = LogRequest(
-        model_path(source),
-        options.count,
-        options.scene_length,
-        None if options.adapter is None else adapter_file(options.adapter),
-        options.provider,
-    )
-    return (
-        partial(log.frames, request),
-        sha256_of(request.model),
-        log.pixels(request),
-    )
-
-
-def _policy(model: Path, options: FramesOptions) -> OnnxPolicy:
-    adapter = None
-    if options.adapter is not None:
-        adapter = Adapter.load(adapter_file(options.adapter))
-    return OnnxPolicy.open(model, adapter, options.provider)
-
-
-def _driven(model: Path, options: FramesOptions) -> Source:
+def _driven(model: Path, adapter: Path | None, options: FramesOptions) -> Source:
     need_extra("highway", "recording frames of a driver")
     from me2e_compress.evaluators.highway.driven_frames import driven_frames
 
-    policy, length = _policy(model, options), options.scene_length
+    adapted = None if adapter is None else Adapter.load(adapter)
+    policy = OnnxPolicy.open(model, adapted, options.runs_on)
+    length = options.scene_length
     return lambda begin: driven_frames(
         policy,
         options.count,

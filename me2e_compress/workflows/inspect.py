@@ -2,47 +2,239 @@
 
 import dataclasses
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 
 import onnx_ir as ir
+import pydantic
 
 from me2e_compress import graph
+from me2e_compress.display import AT_LEAST, giga, megabytes, number, table
 from me2e_compress.driving.adapter.outputs import adapted
-from me2e_compress.errors import GraphError
-from me2e_compress.graph import provenance
+from me2e_compress.errors import EvaluationError, GraphError
+from me2e_compress.graph import Port, provenance
 from me2e_compress.graph.modules import Item, ModuleMap, assign, itemise
 from me2e_compress.graph.opset import lowered
 from me2e_compress.graph.recurrence import recurrent_inputs
-from me2e_compress.graph.summary import why_uncounted
+from me2e_compress.graph.summary import activation_bytes, why_uncounted
 from me2e_compress.manager import PassManager, recipe
 from me2e_compress.passes import Context
 from me2e_compress.passes.fix_shapes import FixShapes, open_dimensions
-from me2e_compress.runtime.latency_trace import LatencyTrace
+from me2e_compress.registry.documents import MalformedError, from_json
+from me2e_compress.runtime.latency_trace import LatencyTrace, shares
+from me2e_compress.shipped.drivers import SHIPPED
 from me2e_compress.workflows.checks import lacking_shapes, load_map, model_path
-from me2e_compress.workflows.inspect_result import InspectResult
-from me2e_compress.workflows.module_costs import (
-    trace_of,
-    with_activations,
-    with_latency,
-)
-from me2e_compress.workflows.weights_record import named_weights
+from me2e_compress.workflows.options import InspectOptions
+from me2e_compress.workflows.result import Result, Shown
+
+_SHOWN = 8
+"""Number of reasons for unknown MACs that are named."""
+
+
+@dataclasses.dataclass(frozen=True, repr=False)
+class InspectResult(Result):
+    """What a file holds.
+
+    Attributes:
+        file_bytes: size with the external weights.
+        opset: opset of the default domain; `domains` names the others.
+        map: the module map that was used.
+        rules: nodes placed, by rule of the map.
+        macs: multiply-accumulates, those known; None if none is.
+        uncounted: nodes that ``macs`` leaves out, by reason.
+        open_dimensions: of the inputs; MACs depend on them.
+        lowered: what was changed for onnxruntime; empty if nothing.
+        hint: what the graph lacks; empty if nothing.
+        recurrent: outputs that are fed back, by input.
+        weights: the checkpoint that its metadata names; or empty.
+        latency_of: what the shares of time are of; empty if not measured.
+    """
+
+    file: str
+    file_bytes: int
+    opset: int | None
+    domains: tuple[str, ...]
+    map: str
+    inputs: tuple[Port, ...]
+    outputs: tuple[Port, ...]
+    modules: tuple[Item, ...]
+    rules: dict[str, int]
+    macs: int | None
+    unknown_macs_nodes: int
+    uncounted: dict[str, int]
+    open_dimensions: tuple[str, ...]
+    lowered: str = ""
+    hint: str = ""
+    recurrent: dict[str, str] = dataclasses.field(default_factory=dict)
+    weights: str = ""
+    latency_of: str = ""
+
+    def shown(self) -> Shown:
+        """Return the interface, the modules, what is lacking and the checkpoint."""
+        more = f" and {', '.join(self.domains)}" if self.domains else ""
+        read = f" ({self.lowered})" if self.lowered else ""
+        size = f"{megabytes(self.file_bytes)} MB"
+        headline = f"{self.file}: {size}, opset {self.opset}{more}{read}"
+        ports = [
+            (kind, port.name, port.type, port.shape)
+            for kind, side in (("in", self.inputs), ("out", self.outputs))
+            for port in side
+        ]
+        rows = [
+            (
+                item.module,
+                number(item.nodes),
+                number(item.parameters),
+                megabytes(item.weight_bytes),
+                giga(item.macs, item.unknown_macs_nodes, ".3f"),
+                _activations(item),
+                *self._share(item),
+            )
+            for item in self.modules
+        ]
+        # notes below the tables: placement, total MACs, time, recurrence
+        rules = ", ".join(f"{count} by {rule}" for rule, count in self.rules.items())
+        note = f"nodes placed: {rules}\nGMACs in all: {self._total_macs()}"
+        if self.latency_of:
+            note += f"\nshare of a frame's time: {self.latency_of}"
+        pairs = [f"{to} as {name}" for name, to in self.recurrent.items()]
+        back = f"fed back: {', '.join(pairs)}" if pairs else ""
+        counts = ("nodes", "parameters", "MB", "GMACs", "activations MB")
+        # the column of time is only there if it was measured
+        columns = ("module", *counts, *(("time",) if self.latency_of else ()))
+        return Shown(
+            headline,
+            (
+                table("Interface", ("", "name", "type", "shape"), ports, back, words=4),
+                table(f"Modules (map {self.map})", columns, rows, note),
+            ),
+            filter(None, (self.hint, headline, self.weights)),
+        )
+
+    def _share(self, item: Item) -> tuple[str, ...]:
+        if not self.latency_of:
+            return ()
+        share = item.latency_share
+        return ("-" if share is None else f"{share:.1%}",)
+
+    def _total_macs(self) -> str:
+        total = giga(self.macs, 0, ".3f")
+        if not self.unknown_macs_nodes:
+            return total
+        known = "" if self.macs is None else f"at least {total}, "
+        found = [f"{count} {reason}" for reason, count in self.uncounted.items()]
+        why = ", ".join(found[:_SHOWN]) + (", ..." if len(found) > _SHOWN else "")
+        ways = ""
+        if self.open_dimensions:
+            ways = f"; --set-dim NAME=SIZE for {', '.join(self.open_dimensions)}"
+        nodes = "node" if self.unknown_macs_nodes == 1 else "nodes"
+        return (
+            f"{known}{number(self.unknown_macs_nodes)} {nodes} not counted: {why}{ways}"
+        )
+
+
+def _activations(item: Item) -> str:
+    if item.activation_bytes is None:
+        return "-"
+    least = "at least " if item.unknown_activation_nodes else ""
+    return f"{least}{megabytes(item.activation_bytes)}"
+
+
+def _with_costs(
+    items: Iterable[Item],
+    costs: Mapping[str, Item],
+    folded: ir.Model,
+    trace: LatencyTrace | None,
+) -> tuple[Item, ...]:
+    """Return items with MACs, bytes that nodes write, and shares of a frame's time.
+
+    The graph `folded` is imported, with shapes inferred. Time between nodes, or of
+    nodes without a module, counts for no module: the shares need not add up to 1.
+    """
+    known, unknown = Counter[str](), Counter[str]()
+    for node in folded.graph:
+        size, module = activation_bytes(node), provenance.module_of(node)
+        known[module] += size or 0
+        unknown[module] += size is None
+    timed = () if trace is None else shares(trace.modules_us)
+    times = {each.name: each.share for each in timed}
+    # bytes are None where no node of a module tells them
+    return tuple(
+        dataclasses.replace(
+            item,
+            macs=costs.get(item.module, item).macs,
+            unknown_macs_nodes=costs.get(item.module, item).unknown_macs_nodes,
+            activation_bytes=known[item.module]
+            if known[item.module] or not unknown[item.module]
+            else None,
+            unknown_activation_nodes=unknown[item.module],
+            latency_share=times.get(item.module),
+        )
+        for item in items
+    )
+
+
+def trace_of(path: str | Path, model: Path) -> LatencyTrace:
+    """Read a trace; it must be by module, and of this very model."""
+    trace = LatencyTrace.load(Path(path))
+    if trace.model_sha256 != graph.sha256_of(model):
+        raise EvaluationError(f"{path}: a trace of another model than {model.name}")
+    if not trace.modules_us:
+        raise EvaluationError(
+            f"{path}: has no times by module: profile {model.name} with --by-module"
+        )
+    return trace
+
+
+RECORD = "me2e.weights"
+"""Metadata key of the checkpoint that a graph was made from."""
+
+
+@dataclass(frozen=True)
+class WeightsRecord:
+    """The checkpoint of a graph's weights.
+
+    Attributes:
+        averaged: whether its moving averages were taken.
+    """
+
+    file: str
+    sha256: str
+    epoch: int | None = None
+    iteration: int | None = None
+    averaged: bool = False
+
+    def line(self) -> str:
+        """Return the line of a report."""
+        counts = {"epoch": self.epoch, "iteration": self.iteration}
+        stated = [f"{key} {n}" for key, n in counts.items() if n is not None]
+        return ", ".join([f"weights: {self.file}", *stated, f"sha256 {self.sha256}"])
+
+
+def named_weights(metadata: Mapping[str, str]) -> str:
+    """Return the line that names a graph's checkpoint or random weights, if known."""
+    text = metadata.get(RECORD)
+    if text is None:
+        stack = metadata.get("me2e.stack")
+        if stack is None or stack in SHIPPED:
+            return ""
+        return f"weights: random, as {stack} is exported: no {RECORD} names others"
+    try:
+        record = pydantic.TypeAdapter(WeightsRecord).validate_python(from_json(text))
+    except (MalformedError, pydantic.ValidationError):
+        return f"metadata {RECORD} is malformed"
+    return record.line()
+
 
 _SHAPES = "import-normalize,fold-constants{through_compute=false}"
 
 
 def inspect(
     model: str | Path,
-    module_map: str | Path | None = None,
-    dims: Mapping[str, int] | None = None,
-    trace: str | Path | None = None,
-    adapter: str | Path | None = None,
+    options: InspectOptions | None = None,
 ) -> InspectResult:
     """Read a graph, and weigh its modules.
-
-    `dims` are sizes that open dimensions of the inputs are given first. The time by
-    module comes from a trace that ``profile`` wrote. The adapter's TOML says which
-    outputs are fed back.
 
     Raises:
         GraphError: The model does not exist.
@@ -50,24 +242,13 @@ def inspect(
         ModuleMapError: The map does not exist.
         EvaluationError: The trace is of another model, or not by module.
     """
-    path = model_path(model)
-    taken = None if trace is None else trace_of(trace, path)
+    options, path = options or InspectOptions(), model_path(model)
+    taken = None if options.trace is None else trace_of(options.trace, path)
     loaded = graph.load(path)
-    adapted(loaded, adapter, module_map)
-    modules = load_map(module_map, loaded)
-    return inspected(path, loaded, modules, dims, taken)
-
-
-def inspected(
-    path: Path,
-    loaded: ir.Model,
-    modules: ModuleMap,
-    dims: Mapping[str, int] | None = None,
-    taken: LatencyTrace | None = None,
-) -> InspectResult:
-    """Weigh the modules of a graph; the arguments are those of :func:`inspect`."""
-    if dims:
-        loaded = FixShapes(dims).run(loaded, Context(modules)).model
+    adapted(loaded, options.adapter, options.module_map)
+    modules = load_map(options.module_map, loaded)
+    if options.dims:
+        loaded = FixShapes(options.dims).run(loaded, Context(modules)).model
     # count what stands in the file, module by module
     placed = assign(loaded, modules)
     inputs, outputs = graph.interface(loaded)
@@ -75,12 +256,14 @@ def inspected(
     # MACs and activations need shapes, and folded shape arithmetic
     folded = _folded(loaded, modules)
     costs = {item.module: item for item in _costs(folded, modules)}
-    items = tuple(_with_cost(item, costs.get(item.module)) for item in items)
-    items = with_activations(items, folded)
-    if taken is not None:
-        items = with_latency(items, taken)
+    items = _with_costs(items, costs, folded, taken)
     # say what is unknown, and why
-    fed_back, wrong = _fed_back(loaded)
+    count, fed_back, wrong = graph.macs_counter(folded), dict[str, str](), ""
+    uncounted = [node for node in folded.graph.all_nodes() if count(node) is None]
+    try:
+        fed_back = recurrent_inputs(loaded)
+    except GraphError as error:
+        wrong = str(error)
     total = sum(item.macs or 0 for item in costs.values())
     unknown = sum(item.unknown_macs_nodes or 0 for item in costs.values())
     return InspectResult(
@@ -95,30 +278,13 @@ def inspected(
         {str(rule): count for rule, count in placed.rules().items()},
         total if total or not unknown else None,
         unknown,
-        _uncounted(folded),
+        dict(Counter(map(why_uncounted, uncounted)).most_common()),
         tuple(open_dimensions(loaded)),
         lowered(loaded),
         "; ".join(filter(None, (lacking_shapes(loaded), wrong))),
         fed_back,
         weights=named_weights(loaded.metadata_props),
         latency_of="" if taken is None else taken.headline,
-    )
-
-
-def _fed_back(model: ir.Model) -> tuple[dict[str, str], str]:
-    """Pair inputs with the outputs that are fed back, or say why that fails."""
-    try:
-        return recurrent_inputs(model), ""
-    except GraphError as error:
-        return {}, str(error)
-
-
-def _with_cost(item: Item, cost: Item | None) -> Item:
-    """Return a module's item as it stands in the file, with its MACs."""
-    if cost is None:
-        return item
-    return dataclasses.replace(
-        item, macs=cost.macs, unknown_macs_nodes=cost.unknown_macs_nodes
     )
 
 
@@ -140,7 +306,49 @@ def _costs(model: ir.Model, modules: ModuleMap) -> tuple[Item, ...]:
     return itemise(model, modules, provenance.module_of, graph.macs_counter(model))
 
 
-def _uncounted(model: ir.Model) -> dict[str, int]:
-    count = graph.macs_counter(model)
-    unknown = [node for node in model.graph.all_nodes() if count(node) is None]
-    return dict(Counter(map(why_uncounted, unknown)).most_common())
+@dataclasses.dataclass(frozen=True, repr=False)
+class ModuleChanges(Result):
+    """The modules before and after; a module that is gone is missing in the latter."""
+
+    before: tuple[Item, ...]
+    after: tuple[Item, ...]
+
+    def shown(self) -> Shown:
+        """Return each module before and after, and the size of all weights."""
+        before, after = (
+            megabytes(sum(item.weight_bytes for item in side))
+            for side in (self.before, self.after)
+        )
+        left = f"{len(self.after)} of {len(self.before)} modules"
+        rows, kept = [], {item.module: item for item in self.after}
+        for item in self.before:
+            now = kept.get(item.module)
+            nodes, size = (now.nodes, now.weight_bytes) if now else (0, 0)
+            rows.append(
+                (
+                    item.module,
+                    f"{item.nodes} → {nodes}",
+                    number(item.parameters),
+                    f"{megabytes(item.weight_bytes)} → {megabytes(size)}",
+                    f"{_gmacs(item)} → {_gmacs(now)}",
+                )
+            )
+        columns = ("module", "nodes", "parameters", "weights MB", "GMACs")
+        note = "before: once imported, its shape arithmetic done"
+        if any(item.unknown_macs_nodes for item in (*self.before, *self.after)):
+            note += f"\n{AT_LEAST}"
+        return Shown(
+            f"{before} MB of weights, now {after} in {left}",
+            [table("Module by module", columns, rows, note)],
+            (),
+        )
+
+
+def _gmacs(item: Item | None) -> str:
+    return giga(0) if item is None else giga(item.macs, item.unknown_macs_nodes)
+
+
+def compare_modules(before: Path, after: Path) -> ModuleChanges:
+    """Weigh the modules of two files, each by the preset that fits it."""
+    loaded = [graph.load(path) for path in (before, after)]
+    return ModuleChanges(*(weigh(each, load_map(None, each)) for each in loaded))

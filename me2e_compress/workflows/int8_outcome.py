@@ -2,19 +2,19 @@
 
 import dataclasses
 from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from typing import Self
 
 import onnx_ir as ir
 
+from me2e_compress.display import counted, megabytes
 from me2e_compress.graph import WEIGHTED
 from me2e_compress.manager import Report
 from me2e_compress.manager.report import LossyPass
 from me2e_compress.passes import Context
 from me2e_compress.passes.quantize_int8 import QuantizeInt8
-from me2e_compress.quantization.plan import FLOAT, Decision, QuantPlan, plan_of
+from me2e_compress.quantization.plan import FLOAT, QuantPlan, plan_of
 from me2e_compress.runtime.providers import CPU
-from me2e_compress.workflows.result import counted, megabytes
 
 LEAST_BYTES = 1024
 """Smaller constants are not worth a word."""
@@ -57,34 +57,23 @@ def float_weights(model: ir.Model, plan: QuantPlan) -> tuple[FloatWeight, ...]:
             continue
         is_int8 = decision.dtype != FLOAT and decision.output not in kept
         for at, value in enumerate(node.inputs):
-            if value is None or not _is_weight(value):
+            if value is None or (tensor := value.const_value) is None:
                 continue
-            if not is_int8:
-                made = _float_weight(value, decision, kept.get(decision.output))
-                found.setdefault(made.name, made)
-            elif at == decision.weight:
-                stored.add(str(value.name))
-    left = (each for name, each in found.items() if name not in stored)
-    return tuple(sorted(left, key=lambda each: (-each.bytes, each.name)))
-
-
-def _is_weight(value: ir.Value) -> bool:
-    tensor = value.const_value
-    return (
-        tensor is not None and tensor.dtype in _FLOATS and tensor.nbytes >= LEAST_BYTES
-    )
-
-
-def _float_weight(value: ir.Value, decision: Decision, kept: str | None) -> FloatWeight:
-    return FloatWeight(
-        str(value.name),
-        0 if value.const_value is None else value.const_value.nbytes,
-        decision.node,
-        decision.op,
-        decision.module,
-        decision.rule if kept is None else "target",
-        decision.reason if kept is None else kept,
-    )
+            if tensor.dtype not in _FLOATS or tensor.nbytes < LEAST_BYTES:
+                continue
+            name = str(value.name)
+            if is_int8 and at == decision.weight:
+                stored.add(name)
+            elif not is_int8:
+                reason = kept.get(decision.output)
+                left = FloatWeight(
+                    *(name, tensor.nbytes, decision.node, decision.op, decision.module),
+                    decision.rule if reason is None else "target",
+                    decision.reason if reason is None else reason,
+                )
+                found.setdefault(name, left)
+    weights = (each for name, each in found.items() if name not in stored)
+    return tuple(sorted(weights, key=lambda each: (-each.bytes, each.name)))
 
 
 LISTED = 10
@@ -135,7 +124,9 @@ class Int8Outcome:
         layers = [each for each in plan.decisions if each.op in WEIGHTED]
         placed = {each.output for each in plan.placed}
         left = [each for each in layers if each.output not in placed]
-        weights = float_weights(quantizer.before, plan)
+        weights, by_rule = float_weights(quantizer.before, plan), Counter[str]()
+        for each in weights:
+            by_rule[each.rule] += each.bytes
         slow = plan.target == "tensorrt" and context.provider.native == CPU.native
         return cls(
             name,
@@ -143,7 +134,7 @@ class Int8Outcome:
             len(layers),
             dict(Counter(f"{e.rule}: {e.reason}" for e in left).most_common()),
             weights[:LISTED],
-            _by_rule(weights),
+            dict(by_rule.most_common()),
             _FOR_TENSORRT if changes and slow else None,
         )
 
@@ -180,13 +171,6 @@ class Int8Outcome:
                 f" {largest.node!r}, rule {largest.rule}: {largest.reason}"
             )
         return "; ".join(found)
-
-
-def _by_rule(weights: Iterable[FloatWeight]) -> dict[str, int]:
-    found = Counter[str]()
-    for each in weights:
-        found[each.rule] += each.bytes
-    return dict(found.most_common())
 
 
 def _plan(report: Report, quantizer: LossyPass, context: Context) -> QuantPlan | None:

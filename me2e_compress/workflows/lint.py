@@ -1,21 +1,20 @@
 """Check whether the runtime that is to run a graph would accept it."""
 
 import dataclasses
-import functools
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Self
 
 import onnx_ir as ir
 
 from me2e_compress import graph
+from me2e_compress.display import counted, table
 from me2e_compress.errors import PreconditionError, RecipeError
 from me2e_compress.passes import Pass
 from me2e_compress.passes.import_normalize import with_own_domains
 from me2e_compress.passes.quantize_int8 import QuantizeInt8
 from me2e_compress.quantization.plan import plan_of
-from me2e_compress.runtime.providers import CPU, Provider
+from me2e_compress.runtime.providers import CPU
 from me2e_compress.targets import (
     SEVERITIES,
     TARGETS,
@@ -26,67 +25,9 @@ from me2e_compress.targets import (
 )
 from me2e_compress.targets.tensorrt import TensorRT
 from me2e_compress.targets.tensorrt.rtx_check import BuildResult, check
-from me2e_compress.workflows.checks import model_path
-from me2e_compress.workflows.first_opening import try_first
-from me2e_compress.workflows.listener import SILENT, Listener
-from me2e_compress.workflows.result import Result, Status, Table, counted, table
-
-
-@dataclasses.dataclass(frozen=True)
-class LintOptions:
-    """The runtime that is asked, and how.
-
-    Attributes:
-        target: ``onnxruntime`` or ``tensorrt``; None is whom the file was written for
-            by the plan that it carries, else ``tensorrt``.
-        trt_check: also parse and build the graph by TensorRT-RTX.
-        sm: GPU generation that is built for.
-        provider: what opens a graph for onnxruntime.
-        target_version: of TensorRT, such as ``10.13``, whose tables are asked; None
-            warns of what 10.1 did not take.
-
-    Raises:
-        RecipeError: An option is given for a target that it does not serve, or the
-            version is none.
-    """
-
-    target: str | None = None
-    trt_check: bool = False
-    sm: int = 86
-    provider: Provider = CPU
-    target_version: str | None = None
-
-    def __post_init__(self) -> None:
-        if self.target not in (None, "tensorrt") and (option := self._of_tensorrt):
-            raise RecipeError(f"--{option} is for tensorrt, not for {self.target}")
-        if self.provider != CPU and self.target and not self.judge.opens:
-            raise RecipeError(
-                f"--provider is onnxruntime's: lint for {self.target} opens no session"
-            )
-
-    def of(self, model: ir.Model) -> Self:
-        """Return these options with the target that a graph is asked for."""
-        if self.target is not None:
-            return self
-        plan = None if self._of_tensorrt else plan_of(model)
-        written_for = "" if plan is None else plan.target
-        return dataclasses.replace(self, target=written_for or "tensorrt")
-
-    @property
-    def _of_tensorrt(self) -> str:
-        """Name an option that only TensorRT serves."""
-        version = "" if self.target_version is None else "target-version"
-        return "trt-check" if self.trt_check else version
-
-    @functools.cached_property
-    def judge(self) -> Target:
-        """The target, whose rules judge the graph."""
-        if self.target_version is None:
-            return TARGETS.parse(self.target or "tensorrt")
-        try:
-            return TensorRT(version=self.target_version)
-        except ValueError as reason:
-            raise RecipeError(f"--target-version: {reason}") from reason
+from me2e_compress.workflows.checks import model_path, try_first
+from me2e_compress.workflows.options import LintOptions
+from me2e_compress.workflows.result import SILENT, Listener, Result, Shown, Status
 
 
 @dataclasses.dataclass(frozen=True)
@@ -143,17 +84,34 @@ class LintResult(Result):
             f" {first.rule} {first.node!r}: {first.message}"
         )
 
+    def shown(self, every: bool = False) -> Shown:
+        """Return counts and findings, three nodes of each rule unless `every` is set.
+
+        A note counts the others; lines say what TensorRT-RTX answers.
+        """
+        # a rule that fails everywhere would bury the others
+        rows, more, shown = list[tuple[str, ...]](), list[str](), None if every else 3
+        for row in self.summary():
+            key = row.severity, row.rule
+            own = [each for each in self.findings if (each.severity, each.rule) == key]
+            rows += [(*key, each.node, each.message) for each in own[:shown]]
+            if shown is not None and row.nodes > shown:
+                more.append(f"{row.severity} {row.rule}: {row.nodes - shown} more")
+        columns = ("", "rule", "node", "what")
+        findings = table("Findings", columns, rows, "\n".join(more), words=4)
+        answer = () if self.build is None else _said(self.build, self.options.sm)
+        reason = self.refusal or self.miscomputed
+        return Shown(
+            self.headline,
+            [findings] if rows else [],
+            (self.headline, *answer),
+            error=None if reason is None else PreconditionError(reason),
+        )
+
     @property
     def status(self) -> Status:
-        """``refused`` if the target would not accept the graph, or miscompute it."""
-        if self.refusal is not None or self.miscomputed is not None:
-            return "refused"
-        return "warning" if self.findings else "ok"
-
-    def check(self) -> None:
-        """Raise PreconditionError unless the target runs the graph, and rightly."""
-        if reason := self.refusal or self.miscomputed:
-            raise PreconditionError(reason)
+        """``warning`` if there are findings of any severity."""
+        return "warning" if super().status == "ok" and self.findings else super().status
 
     @property
     def headline(self) -> str:
@@ -182,26 +140,6 @@ class LintResult(Result):
             for key, found in rows.items()
         )
 
-    def lines(self) -> tuple[str, ...]:
-        """Return the headline, and TensorRT-RTX's answer."""
-        said = () if self.build is None else _said(self.build, self.options.sm)
-        return (self.headline, *said)
-
-    def tables(self, *, shown: int = 3) -> tuple[Table, ...]:
-        """Return the findings, `shown` nodes of each rule; a note counts the others."""
-        if not self.findings:
-            return ()
-        # a rule that fails everywhere would bury the others
-        rows, more = list[tuple[str, ...]](), list[str]()
-        for row in self.summary():
-            key = row.severity, row.rule
-            own = [each for each in self.findings if (each.severity, each.rule) == key]
-            rows += [(*key, each.node, each.message) for each in own[:shown]]
-            if row.nodes > shown:
-                more.append(f"{row.severity} {row.rule}: {row.nodes - shown} more")
-        columns = ("", "rule", "node", "what")
-        return (table("Findings", columns, rows, "\n".join(more), words=4),)
-
     def to_json(self) -> object:
         """Return the target, the findings, and the answer of TensorRT-RTX."""
         asked, build = self.options.target, self.build
@@ -226,10 +164,33 @@ def lint(
     """
     path = model_path(model)
     loaded = graph.load(path)
-    options = (options or LintOptions()).of(loaded)
+    options = asked_of(loaded, options or LintOptions())
     found = _found(loaded, path.name, options, listener)
     build = check(loaded, options.sm) if options.trt_check else None
     return LintResult(path, options, found, build)
+
+
+def asked_of(model: ir.Model, options: LintOptions) -> LintOptions:
+    """Return the options with the target that a graph is asked for."""
+    if options.target is None:
+        plan = None if options.of_tensorrt else plan_of(model)
+        written_for = "" if plan is None else plan.target
+        options = dataclasses.replace(options, target=written_for or "tensorrt")
+    if options.runs_on != CPU and not _judge(options).opens:
+        raise RecipeError(
+            f"--provider is onnxruntime's: lint for {options.target} opens no session"
+        )
+    return options
+
+
+def _judge(options: LintOptions) -> Target:
+    """Return the target, whose rules judge the graph."""
+    if options.target_version is None:
+        return TARGETS.parse(options.target or "tensorrt")
+    try:
+        return TensorRT(version=options.target_version)
+    except ValueError as reason:
+        raise RecipeError(f"--target-version: {reason}") from reason
 
 
 def lint_written(
@@ -242,8 +203,8 @@ def lint_written(
     targets = [each.target for each in passes if isinstance(each, QuantizeInt8)]
     if not targets:
         return None
-    options = LintOptions(targets[-1])
-    found = options.judge.lint(with_own_domains(model))
+    options = LintOptions(target=targets[-1])
+    found = _judge(options).lint(with_own_domains(model))
     return LintResult(Path(output.name), options, found, asked=asked is not None)
 
 
@@ -251,7 +212,7 @@ def _found(
     model: ir.Model, name: str, options: LintOptions, listener: Listener
 ) -> tuple[LintFinding, ...]:
     """Return the rules' findings and, if none is an error, those of opening it."""
-    judge, provider = options.judge, options.provider
+    judge, provider = _judge(options), options.runs_on
     found = judge.lint(model)
     if provider.native != CPU.native:  # the list of kernels is the CPU's
         found = tuple(each for each in found if each.rule != "kernel")

@@ -1,6 +1,11 @@
-"""List everything that can be named, with what other packages add by entry point."""
+"""What can be named, and what this machine can do."""
 
+import contextlib
 import dataclasses
+import importlib.metadata
+import importlib.util
+import os
+import platform
 import re
 from collections.abc import Callable, Iterator, Mapping
 from functools import partial
@@ -9,8 +14,13 @@ from importlib.resources.abc import Traversable
 from pathlib import Path
 from typing import Any
 
+import onnxruntime
+import psutil
+import pynvml
+
 from me2e_compress.calibration.observers import OBSERVERS
 from me2e_compress.calibration.recording import LOGS
+from me2e_compress.display import Table, table
 from me2e_compress.driving.host_stage import HOST_STAGES
 from me2e_compress.driving.input_sources import INPUT_SOURCES
 from me2e_compress.driving.latency import LATENCY_SOURCES
@@ -19,15 +29,22 @@ from me2e_compress.driving.shipped_adapters import adapter_file, shipped_adapter
 from me2e_compress.errors import RecipeError
 from me2e_compress.evaluators import EVALUATORS
 from me2e_compress.graph import modules
+from me2e_compress.manager.report import versions
 from me2e_compress.operators import OPERATORS
+from me2e_compress.operators.kernels import KERNELS, why_not
 from me2e_compress.passes import PASSES
 from me2e_compress.quantization.rules import RULE_SETS, RULES
-from me2e_compress.registry import Entry, Option, Registry, describe
-from me2e_compress.runtime.energy.energy_counter import ENERGY_COUNTERS
+from me2e_compress.registry import Entry, Registry, describe
+from me2e_compress.runtime.energy.energy_counter import (
+    ENERGY_COUNTERS,
+    EnergyRecording,
+    open_counter,
+)
+from me2e_compress.runtime.energy.energy_result import Absent
 from me2e_compress.runtime.providers import PROVIDERS
 from me2e_compress.shipped.drivers import SHIPPED
 from me2e_compress.targets import TARGETS
-from me2e_compress.workflows.result import Result, Table, table
+from me2e_compress.workflows.result import Result, Shown
 
 _OURS = "me2e-compress"
 _COMMENT = re.compile(r"(?:#.*\n)+")
@@ -41,27 +58,15 @@ class ListResult(Result):
     kinds: Mapping[str, tuple[Entry, ...]]
     closely: bool = False
 
-    @property
-    def headline(self) -> str:
-        """The number of names of each kind."""
-        return ", ".join(f"{len(found)} {kind}" for kind, found in self.kinds.items())
-
-    def lines(self) -> tuple[str, ...]:
-        """Return no line: the tables say everything."""
-        return ()
-
-    def tables(self) -> tuple[Table, ...]:
-        """Return one table per kind: names, descriptions and options."""
-        return tuple(
-            table(
-                kind,
-                ("name", "what it is"),
-                [row for each in found for row in _rows(each, self.closely)],
-                _added_to(kind),
-                words=2,
-            )
-            for kind, found in self.kinds.items()
-        )
+    def shown(self) -> Shown:
+        """Return a table of each kind: names, descriptions and options."""
+        headline = ", ".join(f"{len(each)} {kind}" for kind, each in self.kinds.items())
+        tables, by = list[Table](), "other packages add theirs by entry point: "
+        for kind, entries in self.kinds.items():
+            rows = [row for each in entries for row in _rows(each, self.closely)]
+            note = by + REGISTRIES[kind].group if kind in REGISTRIES else ""
+            tables.append(table(kind, ("name", "what it is"), rows, note, words=2))
+        return Shown(headline, tables, ())
 
     def to_json(self) -> object:
         """Return the entries by kind."""
@@ -85,11 +90,6 @@ def _adapters() -> tuple[Entry, ...]:
 def _module_maps() -> tuple[Entry, ...]:
     maps = [modules.ModuleMap.load(name) for name in (*modules.presets(), "whole")]
     return tuple(Entry(each.name, _OURS, ", ".join(each.names())) for each in maps)
-
-
-def _stacks() -> tuple[Entry, ...]:
-    words = "trained; ships with the package"
-    return tuple(Entry(name, _OURS, words) for name in SHIPPED)
 
 
 def _file(path: Traversable) -> Entry:
@@ -123,7 +123,9 @@ KINDS: Mapping[str, Callable[[], tuple[Entry, ...]]] = {
     "recipes": _recipes,
     "adapters": _adapters,
     "module-maps": _module_maps,
-    "stacks": _stacks,
+    "stacks": lambda: tuple(
+        Entry(name, _OURS, "trained; ships with the package") for name in SHIPPED
+    ),
 }
 """The functions that find the entries of a kind."""
 
@@ -141,33 +143,119 @@ def list_entries(kind: str | None = None) -> ListResult:
     return ListResult({name: find() for name, find in chosen.items()}, kind is not None)
 
 
-def _added_to(kind: str) -> str:
-    found = REGISTRIES.get(kind)
-    return (
-        ""
-        if found is None
-        else f"other packages add theirs by entry point: {found.group}"
-    )
-
-
 def _rows(entry: Entry, closely: bool) -> Iterator[tuple[str, str]]:
     """Yield the name with its description, then the options on rows of their own."""
     theirs = "" if entry.source == _OURS else f" ({entry.source})"
-    yield entry.name, entry.error or _words(entry.doc + theirs)
+    yield entry.name, entry.error or f"{entry.doc}{theirs}".replace("`", "")
     if closely:
-        yield from (("", _words(f"{_signature(e)} {e.doc}")) for e in entry.options)
+        for each in entry.options:
+            default = "" if each.default is None else f" = {each.default}"
+            text = f"{each.name}: {each.type}{default} {each.doc}"
+            yield "", text.replace("`", "")
     elif entry.options:
-        yield "", _words(", ".join(map(_assignment, entry.options)))
+        words = (
+            each.name if each.default is None else f"{each.name}={each.default}"
+            for each in entry.options
+        )
+        yield "", ", ".join(words).replace("`", "")
 
 
-def _words(text: str) -> str:
-    return text.replace("`", "")
+_EXTRAS = (
+    ("highway_env", "highway", "drive models in closed loop"),
+    ("tensorrt_rtx", "trt-check", "parse and build for TensorRT without a GPU"),
+    ("onnxslim", "bench", "compare with onnxslim in the benchmarks"),
+)
 
 
-def _assignment(option: Option) -> str:
-    return option.name if option.default is None else f"{option.name}={option.default}"
+@dataclasses.dataclass(frozen=True)
+class Checkup:
+    """One thing a machine can do, or, where `found` is None, how to make it do so."""
+
+    what: str
+    found: str | None
+    advice: str = ""
 
 
-def _signature(option: Option) -> str:
-    default = "" if option.default is None else f" = {option.default}"
-    return f"{option.name}: {option.type}{default}"
+@dataclasses.dataclass(frozen=True, repr=False)
+class DoctorResult(Result):
+    """Everything that was looked for."""
+
+    checkups: tuple[Checkup, ...]
+
+    def shown(self) -> Shown:
+        """Return what was found, and what to do for the rest."""
+        count = sum(each.found is not None for each in self.checkups)
+        rows = [(each.what, each.found or "no", each.advice) for each in self.checkups]
+        columns = ("what", "found", "to have it")
+        return Shown(
+            f"{count} of {len(self.checkups)} things found",
+            [table("This machine", columns, rows, words=3)],
+            (),
+        )
+
+
+def doctor() -> DoctorResult:
+    """Look for everything that the toolkit can make use of."""
+    return DoctorResult((*_machine(), *_packages(), _kernels(), _gpu(), _energy()))
+
+
+def _machine() -> list[Checkup]:
+    memory = psutil.virtual_memory().total / 2**30
+    enough = "" if memory >= 6 else "VAD-tiny needs 6 GiB to calibrate"
+    return [
+        Checkup("cores", str(os.cpu_count())),
+        Checkup("memory", f"{memory:.1f} GiB", enough),
+        Checkup("platform", platform.platform()),
+        Checkup("onnxruntime on", ", ".join(onnxruntime.get_available_providers())),
+    ]
+
+
+def _packages() -> list[Checkup]:
+    found = [Checkup(name, version) for name, version in versions().items()]
+    for module, extra, purpose in _EXTRAS:
+        if importlib.util.find_spec(module) is None:
+            advice = f"{purpose}: pip install 'me2e-compress[{extra}]'"
+            found.append(Checkup(module, None, advice))
+        else:
+            found.append(Checkup(module, _version(module)))
+    return found
+
+
+def _version(module: str) -> str:
+    with contextlib.suppress(importlib.metadata.PackageNotFoundError):
+        return importlib.metadata.version(module.replace("_", "-"))
+    return "of unknown version"
+
+
+def _kernels() -> Checkup:
+    what = "compiled kernels"
+    if reason := why_not():
+        return Checkup(what, None, f"fused operators run as their bodies: {reason}")
+    return Checkup(what, ", ".join(each.op_type for each in KERNELS))
+
+
+def _energy() -> Checkup:
+    found = open_counter()
+    if isinstance(found, Absent):
+        advice = f"joules are not measured here: {found.reason}; docs/energy.md"
+        return Checkup("energy counter", None, advice)
+    if isinstance(found, EnergyRecording):
+        return Checkup("energy counter", found.counter)
+    with contextlib.closing(found):
+        what = f"{found.counter} of {found.device}: {found.scope}"
+        return Checkup("energy counter", what)
+
+
+def _gpu() -> Checkup:
+    # a driver without a GPU fails later than a missing driver
+    try:
+        pynvml.nvmlInit()
+    except pynvml.NVMLError as error:
+        return Checkup("NVIDIA GPU", None, f"no GPU is used ({error})")
+    try:
+        handle = pynvml.nvmlDeviceGetHandleByIndex(0)
+        return Checkup("NVIDIA GPU", str(pynvml.nvmlDeviceGetName(handle)))
+    except pynvml.NVMLError as error:
+        return Checkup("NVIDIA GPU", None, f"the driver answers: {error}")
+    finally:
+        pynvml.nvmlShutdown()

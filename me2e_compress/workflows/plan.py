@@ -1,14 +1,21 @@
 """Plan which nodes become int8 and which stay float, by which rule, and why."""
 
 import dataclasses
-from collections.abc import Sequence
+import itertools
+from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import NoReturn, Self
 
 import onnx_ir as ir
 
 from me2e_compress import graph
-from me2e_compress.errors import RecipeError
-from me2e_compress.passes import Context
+from me2e_compress.calibration.observers import DEFAULT_METHOD
+from me2e_compress.display import Table, table
+from me2e_compress.errors import PreconditionError, RecipeError
+from me2e_compress.graph.modules import ModuleMap
+from me2e_compress.manager import PassManager, recipe
+from me2e_compress.passes import Context, Pass
+from me2e_compress.passes.lower_int8 import LowerInt8
 from me2e_compress.passes.quantize_int8 import QuantizeInt8
 from me2e_compress.quantization.plan import (
     Decision,
@@ -19,33 +26,110 @@ from me2e_compress.quantization.plan import (
     plan_of,
     save_plan,
 )
-from me2e_compress.quantization.rules import DEFAULT_RULES, RuleSet
-from me2e_compress.targets import DEFAULT_TARGET
-from me2e_compress.workflows.checks import lacking_shapes, model_path
-from me2e_compress.workflows.claims import writing
-from me2e_compress.workflows.prepare_int8 import PreparedGraph
-from me2e_compress.workflows.result import Result, Table, table
+from me2e_compress.quantization.rules import DEFAULT_RULES, RULE_SETS
+from me2e_compress.targets import DEFAULT_TARGET, TARGETS
+from me2e_compress.targets.quantized import describe_quantized
+from me2e_compress.workflows.checks import lacking_shapes, load_map, model_path, writing
+from me2e_compress.workflows.options import PlanOptions
+from me2e_compress.workflows.result import Result, Shown
+
+_MOST = "paper{without=[fused-operator]}"
+"""The rules that need all ranges that others do: an override may lift those."""
 
 
-@dataclasses.dataclass(frozen=True)
-class PlanOptions:
-    """How a graph is planned; a plan that is made already takes no options.
+@dataclasses.dataclass(frozen=True, eq=False)
+class PreparedGraph:
+    """A graph in the state in which the pass that reads ranges finds it.
 
-    Attributes:
-        scheme: ``feature-ext``, ``prediction``; None is ``full``.
-        rules: ``safe``, ``paper``, or a set of yours; None is ``safe``.
-        target: runtime of the int8 graph; None is ``onnxruntime``.
-        overrides: TOML file of exceptions.
-        module_map: preset or TOML file; None finds the preset.
-        force: replace outputs that we did not write, too.
+    `reader` is that pass; None where the recipe has none.
     """
 
-    scheme: str | None = None
-    rules: str | RuleSet | None = None
-    target: str | None = None
-    overrides: str | Path | None = None
-    module_map: str | Path | None = None
-    force: bool = False
+    file: Path
+    model: ir.Model
+    modules: ModuleMap
+    reader: Pass | None
+
+    @classmethod
+    def of(
+        cls,
+        file: Path,
+        loaded: ir.Model,
+        module_map: str | Path | ModuleMap | None,
+        passes: Sequence[Pass] | None = None,
+    ) -> Self:
+        """Run the passes before the first that reads ranges, unverified.
+
+        A module map of None finds the preset; passes of None stand for the recipe
+        ``exact``. A graph that is quantized already, and is to become int8, raises
+        PreconditionError.
+        """
+        chosen = tuple(recipe.load("exact") if passes is None else passes)
+        at = next((at for at, each in enumerate(chosen) if each.reads_ranges), None)
+        reader = None if at is None else chosen[at]
+        # a quantized graph may only be rewritten, not quantized again
+        quantized = describe_quantized(loaded)
+        if quantized and (reader is None or reader.quantizes):
+            raise PreconditionError(
+                f"{file}: the graph is quantized already: {quantized}; give the float"
+                " graph that it was made of"
+            )
+        if not isinstance(module_map, ModuleMap):
+            module_map = load_map(module_map, loaded)
+        # exact passes are verified when the graph is compressed
+        manager = PassManager(chosen[:at], verify_frames=0)
+        model = manager.run(loaded, Context(module_map)).model
+        graph.infer_shapes(model)
+        _leave_the_message(model)
+        return cls(file, model, module_map, reader)
+
+    @property
+    def method(self) -> str:
+        """Return how the pass that reads ranges wants them measured."""
+        if isinstance(self.reader, QuantizeInt8):
+            return self.reader.method_of_ranges
+        return (
+            self.reader.method if isinstance(self.reader, LowerInt8) else DEFAULT_METHOD
+        )
+
+    def tensors(self) -> tuple[str, ...]:
+        """Return every tensor that any scheme, rule set or target needs a range of.
+
+        For a quantized graph to be rewritten, these are the tensors without a range in
+        it. If there is none, PreconditionError is raised.
+        """
+        if self.reader is None or self.reader.quantizes:
+            return self._of_all() or self._refuse("no node can become int8")
+        missing = self.reader.ranged_tensors(self.model, Context(self.modules))
+        return missing or self._refuse(
+            f"it tells every range that {self.reader.name} needs: none to measure"
+        )
+
+    def _of_all(self) -> tuple[str, ...]:
+        names: dict[str, None] = {}
+        sets = (*RULE_SETS.usable(), _MOST)
+        for rules, target in itertools.product(sets, TARGETS.usable()):
+            every = QuantizeInt8(
+                modules=self.modules.names(), rules=rules, target=target
+            )
+            plan = every.plan(self.model, Context(self.modules))
+            found = TARGETS.parse(target).tensors(plan, self.model)
+            names |= dict.fromkeys(found)
+        return tuple(names)
+
+    def _refuse(self, reason: str) -> NoReturn:
+        raise PreconditionError(f"{self.file}: {reason}")
+
+
+def _leave_the_message(model: ir.Model) -> None:
+    """Copy weights out of the protobuf message that the file was read into.
+
+    A single weight left there would keep the whole message in memory.
+    """
+    for value in (v for g in model.graphs() for v in g.initializers.values()):
+        tensor = value.const_value
+        if isinstance(tensor, ir.serde.TensorProtoTensor):
+            array = tensor.numpy().copy()
+            value.const_value = ir.Tensor(array, dtype=tensor.dtype, name=value.name)
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
@@ -62,43 +146,33 @@ class PlanResult(Result):
     changes: tuple[PlanDifference, ...] | None = None
     hint: str = ""
 
-    @property
-    def headline(self) -> str:
-        """The number of int8 nodes by rule, or of differences."""
+    def shown(self, every: bool = False) -> Shown:
+        """Return how many nodes of each module became what by which rule, or changes.
+
+        With `every` a row a node that could be int8, and what was decided together.
+        """
         if self.changes is not None:
-            return f"{len(self.changes)} differences"
-        return self.plan.headline
+            headline = f"{len(self.changes)} differences"
+            said = filter(None, (self.hint, headline))
+            return Shown(headline, (), (*map(str, self.changes), *said))
+        lines = filter(None, (self.hint, self.plan.headline))
+        more = self._nodes() if every else ()
+        return Shown(self.plan.headline, (*self.plan.tables(), *more), lines)
 
-    def lines(self) -> tuple[str, ...]:
-        """Return the differences, and the headline."""
-        said = filter(None, (self.hint, self.headline))
-        return (*map(str, self.changes or ()), *said)
-
-    def tables(self) -> tuple[Table, ...]:
-        """Return how many nodes of each module became what, by which rule."""
-        return () if self.changes is not None else self.plan.tables()
-
-    def nodes(self) -> tuple[Table, ...]:
-        """Return one row per node that could be int8, and what was decided together."""
-        if self.changes is not None:
-            return ()
+    def _nodes(self) -> Iterator[Table]:
         rows = [
             (each.node or each.output, _what(each))
             for each in self.plan.decisions
             if each.could_be_int8
         ]
-        shown = table("Decisions", ("node", "what, by which rule, why"), rows, words=2)
-        return shown, *self._groups()
-
-    def _groups(self) -> tuple[Table, ...]:
-        rows = [
+        yield table("Decisions", ("node", "what, by which rule, why"), rows, words=2)
+        groups = [
             (group.name, group.kind, ", ".join(group.tensors), ", ".join(group.nodes))
             for group in self.plan.groups
         ]
-        if not rows:
-            return ()
-        columns = ("of", "kind", "tensors", "read by")
-        return (table("Decided together", columns, rows, words=4),)
+        if groups:
+            columns = ("of", "kind", "tensors", "read by")
+            yield table("Decided together", columns, groups, words=4)
 
     def to_json(self) -> object:
         """Return the plan, or the differences from another."""
@@ -131,31 +205,25 @@ def plan(
     written = None if output is None else Path(output)
     inputs = (*files, options.overrides, options.module_map)
     with writing([written], inputs, force=options.force):
-        return _planned(files, written, options)
-
-
-def _planned(
-    files: Sequence[Path], written: Path | None, options: PlanOptions
-) -> PlanResult:
-    # a file is a plan, carries one, or is a float graph to plan
-    read = [_read(path) for path in files]
-    _check_options(options, files, read)
-    # overrides apply to the first plan only: the other shows what they change
-    plain = QuantizeInt8(
-        scheme=options.scheme or "full",
-        rules=options.rules or DEFAULT_RULES,
-        target=options.target or DEFAULT_TARGET,
-    )
-    overrides = None if options.overrides is None else Path(options.overrides)
-    chosen = dataclasses.replace(plain, overrides=overrides)
-    found = _made(files[0], read[0], chosen, options)
-    if written is not None:
-        save_plan(found, written)
-    if len(files) == 1:
-        hint = "" if isinstance(read[0], QuantPlan) else lacking_shapes(read[0])
-        return PlanResult(found, hint=hint)
-    other = _made(files[1], read[1], plain, options)
-    return PlanResult(found, tuple(differences(other, found)))
+        # a file is a plan, carries one, or is a float graph to plan
+        read = [_read(path) for path in files]
+        _check_options(options, files, read)
+        # overrides apply to the first plan only: the other shows what they change
+        plain = QuantizeInt8(
+            scheme=options.scheme or "full",
+            rules=options.rules or DEFAULT_RULES,
+            target=options.target or DEFAULT_TARGET,
+        )
+        overrides = None if options.overrides is None else Path(options.overrides)
+        chosen = dataclasses.replace(plain, overrides=overrides)
+        made = _made(files[0], read[0], chosen, options)
+        if written is not None:
+            save_plan(made, written)
+        if len(files) == 1:
+            hint = "" if isinstance(read[0], QuantPlan) else lacking_shapes(read[0])
+            return PlanResult(made, hint=hint)
+        other = _made(files[1], read[1], plain, options)
+        return PlanResult(made, tuple(differences(other, made)))
 
 
 def _what(decision: Decision) -> str:

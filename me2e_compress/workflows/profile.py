@@ -1,83 +1,129 @@
-"""Measure the latency of a model alone and warm, and its energy, if asked."""
+"""Latencies of a model, and its energy: measured alone and warm, or imported."""
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Sequence
 from importlib import util
 from pathlib import Path
 
-import onnx_ir as ir
-
 from me2e_compress import graph
 from me2e_compress.calibration.dataset import CalibrationSet
-from me2e_compress.driving.adapter.outputs import adapted
 from me2e_compress.errors import EvaluationError, MissingExtraError
 from me2e_compress.graph.modules import assign
-from me2e_compress.metrics.deadlines import BUDGET_MS
+from me2e_compress.metrics import BUDGET_MS
+from me2e_compress.metrics.deadlines import Deadlines, deadlines, deadlines_table
 from me2e_compress.registry import drafts
-from me2e_compress.runtime.breakdown import Breakdown, break_down
+from me2e_compress.runtime.breakdown import break_down
 from me2e_compress.runtime.energy import EnergyResult
-from me2e_compress.runtime.energy.energy_counter import EnergySchedule, check_counter
+from me2e_compress.runtime.energy.energy_counter import check_counter
 from me2e_compress.runtime.energy.meter import measure_energy
-from me2e_compress.runtime.latency_trace import LatencyTrace, Microseconds, OthersLoad
+from me2e_compress.runtime.imported_latency import read_imports
+from me2e_compress.runtime.latency_trace import (
+    LatencyTrace,
+    Microseconds,
+    OthersLoad,
+    shares,
+    shares_table,
+)
 from me2e_compress.runtime.profile import WARM_UP
 from me2e_compress.runtime.profile import profile as measure
-from me2e_compress.runtime.providers import CPU, Provider
 from me2e_compress.targets.onnxruntime import slow_here
-from me2e_compress.workflows.checks import (
-    MOST_THREADS,
-    check_count,
-    load_map,
-    model_path,
-)
-from me2e_compress.workflows.claims import writing
-from me2e_compress.workflows.deadlines_table import check_budget
-from me2e_compress.workflows.first_opening import try_first
-from me2e_compress.workflows.listener import SILENT, Listener
-from me2e_compress.workflows.profile_result import ProfileResult
+from me2e_compress.workflows.checks import load_map, model_path, opened, writing
+from me2e_compress.workflows.options import ProfileOptions, check_budget
+from me2e_compress.workflows.result import SILENT, Listener, Result, Shown
 
-MOST_SAMPLES = 10**9
-"""Most inferences that can be asked for: at a millisecond each, a fortnight."""
-KINDS = (".png", ".svg", ".pdf")
-"""File name endings of a figure."""
+_SHOWN = 12
+"""Number of operators in a table."""
+BEYOND_P99 = 5
+"""Samples beyond the 99th percentile from which on it is steady: with fewer, one
+disturbance more or less moves it.
+"""
 
 
-@dataclasses.dataclass(frozen=True)
-class ProfileOptions:
-    """How latencies are measured.
+@dataclasses.dataclass(frozen=True, repr=False)
+class ProfileResult(Result):
+    """Latencies of one model.
 
     Attributes:
-        samples: number of samples; None is one per frame.
-        warm_up: inferences before the first that counts.
-        threads: threads of onnxruntime; 0 takes all.
-        provider: what runs the graph.
-        by_module: also measure modules and operators, in inferences of their own.
-        module_map: preset or TOML file; None finds the preset.
-        figure: draw modules over inferences as PNG, SVG or PDF; measures them.
-        force: replace outputs that we did not write, too.
-        energy: also measure joules by ``auto`` or a named counter; None does not.
-        schedule: how long energy is measured, and how often; None takes the defaults.
-        budget_ms: milliseconds that a decision may take.
-        adapter: TOML file that says which outputs are fed back.
+        operators_us: microseconds of each operator, in inferences under a profiler.
+        energy: joules, or why there are none; None if not asked for.
+        told: other readings, in words, such as the power of a device.
+        slow_here: why the file is slow on this CPU, whose form is not its own.
     """
 
-    samples: int | None = None
-    warm_up: int = WARM_UP
-    threads: int = 1
-    provider: Provider = CPU
-    by_module: bool = False
-    module_map: str | Path | None = None
-    figure: str | Path | None = None
-    force: bool = False
-    energy: str | None = None
-    schedule: EnergySchedule | None = None
+    model: Path
+    trace: LatencyTrace
+    output: Path | None
+    operators_us: Microseconds = dataclasses.field(default_factory=dict)
+    figure: Path | None = None
+    energy: EnergyResult | None = None
+    energy_output: Path | None = None
     budget_ms: float = BUDGET_MS
-    adapter: str | Path | None = None
+    told: tuple[str, ...] = ()
+    slow_here: str | None = None
 
-    def __post_init__(self) -> None:
-        check_budget(self.budget_ms)
-        check_count("--threads", self.threads, most=MOST_THREADS)
-        check_count("--samples", self.samples or 0, most=MOST_SAMPLES)
-        check_count("--warm-up", self.warm_up, most=MOST_SAMPLES)
+    @property
+    def deadlines(self) -> Deadlines:
+        """The samples held against the budget."""
+        return deadlines(self.trace.samples_us, self.budget_ms)
+
+    def shown(self) -> Shown:
+        """Return percentiles, then modules, energy and operators.
+
+        Lines tell how far the last percentile can be trusted; alerts what puts joules
+        and times in doubt, and a form that is slow here.
+        """
+        headline = f"{self.output or self.model.name}: {self.trace.headline}"
+        whole, *modules = self.trace.tables()
+        energy, load = self.energy, self.trace.others
+        tables = [
+            dataclasses.replace(whole, title=headline),
+            deadlines_table("Against the budget", self.deadlines),
+            *modules,
+            *(() if energy is None else energy.tables()),
+        ]
+        # of many operators the first are shown, with a note on the others
+        if self.operators_us:
+            rest = len(self.operators_us) - _SHOWN
+            every = shares_table(
+                "By operator, as it runs", "operator", self.operators_us
+            )
+            more = f"{rest} more operators: --json" if rest > 0 else ""
+            note = "; ".join(filter(None, (every.note, more)))
+            few = dataclasses.replace(every, rows=every.rows[:_SHOWN], note=note)
+            tables.append(few)
+        lines = [*self.told, *([] if energy is None else [energy.headline])]
+        count, needed = len(self.trace.samples_us), 100 * BEYOND_P99
+        if count < needed:
+            remedy = "" if load is None else f" (--samples {needed})"
+            lines.append(
+                f"p99 is steady from {needed} samples on, with {BEYOND_P99} beyond it;"
+                f" here are {count}{remedy}"
+            )
+        busy = str(load) if load is not None and load.busy else None
+        slow = self.slow_here and f"{self.model.name}: {self.slow_here}"
+        doubts = () if energy is None else energy.alerts()
+        return Shown(headline, tables, lines, (*doubts, *filter(None, (busy, slow))))
+
+    def to_json(self) -> object:
+        """Return the trace, deadlines, shares, joules, and how busy the machine was."""
+        load = self.trace.others
+        return {
+            **self.trace.to_json(),
+            "deadlines": self.deadlines.to_json(),
+            "modules": shares(self.trace.modules_us),
+            "operators": shares(self.operators_us),
+            "energy": self.energy,
+            "slow_here": self.slow_here,
+            **(
+                {"others_cores": None, "cores": None}
+                if load is None
+                else load.to_json()
+            ),
+        }
+
+
+KINDS = (".png", ".svg", ".pdf")
+"""File name endings of a figure."""
 
 
 def profile(
@@ -103,29 +149,46 @@ def profile(
     """
     options = options or ProfileOptions()
     source, written = model_path(model), None if output is None else Path(output)
-    figure = None if options.figure is None else _figure_path(options.figure)
-    joules = _energy_path(options, written)
-    # refuse what cannot be measured before anything is
+    figure = None if options.figure is None else Path(options.figure)
+    joules = None
+    # refuse what cannot be measured or drawn before anything is
+    if figure is not None and figure.suffix not in KINDS:
+        raise EvaluationError(f"{figure}: a figure ends in {', '.join(KINDS)}")
+    if figure is not None and util.find_spec("matplotlib") is None:
+        raise MissingExtraError("matplotlib", "highway")
     if options.energy is not None:
         check_counter(options.energy)
+        joules = None if written is None else written.with_suffix(".energy.json")
     inputs = (source, frames, options.module_map, options.adapter)
     with writing([written, figure, joules], inputs, force=options.force):
         # each measurement has inferences of its own: the profiler takes time itself
-        recording = CalibrationSet(Path(frames))
-        loaded = graph.load(source)
-        said = adapted(loaded, options.adapter, options.module_map)
-        try_first(
-            loaded, source.name, recording, listener=listener, file=source,
-            provider=options.provider,
-        )  # fmt: skip
-        trace = _measured(source, said, recording, options, listener)
+        recording, threads = CalibrationSet(Path(frames)), options.threads
+        loaded, said = opened(source, recording, options, listener)
+        provider = options.runs_on
+        with OthersLoad() as others:
+            trace = measure(
+                source, recording, samples=options.samples, threads=threads,
+                provider=provider, said=said,
+                on_sample=listener.counting("profile", "inferences"),
+            )  # fmt: skip
+        trace = dataclasses.replace(trace, others=others.load)
         operators: Microseconds = {}
         if options.by_module or figure is not None:
-            recording.check(loaded)
-            found = _broken_down(loaded, recording, options, listener)
-            trace = dataclasses.replace(trace, modules_us=found.modules_us)
-            operators = found.operators_us
-        energy = _energy(source, said, recording, options, listener)
+            placed = assign(loaded, load_map(options.module_map, loaded))
+            parts = break_down(
+                loaded, placed.module_of, recording, warm_up=WARM_UP,
+                runs=options.samples or len(recording), threads=threads,
+                provider=provider, on_run=listener.counting("by module", "inferences"),
+            )  # fmt: skip
+            trace = dataclasses.replace(trace, modules_us=parts.modules_us)
+            operators = parts.operators_us
+        energy, windows = None, listener.counting("energy", "windows")
+        if options.energy is not None:
+            energy = measure_energy(
+                {source.name: source}, recording, options.energy, threads=threads,
+                provider=provider, said=said,
+                on_window=lambda done, total, name: windows(done, total),
+            )[source.name]  # fmt: skip
         # files are written all or none
         with drafts.all_or_none():
             if figure is not None:
@@ -143,89 +206,67 @@ def profile(
         energy=energy,
         energy_output=joules,
         budget_ms=options.budget_ms,
-        slow_here=slow_here(loaded, options.provider),
+        slow_here=slow_here(loaded, provider),
     )
 
 
-def _energy_path(options: ProfileOptions, trace: Path | None) -> Path | None:
-    if options.energy is None or trace is None:
-        return None
-    return trace.with_suffix(".energy.json")
+def import_profile(
+    model: str | Path,
+    files: Sequence[str | Path],
+    output: str | Path | None = None,
+    *,
+    budget_ms: float = BUDGET_MS,
+    force: bool = False,
+) -> ProfileResult:
+    """Read what other tools measured; nothing is run.
 
+    `files` are times and profile of trtexec, the log of tegrastats, traces, or folders
+    of them. `output` is a trace of this very model file, which ``evaluate`` can charge.
 
-def _energy(
-    source: Path,
-    said: Mapping[str, str],
-    recording: CalibrationSet,
-    options: ProfileOptions,
-    listener: Listener,
-) -> EnergyResult | None:
-    if options.energy is None:
-        return None
-    found = measure_energy(
-        {source.name: source},
-        recording,
-        options.energy,
-        options.schedule,
-        threads=options.threads,
-        provider=options.provider,
-        said=said,
-        on_window=lambda done, total, name: listener.on_progress(
-            "energy", done, total, "windows"
-        ),
-    )
-    return found[source.name]
-
-
-def _figure_path(named: str | Path) -> Path:
-    """Return the file of a figure, if its kind is known and matplotlib is installed."""
-    path = Path(named)
-    if path.suffix not in KINDS:
-        raise EvaluationError(f"{path}: a figure ends in {', '.join(KINDS)}")
-    if util.find_spec("matplotlib") is None:
-        raise MissingExtraError("matplotlib", "highway")
-    return path
-
-
-def _broken_down(
-    loaded: ir.Model,
-    recording: CalibrationSet,
-    options: ProfileOptions,
-    listener: Listener,
-) -> Breakdown:
-    placed = assign(loaded, load_map(options.module_map, loaded))
-    return break_down(
-        loaded,
-        placed.module_of,
-        recording,
-        runs=len(recording) if options.samples is None else options.samples,
-        warm_up=options.warm_up,
-        threads=options.threads,
-        provider=options.provider,
-        on_run=lambda done, total: listener.on_progress(
-            "by module", done, total, "inferences"
-        ),
+    Raises:
+        GraphError: The model does not exist, or the output would harm an input.
+        EvaluationError: A file is missing or malformed, or none has a latency.
+    """
+    check_budget(budget_ms)
+    if not files:
+        raise EvaluationError("--import: there is no file")
+    source, written = model_path(model), None if output is None else Path(output)
+    # a folder stands for all of its files
+    read = list[Path]()
+    for path in map(Path, files):
+        inside = [path]
+        if path.is_dir():
+            inside = [each for each in sorted(path.iterdir()) if each.is_file()]
+        if not inside:
+            raise EvaluationError(f"{path}: there is no file in it")
+        read += inside
+    with writing([written], (source, *read), force=force):
+        found = read_imports(read)
+        # the trace belongs to the very file that was measured
+        machine = found.machine or " and ".join(found.sources)
+        trace = LatencyTrace(graph.sha256_of(source), machine, found.samples_us)
+        if written is not None:
+            trace.save(written)
+    return ProfileResult(
+        source,
+        trace,
+        written,
+        operators_us=found.layers_us,
+        budget_ms=budget_ms,
+        told=found.power,
     )
 
 
-def _measured(
-    source: Path,
-    said: Mapping[str, str],
-    recording: CalibrationSet,
-    options: ProfileOptions,
-    listener: Listener,
-) -> LatencyTrace:
-    with OthersLoad() as others:
-        trace = measure(
-            source,
-            recording,
-            samples=options.samples,
-            warm_up=options.warm_up,
-            threads=options.threads,
-            provider=options.provider,
-            said=said,
-            on_sample=lambda done, total: listener.on_progress(
-                "profile", done, total, "inferences"
-            ),
-        )
-    return dataclasses.replace(trace, others=others.load)
+def refuse_both(frames: Path | None, options: ProfileOptions) -> None:
+    """Refuse options that measure where latencies are imported."""
+    asked = {
+        "FRAMES": frames,
+        "--samples": options.samples,
+        "--by-module": options.by_module,
+        "--figure": options.figure,
+        "--energy": options.energy,
+        "--adapter": options.adapter,
+    }
+    for name, value in asked.items():
+        if value not in (None, False):
+            raise EvaluationError(f"--import runs nothing: leave {name} out")

@@ -1,44 +1,14 @@
-"""Results of workflows: what is said of them, and the document of `--json`."""
+"""Results of workflows, the document of `--json`, and who is told of progress."""
 
-import abc
 import dataclasses
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import field
 from pathlib import Path
 from typing import Literal
 
-from me2e_compress.display import (
-    AT_LEAST,
-    Cell,
-    Table,
-    counted,
-    duration,
-    giga,
-    megabytes,
-    not_measured,
-    number,
-    significant,
-    table,
-)
-
-__all__ = [
-    "AT_LEAST",
-    "SCHEMA",
-    "Cell",
-    "Result",
-    "Status",
-    "Table",
-    "counted",
-    "duration",
-    "giga",
-    "megabytes",
-    "not_measured",
-    "number",
-    "plain",
-    "significant",
-    "table",
-]
-
+from me2e_compress.display import Table
+from me2e_compress.errors import Me2eError
 
 SCHEMA = 3
 """Version of the documents that ``--json`` prints; docs/json.md tells their keys. It
@@ -47,38 +17,71 @@ grows where a key goes or changes its meaning, not where one is added."""
 Status = Literal["ok", "warning", "refused"]
 
 
-class Result(abc.ABC):
-    """The result of a workflow."""
+@dataclasses.dataclass(frozen=True)
+class Shown:
+    """What is printed of a result: tables, then lines, then alerts in bold.
+
+    Attributes:
+        headline: what it is, in one line.
+        lines: None are the headline alone; empty where a table says everything.
+        alerts: what must not be overlooked.
+        error: why the command ends with 1 though it has a result.
+    """
+
+    headline: str
+    tables: Iterable[Table] = ()
+    lines: Iterable[str] | None = None
+    alerts: Iterable[str] = ()
+    error: Me2eError | None = None
+
+
+class Result:
+    """The result of a workflow: its data, and by `shown` what is printed of them.
+
+    One of a single line gives its `headline` alone.
+    """
+
+    def shown(self) -> Shown:
+        """Return what is printed."""
+        return Shown(self.headline)
 
     @property
-    @abc.abstractmethod
     def headline(self) -> str:
         """What it is, in one line."""
+        return self.shown().headline
 
     def __repr__(self) -> str:
         """Show the class and the one line."""
         return f"<{type(self).__name__}: {self.headline}>"
 
     def tables(self) -> tuple[Table, ...]:
-        """Return no table where the lines say everything."""
-        return ()
+        """Return what is printed first."""
+        return tuple(self.shown().tables)
 
     def lines(self) -> tuple[str, ...]:
         """Return what is said below the tables."""
-        return (self.headline,)
+        lines = self.shown().lines
+        return (self.headline,) if lines is None else tuple(lines)
 
     def alerts(self) -> tuple[str, ...]:
         """Return what must not be overlooked: said last, in bold."""
-        return ()
+        return tuple(self.shown().alerts)
 
-    def to_json(self) -> object:
-        """Return everything, as JSON data: by default what the fields hold."""
-        return plain(self)
+    def check(self) -> None:
+        """Raise the error of what is refused."""
+        if (error := self.shown().error) is not None:
+            raise error
 
     @property
     def status(self) -> Status:
         """What a program acts on: ``refused`` where the command's exit code is 1."""
+        if self.shown().error is not None:
+            return "refused"
         return "warning" if self.alerts() else "ok"
+
+    def to_json(self) -> object:
+        """Return everything, as JSON data: by default what the fields hold."""
+        return plain(self)
 
     def document(self) -> dict[str, object]:
         """Return the ``--json`` document: version, status, the lines said, everything.
@@ -86,11 +89,11 @@ class Result(abc.ABC):
         Dataclasses and paths become objects and strings, numbers that are not finite
         null.
         """
-        found = plain(self.to_json())
-        if not isinstance(found, Mapping):
+        content = plain(self.to_json())
+        if not isinstance(content, Mapping):
             raise TypeError(f"{type(self).__name__}.to_json: not an object")
         said = [*(self.lines() or (self.headline,)), *self.alerts()]
-        return {"schema": SCHEMA, "status": self.status, "verdict": said, **found}
+        return {"schema": SCHEMA, "status": self.status, "verdict": said, **content}
 
 
 def plain(value: object) -> object:
@@ -104,3 +107,31 @@ def plain(value: object) -> object:
     if isinstance(value, float):
         return float(value) if math.isfinite(value) else None
     return str(value) if isinstance(value, Path) else value
+
+
+Progress = Callable[[str, int, int, str], None]
+Warn = Callable[[str], None]
+
+
+@dataclasses.dataclass(frozen=True)
+class Listener:
+    """Functions that are called while a workflow runs; neither changes its result.
+
+    Attributes:
+        on_progress: gets the stage, things done, things in all, and words.
+        on_warning: gets one line per surprise.
+    """
+
+    on_progress: Progress = field(default_factory=lambda: _silent, repr=False)
+    on_warning: Warn = field(default_factory=lambda: _silent, repr=False)
+
+    def counting(self, stage: str, words: str = "") -> Callable[[int, int], None]:
+        """Return a function of things done, and in all, that reports a stage."""
+        return lambda done, total: self.on_progress(stage, done, total, words)
+
+
+def _silent(*words: object) -> None:
+    """Say nothing."""
+
+
+SILENT = Listener()

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from pydantic import TypeAdapter
 
+from me2e_compress.display import Table, counted, table
 from me2e_compress.errors import EvaluationError
 from me2e_compress.extras import need_extra
 from me2e_compress.registry import documents
@@ -17,16 +18,15 @@ from me2e_compress.runtime.atomic import write_document
 from me2e_compress.simulator.routes import (
     ROAD_VERSION,
     SCENARIO_ABILITIES,
-    VARIANTS,
     load_routes,
     pick_routes,
     save_routes,
 )
+from me2e_compress.simulator.scenarios import VARIANTS
 from me2e_compress.version import __version__
-from me2e_compress.workflows.checks import check_count
-from me2e_compress.workflows.claims import writing
-from me2e_compress.workflows.listener import SILENT, Listener
-from me2e_compress.workflows.result import Result, Status, Table, counted, table
+from me2e_compress.workflows.checks import writing
+from me2e_compress.workflows.options import check_count
+from me2e_compress.workflows.result import SILENT, Listener, Result, Status
 
 if TYPE_CHECKING:  # they take highway-env, an extra and a second to import
     from me2e_compress.evaluators.highway.generate import Admission, ScenarioRoutes

@@ -1,33 +1,201 @@
-"""Score existing results, of one folder or of several."""
+"""Score existing results, of one folder or of several, of real runs too."""
 
 import dataclasses
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
+from me2e_compress.display import Table, not_measured, number, table
 from me2e_compress.errors import EvaluationError
+from me2e_compress.evaluators.bench2drive.real_results import (
+    Bench2DriveResults,
+    CollectedResults,
+)
 from me2e_compress.evaluators.bench2drive.result_files import holds_records
 from me2e_compress.evaluators.highway.results import MANIFEST, ResultsFolder
+from me2e_compress.metrics import BUDGET_MS
 from me2e_compress.metrics import scores as metrics
-from me2e_compress.metrics.deadlines import BUDGET_MS, Deadlines, charged
+from me2e_compress.metrics.deadlines import Deadlines, charged, deadlines_table
 from me2e_compress.metrics.episode import Episode
-from me2e_compress.metrics.measure import Estimate
+from me2e_compress.metrics.measure import Estimate, Measure
 from me2e_compress.metrics.route_scores import stood_most
-from me2e_compress.metrics.scores import Scores
-from me2e_compress.workflows.deadlines_table import check_budget, deadlines_table
-from me2e_compress.workflows.listener import SILENT, Listener
-from me2e_compress.workflows.result import Result, Table, not_measured, number, table
-from me2e_compress.workflows.score_bench2drive import (
-    STANDING,
-    RealRun,
-    score_real_run,
-    some_of,
+from me2e_compress.metrics.scores import (
+    LeaderboardScores,
+    Quotients,
+    Scores,
+    leaderboard_scores,
 )
+from me2e_compress.workflows.options import EerOptions, check_budget
+from me2e_compress.workflows.result import SILENT, Listener, Result, Shown
 from me2e_compress.workflows.score_eer import (
-    EerOptions,
     EerScores,
     estimate_cells,
     score_eer,
 )
+
+STANDING = "the ego stood most of the time, which is comfortable: see comfort in motion"
+_NAMED = 5
+_TOLERANCE = 1e-6
+
+
+@dataclasses.dataclass(frozen=True)
+class RealRun:
+    """A real run, scored.
+
+    Attributes:
+        scores: scores as of any other run, with Bench2Drive's rules of abilities.
+        leaderboard: scores as the leaderboard and Bench2Drive's tools compute them.
+        stood: routes on which the ego stood most of its time.
+    """
+
+    collected: CollectedResults
+    scores: Scores
+    leaderboard: LeaderboardScores
+    stood: tuple[str, ...]
+
+    def tables(self, name: str) -> tuple[Table, ...]:
+        """Return the records found, and the scores as given and as computed."""
+        return (self._counts(name), self._quotients())
+
+    def alerts(self, name: str) -> Iterator[str]:
+        """Yield warnings, one line each."""
+        found = self.collected
+        if found.route_set is None:
+            yield f"{name}: its routes are of no set of Bench2Drive that is known"
+        # routes that do not count as they should
+        for what, routes in (
+            (f"of another set than {found.route_set}", found.foreign),
+            (
+                "driven more than once with different results, of which the lowest "
+                "driving score counts",
+                found.contradictory,
+            ),
+            (STANDING, self.stood),
+        ):
+            if routes:
+                yield f"{name}: {what}: {some_of(routes)}"
+        # damaged files, then statements that contradict the records
+        for where, reason in list(found.broken.items())[:_NAMED]:
+            yield f"{where}: {reason}: left out"
+        if len(found.broken) > _NAMED:
+            yield f"{name}: broken and left out, too: {len(found.broken) - _NAMED}"
+        yield from self._stated()
+        if found.off_rate:
+            route, interval_s = next(iter(found.off_rate.items()))
+            yield (
+                f"{name}: not recorded at 20 Hz, so that comfort does not compare with "
+                f"others': {len(found.off_rate)} of {len(found.episodes)}, {route} at "
+                f"{1 / interval_s:.3g} Hz"
+            )
+        yield from found.notes[:_NAMED]
+
+    def to_json(self) -> dict[str, object]:
+        """Return scores, quotients, and every route that was named."""
+        found = self.collected
+        return {
+            **self.scores.to_json(),
+            "leaderboard": {
+                "route_set": found.route_set,
+                "set_size": self.leaderboard.set_size,
+                **self.leaderboard.to_json(),
+            },
+            "records": {
+                "evaluated": len(found.episodes),
+                **{name: list(each) for name, each in self._named().items()},
+                "unfinished": [str(path) for path in found.unfinished],
+                "broken": dict(found.broken),
+                "intervals_s": dict(found.off_rate),
+            },
+        }
+
+    def _named(self) -> dict[str, tuple[str, ...]]:
+        names = (
+            *("crashed", "missing", "foreign", "repeated", "rerun"),
+            *("contradictory", "unrecorded"),
+        )
+        return {n: getattr(self.collected, n) for n in names} | {"stood": self.stood}
+
+    def _stated(self) -> Iterator[str]:
+        """Yield where merged files contradict their own records."""
+        for path, file in self.collected.stated.items():
+            episodes = [each.episode for each in file.records]
+            again = leaderboard_scores(episodes)
+            rate = again.success_rate.over_set.value
+            found = {
+                "driving score": again.given_score.over_set.value,
+                "success rate": None if rate is None else rate / 100.0,
+                "eval num": float(len(episodes)),
+            }
+            for key, said in file.stated.items():
+                value = found[key]
+                if value is None or not math.isclose(said, value, abs_tol=_TOLERANCE):
+                    yield (
+                        f"{path}: it says {key} {said:g}, its records say "
+                        f"{number(value, 'g')}"
+                    )
+
+    def _counts(self, name: str) -> Table:
+        found = self.collected
+        rows = [
+            ("evaluated", "", str(len(found.episodes))),
+            *((key, some_of(of), str(len(of))) for key, of in self._named().items()),
+            ("unfinished files", "", str(len(found.unfinished))),
+            ("broken", some_of(tuple(found.broken)), str(len(found.broken))),
+        ]
+        route_set = found.route_set or "of no known set"
+        title = f"{name}: real runs, Bench2Drive's routes {route_set}"
+        return table(title, ("records", "which", "n"), rows, words=2)
+
+    def _quotients(self) -> Table:
+        """Show given and computed figures, each over the set and over the records."""
+        of = self.leaderboard
+        none = Measure(None, "", "not so")
+        nothing = Quotients(none, none)
+        # not every figure is both given by the simulator and computed here
+        lines = [
+            ("driving score", of.given_score, of.score, "%"),
+            ("success rate", nothing, of.success_rate, "%"),
+            ("route completion", of.given_completion, nothing, "%"),
+            ("infraction penalty", of.given_penalty, of.penalty, "ratio"),
+        ]
+        # each figure is shown over the whole set, and over what was driven
+        rows = [
+            (label, over, _shown(given, over), _shown(computed, over), str(n), unit)
+            for label, given, computed, unit in lines
+            for over, n in (("set", of.set_size), ("driven", of.driven))
+            if unit == "%" or over == "driven"  # a missing route has no penalty
+        ]
+        columns = ("score", "over", "given", "computed", "n", "unit")
+        title = "given by the simulator, and computed with Bench2Drive's penalties"
+        return table(title, columns, rows, words=2)
+
+
+def score_real_run(path: Path, metric_folder: Path | None = None) -> RealRun:
+    """Read and score the results of a real run.
+
+    `metric_folder` holds recordings (``metric_info.json``) that do not lie below that
+    of the results.
+    """
+    collected = Bench2DriveResults(path, metric_folder).collect()
+    episodes = collected.episodes
+    set_size = metrics.FULL_SET * collected.repetitions
+    return RealRun(
+        collected,
+        metrics.score(episodes, set_size),
+        leaderboard_scores(episodes, set_size),
+        stood_most(episodes),
+    )
+
+
+def _shown(quotients: Quotients, over: str) -> str:
+    measure = quotients.over_set if over == "set" else quotients.over_driven
+    return number(measure.value, ".4f")
+
+
+def some_of(names: Sequence[str]) -> str:
+    """Return the first few of many names."""
+    more = f" and {len(names) - _NAMED} more" if len(names) > _NAMED else ""
+    return ", ".join(names[:_NAMED]) + more
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
@@ -46,35 +214,31 @@ class ScoreResult(Result):
     eer: EerScores | None = None
     late: Mapping[str, Deadlines] = dataclasses.field(default_factory=dict)
 
-    @property
-    def headline(self) -> str:
-        """The driving scores, and the room kept to others."""
-        return "; ".join(
+    def shown(self) -> Shown:
+        """Return a table a folder, records of real runs, EER_AV and its order.
+
+        Alerts are failures that ended routes, and wrong records of real runs.
+        """
+        tables, alerts = list[Table](), list[str]()
+        for name, scores in self.scores.items():
+            if name in self.real:
+                tables += self.real[name].tables(name)
+            tables.append(scores_table(name, scores))
+            if name in self.late:
+                tables.append(deadlines_table(name, self.late[name]))
+            if scores.failed:
+                alerts.append(f"{name}: {scores.failed}")
+        headline = "; ".join(
             f"{name}: {driving_score(scores)}" for name, scores in self.scores.items()
         )
-
-    def lines(self) -> tuple[str, ...]:
-        """Return whether the order by EER_AV depends on how it is normalized."""
-        return () if self.eer is None else self.eer.lines()
-
-    def tables(self) -> tuple[Table, ...]:
-        """Return one table per folder, the records of real runs, and EER_AV."""
-        found = [
-            each
-            for name, scores in self.scores.items()
-            for each in self._of(name, scores)
-        ]
-        return (*found, *(() if self.eer is None else self.eer.tables()))
-
-    def alerts(self) -> tuple[str, ...]:
-        """Return failures that ended routes, and wrong records of real runs."""
-        failed = [
-            f"{name}: {each.failed}"
-            for name, each in self.scores.items()
-            if each.failed
-        ]
         real = [line for name, each in self.real.items() for line in each.alerts(name)]
-        return (*failed, *real)
+        eer = self.eer
+        return Shown(
+            headline,
+            (*tables, *(() if eer is None else eer.tables())),
+            () if eer is None else eer.lines(),
+            (*alerts, *real),
+        )
 
     def to_json(self) -> object:
         """Return the scores of every folder, and EER_AV of all together."""
@@ -90,17 +254,6 @@ class ScoreResult(Result):
             "folders": found,
             "eer": None if self.eer is None else self.eer.to_json(),
         }
-
-    def _of(self, name: str, scores: Scores) -> tuple[Table, ...]:
-        late = [deadlines_table(name, self.late[name])] if name in self.late else []
-        if name not in self.real:
-            return (scores_table(name, scores), *late)
-        real = self.real[name]
-        return (
-            *real.tables(name),
-            scores_table(name, scores),
-            *late,
-        )
 
 
 def score(

@@ -3,13 +3,24 @@
 import dataclasses
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
 
+from pydantic import ConfigDict, Field, TypeAdapter, with_config
+
+from me2e_compress.display import (
+    Table,
+    counted,
+    not_measured,
+    number,
+    significant,
+    table,
+)
 from me2e_compress.errors import EvaluationError
 from me2e_compress.metrics.eer import (
     MEASURES,
     EerResult,
     EerScale,
+    Normalization,
     RouteMeasures,
     eer,
     rankings,
@@ -18,44 +29,73 @@ from me2e_compress.metrics.eer import (
 from me2e_compress.metrics.episode import Episode
 from me2e_compress.metrics.measure import Estimate
 from me2e_compress.metrics.route_summary import RouteSummary
+from me2e_compress.registry import documents, drafts
+from me2e_compress.runtime.atomic import write_json
 from me2e_compress.runtime.energy import EnergyResult
-from me2e_compress.workflows.eer_weights import SavedWeights, save_weights
-from me2e_compress.workflows.result import (
-    Table,
-    counted,
-    not_measured,
-    number,
-    significant,
-    table,
-)
+from me2e_compress.workflows.options import EerOptions, Joules
+
+_STRICT = ConfigDict(allow_inf_nan=False, extra="forbid")
+_Four = Annotated[dict[str, float], Field(min_length=4, max_length=4)]
+
+
+@with_config(_STRICT)
+@dataclasses.dataclass(frozen=True)
+class SavedWeights:
+    """A scale by the names of the measures; its joules are measured."""
+
+    energy: Literal["measured"]
+    normalization: Normalization
+    weights: _Four
+    offset: _Four
+    span: _Four
+
+    @classmethod
+    def of(cls, scale: EerScale) -> "SavedWeights":
+        """Build the saved form of a scale."""
+        columns = (scale.weights, scale.offset, scale.span)
+        named = [dict(zip(MEASURES, each, strict=True)) for each in columns]
+        return cls("measured", scale.normalization, *named)
+
+    @classmethod
+    def load(cls, path: Path) -> "SavedWeights":
+        """Read a file that `save` wrote."""
+        with documents.reading(path, EvaluationError, "no file of weights"):
+            found = _FILE.validate_python(documents.from_json(documents.content(path)))
+        # the form alone does not say which names there must be, or their signs
+        for column in (found.weights, found.offset, found.span):
+            if set(column) != set(MEASURES):
+                names = ", ".join(MEASURES)
+                raise EvaluationError(f"{path}: it must name {names}")
+        if min(found.span.values()) <= 0.0 or min(found.weights.values()) < 0.0:
+            raise EvaluationError(f"{path}: a span or a weight is not positive")
+        return found
+
+    def scale(self) -> EerScale:
+        """Return the scale as `metrics.eer` takes it."""
+        weights, offset, span = (
+            (each[MEASURES[0]], each[MEASURES[1]], each[MEASURES[2]], each[MEASURES[3]])
+            for each in (self.weights, self.offset, self.span)
+        )
+        return EerScale(self.normalization, weights, offset, span)
+
+
+def save_weights(path: Path, result: EerResult) -> None:
+    """Write the scale that a result was made by."""
+    if result.scale is None:
+        reason = next(iter(result.scores.values())).measure.reason
+        raise EvaluationError(f"{path}: there are no weights to save: {reason}")
+    saved = SavedWeights.of(result.scale)
+    with drafts.written(path, EvaluationError):
+        write_json(path, dataclasses.asdict(saved), indent=1)
+
+
+_FILE = TypeAdapter(SavedWeights)
+
 
 UNITS = ("%", "%", "ratio", "J")
 
 UNPAIRED = "a drive in each"
 """Why a route is left out, listed beside the measures that may be missing."""
-
-Joules = Mapping[str, str | Path | float]
-
-
-@dataclasses.dataclass(frozen=True)
-class EerOptions:
-    """The inputs of EER_AV besides the episodes.
-
-    Attributes:
-        energy: measured joules of one inference, by folder: a number, or a file that
-            ``profile --energy`` wrote. A folder's last part is enough as its name.
-        weights: file of weights and scales that an earlier call saved.
-        save_weights: where to write those of this call.
-    """
-
-    energy: Joules = dataclasses.field(default_factory=dict)
-    weights: str | Path | None = None
-    save_weights: str | Path | None = None
-
-    @property
-    def asked(self) -> bool:
-        """Whether there is anything to do."""
-        return bool(self.energy or self.weights or self.save_weights)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -134,7 +174,8 @@ def score_eer(
         scale = SavedWeights.load(Path(options.weights)).scale()
     paired, others = paired_drives(folders)
     variants = _variants(paired, options.energy)
-    found = eer(variants, scale, types=_types(paired))
+    types = [episode.scenario for episode in next(iter(paired.values()), ())]
+    found = eer(variants, scale, types=types)
     if others:
         left_out = {UNPAIRED: others, **found.left_out}
         found = dataclasses.replace(found, left_out=left_out)
@@ -173,54 +214,30 @@ def paired_drives(
     return paired, len(every) - len(shared)
 
 
-def joules_named(words: Sequence[str]) -> dict[str, str | float]:
-    """Parse ``NAME=JOULES`` or ``NAME=FILE``, as the command takes them."""
-    found = dict[str, str | float]()
-    for word in words:
-        name, equals, value = word.rpartition("=")
-        if not (name and equals and value):
-            raise EvaluationError(f"energy {word!r}: write NAME=JOULES or NAME=FILE")
-        if name in found:
-            raise EvaluationError(f"energy of {name} is given twice")
-        try:
-            found[name] = float(value)
-        except ValueError:
-            found[name] = value
-    return found
-
-
 def _variants(
     folders: Mapping[str, Sequence[Episode]], joules: Joules
 ) -> dict[str, RouteMeasures]:
-    named = {
-        _folder(name, folders): _joules(name, each) for name, each in joules.items()
-    }
+    """Measure every folder's routes; joules are a number, or of a file."""
+    measured = dict[str, float | None]()
+    for name, given in joules.items():
+        fitting = [each for each in folders if name in (each, Path(each).name)]
+        if len(fitting) != 1:
+            raise EvaluationError(
+                f"energy of {name}: {counted(len(fitting), 'folder')} of that name;"
+                f" there are {', '.join(folders)}"
+            )
+        if isinstance(given, (str, Path)):
+            measured[fitting[0]] = EnergyResult.load(Path(given)).j_per_frame
+        elif 0.0 <= given < float("inf"):
+            measured[fitting[0]] = given
+        else:
+            raise EvaluationError(
+                f"energy of {name}: {given} is not a number of joules"
+            )
     return {
-        name: route_measures(list(map(RouteSummary.of, episodes)), named.get(name))
+        name: route_measures(list(map(RouteSummary.of, episodes)), measured.get(name))
         for name, episodes in folders.items()
     }
-
-
-def _folder(name: str, folders: Mapping[str, Sequence[Episode]]) -> str:
-    fitting = [each for each in folders if name in (each, Path(each).name)]
-    if len(fitting) != 1:
-        raise EvaluationError(
-            f"energy of {name}: {counted(len(fitting), 'folder')} of that name; there"
-            f" are {', '.join(folders)}"
-        )
-    return fitting[0]
-
-
-def _joules(name: str, given: str | Path | float) -> float | None:
-    if isinstance(given, (str, Path)):
-        return EnergyResult.load(Path(given)).j_per_frame
-    if not 0.0 <= given < float("inf"):
-        raise EvaluationError(f"energy of {name}: {given} is not a number of joules")
-    return given
-
-
-def _types(folders: Mapping[str, Sequence[Episode]]) -> list[str]:
-    return [episode.scenario for episode in next(iter(folders.values()), ())]
 
 
 def estimate_cells(estimate: Estimate, form: str) -> tuple[str, str, str, str]:

@@ -1,6 +1,7 @@
-"""Find the modules whose int8 meets budgets and costs the plan least."""
+"""Int8 by trials: what each module costs, and what meets budgets at least loss."""
 
 import dataclasses
+from contextlib import AbstractContextManager
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -9,40 +10,116 @@ from timeit import repeat
 import onnx_ir as ir
 
 from me2e_compress import graph
-from me2e_compress.errors import RecipeError
-from me2e_compress.fidelity.sensitivity import Budget, Candidate, Int8Choice, Trials
+from me2e_compress.calibration.calibrator import Calibrator
+from me2e_compress.calibration.dataset import CalibrationSet
+from me2e_compress.calibration.ranges import Ranges
+from me2e_compress.calibration.sample import draw
+from me2e_compress.display import counted, megabytes, significant, table
+from me2e_compress.errors import EnergyError, RecipeError
+from me2e_compress.fidelity.sensitivity import (
+    Budget,
+    Candidate,
+    Int8Choice,
+    Score,
+    Sensitivity,
+    Trials,
+    advise,
+    analyse,
+    write_recipe,
+)
 from me2e_compress.fidelity.sensitivity import search as find
+from me2e_compress.manager import recipe
+from me2e_compress.quantization.rules import DEFAULT_RULES, RULE_SETS
+from me2e_compress.quantization.scheme import QuantScheme
+from me2e_compress.runtime.energy.energy_counter import EnergySchedule, open_counter
+from me2e_compress.runtime.energy.energy_result import FEWEST_WINDOWS, Absent, Reader
+from me2e_compress.runtime.energy.meter import measure_energy
 from me2e_compress.runtime.session import Session, replay
-from me2e_compress.targets import DEFAULT_TARGET
-from me2e_compress.workflows.budgets import check_budgets, joules_of, need_counter
-from me2e_compress.workflows.checks import model_path
-from me2e_compress.workflows.int8_trials import TrialFiles, TrialOptions
-from me2e_compress.workflows.listener import SILENT, Listener
-from me2e_compress.workflows.result import Result, Table, significant, table
+from me2e_compress.targets import DEFAULT_TARGET, TARGETS
+from me2e_compress.workflows.checks import (
+    load_map,
+    model_path,
+    opened,
+    output_path,
+    writing,
+)
+from me2e_compress.workflows.options import (
+    SearchOptions,
+    SensitivityOptions,
+    TrialOptions,
+)
+from me2e_compress.workflows.plan import PreparedGraph
+from me2e_compress.workflows.result import SILENT, Listener, Result, Shown
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class SearchOptions(TrialOptions):
-    """How int8 is judged, and the budgets: one or more.
+@dataclasses.dataclass(frozen=True)
+class TrialFiles:
+    """Where trials read and write: float model, folder of frames, and the recipe."""
 
-    Attributes:
-        max_mb: most MB of weights.
-        max_ms: most milliseconds per frame, on all cores of this CPU, so for its target
-            alone.
-        max_joules: most joules per frame, as a counter measures them.
-    """
+    model: Path
+    frames: Path
+    output: Path
 
-    max_mb: float | None = None
-    max_ms: float | None = None
-    max_joules: float | None = None
+    def claimed(self, options: TrialOptions) -> AbstractContextManager[None]:
+        """Claim the recipe and its overrides while they are made."""
+        output = output_path(self.output)
+        named = (options.ranges, options.module_map, options.adapter)
+        read = (self.model, self.frames, *named)
+        overrides = output.with_name(output.stem + ".overrides.toml")
+        return writing([output, overrides], read, force=options.force)
 
-    def __post_init__(self) -> None:
-        check_budgets(self.max_mb, self.max_ms, self.max_joules)
-        if self.max_ms is not None and self.target != DEFAULT_TARGET:
-            raise RecipeError(
-                f"--max-ms is measured on this CPU, where int8 for {self.target} is"
-                f" slow: use --target {DEFAULT_TARGET}"
-            )
+    def trials(
+        self, options: TrialOptions, listener: Listener
+    ) -> tuple[Trials, tuple[str, ...]]:
+        """Prepare the graph, calibrate once, and name the modules to try."""
+        # check names and frames before anything is run
+        rules = RULE_SETS.parse(options.rules or DEFAULT_RULES)
+        place = TARGETS.parse(options.target or DEFAULT_TARGET)
+        recording = CalibrationSet(self.frames)
+        loaded, _ = opened(self.model, recording, options, listener)
+        modules = load_map(options.module_map, loaded)
+        scheme = QuantScheme.named(options.scheme or "full", modules)
+        # the graph is prepared once; every trial starts from there
+        ready = PreparedGraph.of(self.model, loaded, options.module_map)
+        return Trials(
+            ready.model,
+            ready.modules,
+            rules,
+            place,
+            _ranges(ready, recording, options, listener),
+            draw(recording, options.count, 0),
+            provider=options.runs_on,
+        ), scheme.modules
+
+    def write(self, choice: Int8Choice, options: TrialOptions) -> str:
+        """Write the recipe, and return a line that says what it makes int8."""
+        before = [each.name for each in recipe.load("exact")]
+        rules = options.rules or DEFAULT_RULES
+        target = options.target or DEFAULT_TARGET
+        overrides = write_recipe(self.output, choice, before, rules, target)
+        listed = ", ".join(choice.modules) or "no module"
+        more = f", {len(choice.floats)} of their nodes in float" if overrides else ""
+        return f"{self.output}: int8 in {listed}{more}"
+
+
+def _ranges(
+    ready: PreparedGraph,
+    recording: CalibrationSet,
+    options: TrialOptions,
+    listener: Listener,
+) -> Ranges:
+    tensors = ready.tensors()
+    if options.ranges is not None:
+        ranges = Ranges.load(Path(options.ranges))
+        digest = graph.digest(ready.model)
+        ranges.check(
+            model=digest, tensors=tensors, method=ranges.method, named=options.ranges
+        )
+        return ranges
+    method = RULE_SETS.parse(options.rules or DEFAULT_RULES).method
+    return Calibrator(method, provider=options.runs_on).run(
+        ready.model, tensors, recording, listener.counting("calibrate")
+    )
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
@@ -54,13 +131,8 @@ class SearchResult(Result):
     limits: tuple[tuple[str, float], ...]
     written: str
 
-    @property
-    def headline(self) -> str:
-        """The recipe."""
-        return self.written
-
-    def tables(self) -> tuple[Table, ...]:
-        """Return what was tried, best first."""
+    def shown(self) -> Shown:
+        """Return the recipe, and what was tried, best first."""
         rows = [
             (
                 ", ".join(each.modules) or "none",
@@ -70,13 +142,12 @@ class SearchResult(Result):
             )
             for each in self.tried
         ]
-        units = [unit for unit, _ in self.limits]
         limits = " and ".join(
             f"{significant(limit, 6)} {unit}" for unit, limit in self.limits
         )
-        columns = ("int8", "loss", "predicted", *units)
-        note = f"budget: {limits}"
-        return (table("Tried, best first", columns, rows, note),)
+        columns = ("int8", "loss", "predicted", *(unit for unit, _ in self.limits))
+        tried = table("Tried, best first", columns, rows, f"budget: {limits}")
+        return Shown(self.written, [tried])
 
     def to_json(self) -> object:
         """Return the budgets, and what was tried."""
@@ -104,23 +175,25 @@ def search(
         PreconditionError: The graph is quantized already, or nothing can become int8.
         EvaluationError: Nothing fits; the message says what the least was.
     """
+    if options.max_ms is not None and options.target not in (None, DEFAULT_TARGET):
+        raise RecipeError(
+            f"--max-ms is measured on this CPU, where int8 for {options.target} is"
+            f" slow: use --target {DEFAULT_TARGET}"
+        )
     files = TrialFiles(model_path(model), Path(frames), Path(output))
     with files.claimed(options):
-        return _search(files, options, listener)
-
-
-def _search(
-    files: TrialFiles, options: SearchOptions, listener: Listener
-) -> SearchResult:
-    if options.max_joules is not None:
-        need_counter()
-    # calibrate once, then search variants of that one graph
-    trials, modules = files.trials(options, listener)
-    budgets = _budgets(options, trials)
-    report = partial(listener.on_progress, "modules")
-    tried = find(trials, modules, budgets, progress=report)
-    choice = Int8Choice(tried[-1].modules)
-    written = files.write(choice, options)
+        if options.max_joules is not None:
+            counter = open_counter()
+            if isinstance(counter, Absent):
+                raise EnergyError(f"--max-joules: {counter.reason}")
+            if isinstance(counter, Reader):
+                counter.close()
+        # calibrate once, then search variants of that one graph
+        trials, modules = files.trials(options, listener)
+        budgets = _budgets(options, trials)
+        report = partial(listener.on_progress, "modules")
+        tried = find(trials, modules, budgets, progress=report)
+        written = files.write(Int8Choice(tried[-1].modules), options)
     limits = tuple((each.unit, each.limit) for each in budgets)
     return SearchResult(files.output, tried, limits, written)
 
@@ -144,13 +217,19 @@ def _weight_bytes(made: ir.Model) -> float:
 
 
 def _joules(trials: Trials, made: ir.Model) -> float:
+    """Measure joules per frame over the fewest windows that give an interval."""
+    provider, frames = trials.reference.session.provider, trials.reference.frames
+    schedule = EnergySchedule(windows=FEWEST_WINDOWS)
     # energy is measured of a file
-    reference = trials.reference
     with TemporaryDirectory() as folder:
         file = Path(folder) / "int8.onnx"
         graph.save(made, file)
-        provider = reference.session.provider
-        return joules_of(file, reference.frames, provider)
+        energy = measure_energy(
+            {"model": file}, frames, schedule=schedule, threads=0, provider=provider
+        )["model"]
+    if energy.j_per_frame is None:
+        raise EnergyError(f"{file}: its joules are not known: {energy.reason}")
+    return energy.j_per_frame
 
 
 def _seconds(trials: Trials, made: ir.Model) -> float:
@@ -160,3 +239,83 @@ def _seconds(trials: Trials, made: ir.Model) -> float:
     first = next(iter(trials.reference.frames))
     times = repeat(lambda: list(replay(session, [first])), number=1, repeat=6)
     return min(times[1:])  # the first warms up
+
+
+@dataclasses.dataclass(frozen=True, repr=False)
+class SensitivityResult(Result):
+    """What int8 costs, and the recipe.
+
+    Attributes:
+        score: loss of the choice; None where nothing is int8.
+    """
+
+    output: Path
+    found: Sensitivity
+    choice: Int8Choice
+    score: Score | None
+    limit: float
+    written: str
+
+    def shown(self) -> Shown:
+        """Return what int8 costs by module, the nodes to blame, recipe and its loss."""
+        found, unit = self.found, self.found.together.unit
+        rows = [
+            (each.module, str(each.nodes), *_cells(each.score))
+            for each in found.findings
+        ]
+        rows.append(("together", "", *_cells(found.together)))
+        columns = ("module", "nodes", f"loss {unit}", "worst dB")
+        size = megabytes(found.together.weight_bytes)
+        note = f"{counted(found.trials, 'variant')} run; all together {size} MB"
+        lines = [
+            f"{each.module}: {node}: {significant(alone)} {unit} alone"
+            for each in found.findings
+            for node, alone in each.blamed
+        ]
+        lines.append(self.written)
+        if self.score is not None:
+            loss = f"{significant(self.score.loss)} {self.score.unit}"
+            lines.append(f"its loss: {loss}, limit {significant(self.limit)}")
+        modules = table("Int8 module by module", columns, rows, note)
+        return Shown(self.written, [modules], lines)
+
+    def to_json(self) -> object:
+        """Return what was found."""
+        return self.found
+
+
+def measure_sensitivity(
+    model: str | Path,
+    frames: str | Path,
+    output: str | Path,
+    options: SensitivityOptions | None = None,
+    listener: Listener = SILENT,
+) -> SensitivityResult:
+    """Measure what int8 costs module by module, and write a recipe within a limit.
+
+    The nodes of the worst module are halved to find those to blame. The model is a
+    float ONNX file or the name of one that ships; overrides lie beside the recipe where
+    nodes stay float.
+
+    Raises:
+        GraphError: The model does not exist, or an output would harm an input.
+        RecipeError: There is no such scheme, rule set or target.
+        FramesError: Frames or saved ranges do not fit.
+        PreconditionError: The graph is quantized already, or nothing can become int8.
+    """
+    options = options or SensitivityOptions()
+    files = TrialFiles(model_path(model), Path(frames), Path(output))
+    with files.claimed(options):
+        # calibrate once, try modules and nodes, then choose within the limit
+        trials, modules = files.trials(options, listener)
+        report, most = partial(listener.on_progress, "modules"), options.node_trials
+        found = analyse(trials, modules, node_trials=most, progress=report)
+        choice = advise(trials, found, options.limit)
+        written = files.write(choice, options)
+        score = trials.score(choice) if choice.modules else None
+    return SensitivityResult(files.output, found, choice, score, options.limit, written)
+
+
+def _cells(score: Score) -> tuple[str, str]:
+    worst = min(item.sqnr_db for item in score.fidelity.outputs)
+    return significant(score.loss), f"{worst:.1f}"

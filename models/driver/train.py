@@ -7,44 +7,34 @@ The same command again goes on where it was interrupted.
 """
 
 import sys
-from functools import partial
-from pathlib import Path
-from typing import Annotated
-
-import typer
 
 from me2e_compress.cli import AGAIN, run_in_order
-from me2e_compress.cli import arguments as given
+from me2e_compress.cli.app import build_app
+from me2e_compress.cli.commands import Output
 from me2e_compress.cli.console import listening, show
+from me2e_compress.errors import OptionError
 from me2e_compress.extras import need_extra
-
-Output = Annotated[
-    Path, typer.Option("-o", "--output", help="the folder; the same again resumes")
-]
-Small = Annotated[
-    bool, typer.Option("--small", help="every part, a minute, learns nothing")
-]
-
-Seed = Annotated[int, typer.Option(help="of the first weights, not of the routes")]
-Overlook = Annotated[
-    float | None,
-    typer.Option(
-        min=0.0,
-        max=1.0,
-        help="share of agents the planner is not told of: only occupancy shows them",
-    ),
-]
 
 
 def command(
+    *,
     output: Output,
-    workers: given.Workers = 4,
-    small: Small = False,
-    seed: Seed = 0,
-    overlook: Overlook = None,
-    json: given.Json = False,
+    workers: int = 4,
+    small: bool = False,
+    seed: int = 0,
+    overlook: float | None = None,
 ) -> None:
-    """Train the driver from nothing: collect, learn, drive, learn again (hours)."""
+    """Train the driver from nothing: collect, learn, drive, learn again (hours).
+
+    Args:
+        output: the folder; the same again resumes
+        workers: processes at a time
+        small: every part, a minute, learns nothing
+        seed: of the first weights, not of the routes
+        overlook: share of agents the planner is not told of: only occupancy shows them
+    """
+    if not 0.0 <= (overlook or 0.0) <= 1.0:
+        raise OptionError(f"--overlook is {overlook}: it must be from 0 to 1")
     need_extra("highway", "training")
     from models.driver.workflow import train  # takes torch seconds to import
 
@@ -62,9 +52,9 @@ def command(
 
 def main() -> int:
     """Run the command, with one line for an error, as ``me2e-compress`` does."""
-    app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
-    app.command()(command)
-    return run_in_order(partial(app, prog_name="python -m models.driver.train"), AGAIN)
+    app = build_app("python -m models.driver.train")
+    app.default(command)
+    return run_in_order(lambda: app.meta(sys.argv[1:]), AGAIN)
 
 
 if __name__ == "__main__":

@@ -18,7 +18,7 @@ from me2e_compress.simulator.routes import (
     load_routes,
     pick_routes,
 )
-from me2e_compress.workflows.listener import Listener
+from me2e_compress.workflows.result import Listener
 from me2e_compress.workflows.routes import RoutesOptions, make_routes
 from models.driver.curriculum import Trial
 from models.driver.episodes.collection import refuse_shipped

@@ -3,11 +3,11 @@
 import dataclasses
 from pathlib import Path
 
+from me2e_compress.display import Table, number, table
 from me2e_compress.metrics.measure import Estimate
-from me2e_compress.workflows.checks import check_count, check_folder
-from me2e_compress.workflows.claims import writing
-from me2e_compress.workflows.listener import SILENT, Listener
-from me2e_compress.workflows.result import Result, Table, number, table
+from me2e_compress.workflows.checks import check_folder, writing
+from me2e_compress.workflows.options import check_count
+from me2e_compress.workflows.result import SILENT, Listener, Result
 from models.driver.course import RoundResult, run
 from models.driver.curriculum import FULL, FULL_LATENCY, SMALL, SMALL_LATENCY
 

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from me2e_compress.errors import GraphError
-from me2e_compress.workflows.weights_record import named_weights
+from me2e_compress.workflows.inspect import named_weights
 from models.export import trace
 from models.published_names import PUBLISHED, NameMatch
 from models.published_weights import (

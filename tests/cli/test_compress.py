@@ -112,11 +112,11 @@ def test_what_cannot_be_run_is_written_on_demand_alone(
     said = cli.refused(line)
     assert "not proven that import-normalize, eliminate-redundant left" in said
     assert "no operator trt.plugins::Rotate (node '/occ_head/Rotate')" in said
-    assert said.endswith("nothing is written, --unproven writes it nevertheless")
-    (check,) = cli.document(f"{line} --unproven")["verifications"]
+    assert said.endswith("nothing is written; --verify-frames 0 writes it unproven")
+    (check,) = cli.document(f"{line} --verify-frames 0")["verifications"]
     assert kinds(tmp_path / "out.onnx") == ["Rotate", "Neg"]
     assert not check["proven"]
-    assert "trt.plugins::Rotate" in check["skipped"]
+    assert check["skipped"] == "no frame was asked for (--verify-frames 0)"
 
 
 def test_an_open_dimension_is_proven_at_drawn_sizes_unless_nobody_asks(

@@ -8,7 +8,7 @@ import pytest
 from me2e_compress import graph
 from me2e_compress.shipped import drivers as shipped
 from me2e_compress.study import demo
-from me2e_compress.workflows.module_changes import ModuleChanges
+from me2e_compress.workflows.inspect import ModuleChanges
 from tests.command import Cli
 from tests.stand_in import write_shipped
 from tests.study.conftest import Here

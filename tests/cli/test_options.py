@@ -1,18 +1,16 @@
 """One spelling for one option in all commands."""
 
-import importlib
 import re
-import types
 import typing
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from types import NoneType
+from typing import Any
 
 import pytest
-from typer.models import ArgumentInfo, OptionInfo
 
-from me2e_compress.cli.app import COMMANDS
+from me2e_compress.cli.app import COMMANDS, app
 
 OWN = {"--output": "the ", "stack": ""}
 """Names whose help is each command's own, and how it begins."""
@@ -32,30 +30,18 @@ class Parameter:
 
 
 def parameters() -> Iterator[Parameter]:
-    for name, entry in COMMANDS.items():
-        home = importlib.import_module(f"me2e_compress.cli.commands.{name}")
-        function = getattr(home, entry.function)
-        hints = typing.get_type_hints(function, include_extras=True)
-        for given, hint in hints.items():
-            if typing.get_origin(hint) is Annotated:
-                type_, info = typing.get_args(hint)
-                yield Parameter(name, spelling(given, info), plain(type_), info.help)
+    for name in COMMANDS:
+        for each in app[name].assemble_argument_collection(parse_docstring=True):
+            if each.parse and each.name != "*":
+                spelling = each.name if each.name.startswith("-") else each.name.lower()
+                help_text = each.parameter.help or ""
+                yield Parameter(name, spelling, plain(each.hint), help_text)
 
 
-def spelling(name: str, info: ArgumentInfo | OptionInfo) -> str:
-    if isinstance(info, ArgumentInfo):
-        return name
-    decls = (info.default, *(info.param_decls or ()))  # the first stands there
-    long = [each for each in decls if str(each).startswith("--")]
-    return str(long[0]) if long else "--" + name.replace("_", "-")
-
-
-def plain(type_: Any) -> object:
-    """Leave None out: whether an option may be absent is each command's own."""
-    if not isinstance(type_, types.UnionType):
-        return type_
-    (rest,) = (each for each in typing.get_args(type_) if each is not type(None))
-    return rest
+def plain(type_: Any) -> frozenset[object]:
+    """Leave None out, which is each command's own; a file is a text."""
+    leaves = typing.get_args(type_) or (type_,)
+    return frozenset(str if each is Path else each for each in leaves) - {NoneType}
 
 
 FOUND = list(parameters())
@@ -92,4 +78,3 @@ def test_what_a_command_writes_is_its_output() -> None:
     assert writers == set(COMMANDS) - {
         *("doctor", "list", "inspect", "lint", "compare", "ranges", "score"),
     }
-    assert not [each for each in FOUND if each.type is Path and each.name == "--out"]

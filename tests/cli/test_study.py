@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import me2e_compress.study.run
-from me2e_compress.cli.commands.study import study
+from me2e_compress.cli.driving import study
 from me2e_compress.errors import StudyError
 from me2e_compress.evaluators.highway import evaluator
 from me2e_compress.registry.drafts import IN_JSON
@@ -123,7 +123,7 @@ def test_a_model_that_ships_is_not_one_where_you_are(
 
     monkeypatch.setattr(me2e_compress.study.run, "run_study", noted)
     with pytest.raises(StudyError, match="seen"):
-        study(toml, tmp_path / "out")
+        study(toml, output=tmp_path / "out")
 
     assert asked[0].variants[0].policy == str(shipped("highway"))
 

@@ -1,6 +1,7 @@
 """What a terminal shows: version, quiet, verbose, completion, progress, 80 columns."""
 
 import re
+import subprocess
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -8,8 +9,14 @@ import pytest
 
 from me2e_compress.cli import console
 from me2e_compress.cli.app import COMMANDS
-from me2e_compress.cli.console import EVERY_S, ProgressLines, listening, print_table
-from me2e_compress.cli.verbosity import Verbosity, set_verbosity
+from me2e_compress.cli.console import (
+    EVERY_S,
+    ProgressLines,
+    Verbosity,
+    listening,
+    print_table,
+    set_verbosity,
+)
 from me2e_compress.display import Cell, Table, duration, table
 from me2e_compress.version import __version__
 from tests.command import Cli
@@ -27,21 +34,27 @@ def test_the_version(cli: Cli) -> None:
 
 def test_commands_stand_in_groups(cli: Cli) -> None:
     said = cli.done("--help").out
-    for panel in dict.fromkeys(entry.panel for entry in COMMANDS.values()):
+    for panel in COMMANDS.values():
         assert f"─ {panel} ─" in said
     assert re.findall(r"^│ (\w+) +\w", said, re.MULTILINE) == list(COMMANDS)
 
 
-@pytest.mark.parametrize("words", ["compress --sch", "compr"])
+@pytest.mark.parametrize(
+    ("words", "completed"), [("compress --sch", "--scheme"), ("compr", "compress")]
+)
 def test_the_shell_completes_commands_and_their_options(
-    cli: Cli, monkeypatch: pytest.MonkeyPatch, words: str
+    cli: Cli, words: str, completed: str
 ) -> None:
-    monkeypatch.setenv("_ME2E_COMPRESS_COMPLETE", "complete_bash")
-    monkeypatch.setenv("COMP_WORDS", f"me2e-compress {words}")
-    monkeypatch.setenv("COMP_CWORD", str(len(words.split())))
+    cli.done("--install-completion --shell bash --output complete.sh")
+    script = (
+        f"source complete.sh; COMP_WORDS=(me2e-compress {words});"
+        f" COMP_CWORD={len(words.split())}; _me2e_compress; echo ${{COMPREPLY[@]}}"
+    )
 
-    found = "--scheme" if "--" in words else "compress"
-    assert cli.done("").out.split() == [found]
+    done = subprocess.run(
+        ["bash", "-c", script], cwd=cli.folder, capture_output=True, text=True
+    )
+    assert done.stdout.split() == [completed]
 
 
 @pytest.mark.parametrize("words", ["-v {}", "{} --verbose"])
@@ -61,16 +74,12 @@ def test_quiet_leaves_results_and_errors(cli: Cli, files: Path) -> None:
     assert "none.onnx: no such file" in cli.refused("-q inspect none.onnx")
 
 
-def test_quiet_listeners_hear_nothing(capsys: pytest.CaptureFixture[str]) -> None:
-    set_verbosity(Verbosity.QUIET)
+def test_a_run_is_quiet_only_once(cli: Cli) -> None:
+    cli.done("-q list targets")
     with listening(stages=True) as listener:
         listener.on_progress("collect", 0, 1, "")
         listener.on_warning("a file is damaged")
-    assert capsys.readouterr().err == ""
-
-
-def test_a_run_is_quiet_only_once(cli: Cli) -> None:
-    cli.done("-q list targets")
+    assert cli.capsys.readouterr().err == ""
     cli.done("list targets")
     with listening() as listener:
         listener.on_warning("a file is damaged")
@@ -140,14 +149,6 @@ def test_words_that_fit_stand_in_columns(
 
     assert lines[1].replace("┃", "").split() == list(COLUMNS)
     assert NODE in lines[3]
-
-
-@pytest.mark.usefixtures("width")
-def test_only_long_sentences_wrap(capsys: pytest.CaptureFixture[str]) -> None:
-    row = ("driving score", "72.22", "43.93 to 100.00", "5", "not measured: " * 4)
-    lines = printed(capsys, *row)
-
-    assert any("driving score" in each and "43.93 to 100.00" in each for each in lines)
 
 
 @pytest.mark.usefixtures("width")

@@ -10,10 +10,8 @@ import tomllib
 from pathlib import Path
 
 import pytest
-import typer
-from typer.main import get_command
 
-from me2e_compress.cli.app import LazyGroup, app
+from me2e_compress.cli.app import app
 from me2e_compress.errors import GraphError
 from me2e_compress.registry import Registry
 from me2e_compress.testing import check_form
@@ -94,12 +92,10 @@ def commands() -> list[str]:
 def test_a_command_of_the_documents_is_one(line: str) -> None:
     """Its options exist and its values are of their types; nothing is run."""
     words = shlex.split(re.split(r"\s{3,}", line)[0], comments=True)[1:]
-    group = get_command(app)
-    assert isinstance(group, LazyGroup)
-    name, command, rest = group.resolve_command(typer.Context(group), words)
-    if rest and "..." not in line and "…" not in line:
+    if len(words) > 1 and "..." not in line and "…" not in line:
+        words = [each for each in words if each not in ("-q", "-v", "--json")]
         with contextlib.suppress(GraphError):  # the model is not there
-            command.make_context(name, rest)
+            app.parse_args(words)
 
 
 @writing

@@ -10,7 +10,8 @@ from me2e_compress.driving.adapter import Adapter
 from me2e_compress.driving.onnx_policy import OnnxPolicy
 from me2e_compress.errors import EvaluationError
 from me2e_compress.evaluators.highway.drivers import OnnxDriver
-from me2e_compress.workflows.frames import FramesOptions, record_frames
+from me2e_compress.workflows.frames import record_frames
+from me2e_compress.workflows.options import FramesOptions
 from tests.driving.observed import motion, observation
 from tests.evaluators.highway.drivers import straight_on
 
@@ -70,7 +71,7 @@ def test_recorded_scenes_begin_so_too(tmp_path: Path) -> None:
     queries(tmp_path)
     model, toml = counter(tmp_path), tmp_path / "a.toml"
     toml.write_text(FILE_AND_INPUT)
-    options = FramesOptions(4, adapter=toml, scene_length=2)
+    options = FramesOptions(count=4, adapter=toml, scene_length=2)
 
     folder = record_frames(model, tmp_path / "frames", options)
 

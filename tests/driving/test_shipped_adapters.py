@@ -14,7 +14,8 @@ from me2e_compress.driving.shipped_adapters import adapter_file, shipped_adapter
 from me2e_compress.errors import EvaluationError
 from me2e_compress.evaluators.highway.drivers import OnnxDriver
 from me2e_compress.runtime.session import Session
-from me2e_compress.workflows.frames import FramesOptions, record_frames
+from me2e_compress.workflows.frames import record_frames
+from me2e_compress.workflows.options import FramesOptions
 from models.stacks import STACKS, TCP, VAD_TINY
 from tests.driving.observed import motion, observation
 from tests.evaluators.highway.drivers import EXIT, straight_on
@@ -58,7 +59,7 @@ def test_the_trajectory_head(tcp: Path) -> None:
 
 
 def test_tcp_sees_its_strip_and_its_state(tcp: Path, tmp_path: Path) -> None:
-    options = FramesOptions(2, seed=1, adapter=Path("tcp"), scene_length=2)
+    options = FramesOptions(count=2, seed=1, adapter=Path("tcp"), scene_length=2)
 
     folder = record_frames(tcp, tmp_path / "frames", options)
 

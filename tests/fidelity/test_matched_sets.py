@@ -14,6 +14,7 @@ from me2e_compress.runtime.frames import Array, Frame
 from me2e_compress.runtime.plan_adapter import PlanAdapter
 from me2e_compress.runtime.session import Session
 from me2e_compress.workflows.compare import compare as compare_files
+from me2e_compress.workflows.options import CompareOptions
 from tests.nets import parsed, save_text
 
 Frames = dict[str, np.ndarray]
@@ -121,7 +122,7 @@ def test_compare_matches_what_both_graphs_have(
     write_recording(tmp_path / "frames", lambda _: [Frame(0, True, arrays)], {})
 
     one, other, frames = (tmp_path / n for n in ("one.onnx", "other.onnx", "frames"))
-    found = compare_files(one, other, frames, alive=0.0)
+    found = compare_files(one, other, frames, CompareOptions(alive=0.0))
 
     assert found.fidelity.outputs[0].sqnr_db < 6.0
     if has_scores:

@@ -3,10 +3,10 @@ from dataclasses import replace
 import pytest
 
 from me2e_compress.errors import EvaluationError
-from me2e_compress.metrics.deadlines import charged, deadlines
+from me2e_compress.metrics.deadlines import charged, deadlines, deadlines_table
 from me2e_compress.metrics.episode import ConflictRecord, InferenceRecord
 from me2e_compress.metrics.measure import percentile, too_few
-from me2e_compress.workflows.deadlines_table import check_budget, deadlines_table
+from me2e_compress.workflows.options import check_budget
 from tests.metrics.drives import drive
 
 

@@ -62,6 +62,14 @@ def test_a_method_that_is_gone_is_one_line(cli: Cli) -> None:
     assert line == ("me2e-compress: moving-average is gone since 0.3.0: use max-min")
 
 
+def test_a_key_of_a_study_that_is_gone_is_one_line(cli: Cli, tmp_path: Path) -> None:
+    (tmp_path / "s.toml").write_text('[[scheme]]\nname = "a"\n')
+
+    assert "[[scheme]] is gone since 0.3.0: use [[variant]]" in cli.refused(
+        "study s.toml -o out"
+    )
+
+
 @pytest.mark.parametrize(
     ("text", "line"),
     [

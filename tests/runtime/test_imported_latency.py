@@ -4,12 +4,14 @@ from typing import Any
 
 import pytest
 
-from me2e_compress.cli.commands.profile import profile as command
-from me2e_compress.errors import EvaluationError, Me2eError
+from me2e_compress.errors import EvaluationError
 from me2e_compress.runtime.imported_latency import read_imports
 from me2e_compress.runtime.latency_trace import LatencyTrace
-from me2e_compress.workflows.import_profile import import_profile
+from me2e_compress.workflows.profile import import_profile
+from tests.command import Cli, cli, command
 from tests.evaluators.highway.drivers import straight_on
+
+__all__ = ["cli", "command"]
 
 TIMES = [
     {"startEnqMs": 0.1, "computeMs": 49.0, "latencyMs": 50.1234, "endToEndMs": 51.0},
@@ -131,18 +133,17 @@ def test_two_files_of_one_kind_are_refused(files: dict[str, Path]) -> None:
 
 
 @pytest.mark.parametrize(
-    ("options", "words"),
+    ("line", "words"),
     [
-        ({}, "give recorded FRAMES, or --import FILE"),
-        ({"frames": Path("frames"), "imported": Path("t")}, "leave FRAMES out"),
-        ({"by_module": True, "imported": Path("t")}, "leave --by-module out"),
-        ({"imported": Path("missing.json")}, "missing.json: No such file"),
+        ("", "give recorded FRAMES, or --import FILE"),
+        ("frames --import t", "leave FRAMES out"),
+        ("--by-module --import t", "leave --by-module out"),
+        ("--import missing.json", "missing.json: No such file"),
     ],
 )
 def test_what_does_not_go_together(
-    tmp_path: Path, options: dict[str, Any], words: str
+    tmp_path: Path, cli: Cli, line: str, words: str
 ) -> None:
-    model = straight_on(tmp_path / "m.onnx")
+    straight_on(tmp_path / "m.onnx")
 
-    with pytest.raises(Me2eError, match=words):
-        command(str(model), tmp_path / "trace.json", **options)
+    assert words in cli.refused(f"profile m.onnx {line} -o trace.json")

@@ -3,9 +3,9 @@
 import matplotlib.pyplot as plt
 from markupsafe import Markup
 
+from me2e_compress.display import Cell, Table
 from me2e_compress.study.report.page import Drawing, Page, Section
 from me2e_compress.study.report.style import svg
-from me2e_compress.workflows.result import Cell, Table
 
 MARKUP = "<script>alert(1)</script>"
 

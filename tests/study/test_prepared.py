@@ -11,7 +11,7 @@ from me2e_compress.manager import PassManager, recipe
 from me2e_compress.study import Listener, Study, Variant
 from me2e_compress.study.prepared import PreparedVariant, prepare_variant
 from me2e_compress.study.workspace import Workspace
-from me2e_compress.workflows.listener import SILENT
+from me2e_compress.workflows.result import SILENT
 from tests.command import write_frames
 from tests.evaluators.highway.drivers import straight_on
 from tests.stand_in import write_model

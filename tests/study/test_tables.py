@@ -2,6 +2,7 @@ import dataclasses
 
 import pytest
 
+from me2e_compress.display import Cell, Table
 from me2e_compress.metrics.measure import Estimate, Measure
 from me2e_compress.study import StudyResult
 from me2e_compress.study.cells import (
@@ -18,7 +19,6 @@ from me2e_compress.study.tables import (
     differences,
     scoreboards,
 )
-from me2e_compress.workflows.result import Cell, Table
 from tests.study.conftest import IDEAL
 
 pytestmark = pytest.mark.xdist_group("study")

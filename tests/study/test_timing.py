@@ -17,7 +17,7 @@ from me2e_compress.study import Condition, Listener, Study, Timing, Variant, tim
 from me2e_compress.study.prepared import prepare_variant
 from me2e_compress.study.timing import Clock, time_all
 from me2e_compress.study.workspace import Workspace
-from me2e_compress.workflows.listener import SILENT
+from me2e_compress.workflows.result import SILENT
 from tests.study.conftest import BLIND, IDEAL, Make
 
 DEVICE = Condition("device", "trace")

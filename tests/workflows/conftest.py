@@ -1,5 +1,5 @@
 """The folders that commands are tested in."""
 
-from tests.command import command, dense, files
+from tests.command import cli, command, dense, files
 
-__all__ = ["command", "dense", "files"]
+__all__ = ["cli", "command", "dense", "files"]

@@ -14,12 +14,19 @@ from me2e_compress.errors import EvaluationError, FramesError
 from me2e_compress.graph.recurrence import recurrent_inputs
 from me2e_compress.runtime.plan_adapter import PlanAdapter
 from me2e_compress.workflows.calibrate import calibrate
-from me2e_compress.workflows.calibrate_options import CalibrateOptions
 from me2e_compress.workflows.compare import compare
-from me2e_compress.workflows.compress import CompressOptions, compress
+from me2e_compress.workflows.compress import compress
 from me2e_compress.workflows.inspect import inspect
-from me2e_compress.workflows.profile import ProfileOptions, profile
-from me2e_compress.workflows.sensitivity import SensitivityOptions, measure_sensitivity
+from me2e_compress.workflows.options import (
+    CalibrateOptions,
+    CompareOptions,
+    CompressOptions,
+    InspectOptions,
+    ProfileOptions,
+    SensitivityOptions,
+)
+from me2e_compress.workflows.profile import profile
+from me2e_compress.workflows.search import measure_sensitivity
 
 MINE = """
 <ir_version: 9, opset_import: ["" : 17]>
@@ -90,7 +97,7 @@ def test_compare_knows_the_plan_and_the_state(
     with pytest.raises(FramesError, match="memory is missing"):
         compare(mine, mine, frames)
 
-    found = compare(mine, mine, frames, adapter=adapter).fidelity
+    found = compare(mine, mine, frames, CompareOptions(adapter=adapter)).fidelity
 
     assert found.plan is not None
     assert found.plan_output == "waypoints"
@@ -121,7 +128,9 @@ def test_profile_feeds_the_state_back(
 
 
 def test_inspect_shows_the_state(mine: Path, adapter: Path) -> None:
-    assert inspect(mine, adapter=adapter).recurrent == {"memory": "remembered"}
+    assert inspect(mine, InspectOptions(adapter=adapter)).recurrent == {
+        "memory": "remembered"
+    }
 
 
 def test_sensitivity_is_told_in_metres_without_a_drive(
@@ -164,7 +173,7 @@ def test_a_map_says_which_output_is_the_plan_and_what_is_fed_back(
 ) -> None:
     small = tmp_path / "small.onnx"
 
-    found = compare(mine, mine, frames, module_map=parts).fidelity
+    found = compare(mine, mine, frames, CompareOptions(module_map=parts)).fidelity
     compress(mine, small, "exact", frames, CompressOptions(module_map=parts))
     timed = profile(mine, frames, None, ProfileOptions(module_map=parts))
 

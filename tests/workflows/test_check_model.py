@@ -65,7 +65,7 @@ def checked(tmp_path: Path, adapter: str | None = ADAPTER + PLAN) -> ModelCheck:
 def test_every_port_and_its_part(tmp_path: Path) -> None:
     found = checked(tmp_path)
 
-    assert found.fits
+    assert not found.problems
     assert found.status == "ok"
     assert [(each.name, each.use) for each in found.inputs] == [
         ("img", "FRONT"),
@@ -84,7 +84,7 @@ def test_every_port_and_its_part(tmp_path: Path) -> None:
 def test_controls_drive(tmp_path: Path) -> None:
     found = checked(tmp_path, ADAPTER + CONTROL)
 
-    assert found.fits
+    assert not found.problems
     assert found.drives_by == "its controls"
     uses = {each.name: each.use for each in found.outputs}
     assert uses["action"] == "control: steer, throttle, brake"
@@ -93,7 +93,7 @@ def test_controls_drive(tmp_path: Path) -> None:
 def test_all_that_is_missing_is_told_at_once(tmp_path: Path) -> None:
     found = checked(tmp_path, None)
 
-    assert not found.fits
+    assert found.problems
     assert found.status == "refused"
     image, state, plan = found.problems
     assert "img" in image
@@ -123,7 +123,7 @@ def test_what_does_not_fit(tmp_path: Path, old: str, new: str, message: str) -> 
 
 
 def test_a_policy_that_is_no_graph_is_opened() -> None:
-    assert check_model("blind:6").fits
+    assert not check_model("blind:6").problems
     with pytest.raises(EvaluationError, match="No module named 'nowhere_at_all'"):
         check_model("nowhere_at_all:make")
 

@@ -12,6 +12,7 @@ from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.errors import EvaluationError, GraphError
 from me2e_compress.runtime.session import Session
 from me2e_compress.workflows.compare_dump import compare_dump
+from me2e_compress.workflows.options import CompareOptions
 from tests.command import Command, command
 from tests.fidelity.engines import Arrays, drive, frames, noisy, stack
 from tests.frames import record
@@ -88,7 +89,8 @@ def test_a_plan_that_rests_is_dead_though_all_else_is_right(files: Path) -> None
     }  # fmt: skip
     with pytest.raises(EvaluationError, match="dump: plan is constant"):
         found.check()
-    assert compare_dump(*given, alive=0.0).alerts() == ()
+    unasked = compare_dump(*given, options=CompareOptions(alive=0.0))
+    assert unasked.alerts() == ()
 
 
 @pytest.mark.parametrize(("more", "code"), [((), 1), (("--alive", "0"), 0)])

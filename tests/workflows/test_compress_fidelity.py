@@ -11,7 +11,7 @@ import pytest
 import me2e_compress as me2e
 from me2e_compress import graph
 from me2e_compress.calibration.calibrator import Calibrator
-from me2e_compress.workflows.compress_fidelity import ADVICE
+from me2e_compress.workflows.measured_loss import ADVICE
 from tests.command import Command
 from tests.frames import record
 from tests.nets import conv_attention, net

@@ -10,9 +10,9 @@ import pytest
 from me2e_compress.errors import GraphError
 from me2e_compress.runtime.children import run_script
 from me2e_compress.runtime.frames import Array, Frame
-from me2e_compress.workflows import first_opening
-from me2e_compress.workflows.first_opening import try_first
-from me2e_compress.workflows.listener import SILENT
+from me2e_compress.workflows import checks
+from me2e_compress.workflows.checks import try_first
+from me2e_compress.workflows.result import SILENT
 from tests.stacks import write_stack
 
 pytestmark = pytest.mark.opens_apart
@@ -35,7 +35,7 @@ def test_a_graph_that_survived_is_not_tried_again(
         ends.append(done.stdout)
         return done
 
-    monkeypatch.setattr(first_opening, "run_script", noted)
+    monkeypatch.setattr(checks, "run_script", noted)
     camera: dict[str, Array] = {"camera": np.zeros((1, 4), np.float32)}
     camera["file"] = np.zeros(1)  # a name that numpy's savez takes for its own
     frames = [Frame(0, True, camera)]
@@ -73,7 +73,7 @@ def test_how_it_died(
     as_file: bool,
 ) -> None:
     dead = subprocess.CompletedProcess([], code, "open\nrun\n", "")
-    monkeypatch.setattr(first_opening, "run_script", lambda script, words: dead)
+    monkeypatch.setattr(checks, "run_script", lambda script, words: dead)
     source = write_stack(tmp_path).with_name("head.onnx") if as_file else driver
 
     with pytest.raises(GraphError) as caught:

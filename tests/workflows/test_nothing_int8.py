@@ -7,7 +7,7 @@ import pytest
 
 import me2e_compress as me2e
 from me2e_compress import graph
-from me2e_compress.workflows.listener import Listener
+from me2e_compress.workflows.result import Listener
 from tests.command import Command
 from tests.frames import record
 from tests.nets import net

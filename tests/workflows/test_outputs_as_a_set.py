@@ -12,7 +12,7 @@ import pytest
 from me2e_compress import graph
 from me2e_compress.registry import drafts
 from me2e_compress.runtime.atomic import write_bytes
-from me2e_compress.workflows import compress_result
+from me2e_compress.workflows import compress
 from tests.command import Command, contents
 
 COMPRESS = ("compress", "in.onnx", "-o", "out.onnx", "--passes")
@@ -23,7 +23,7 @@ def full_at_the_report(monkeypatch: pytest.MonkeyPatch) -> None:
     def full(path: Path, *_: object, **__: object) -> None:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
 
-    monkeypatch.setattr(compress_result, "write_document", full)
+    monkeypatch.setattr(compress, "write_document", full)
 
 
 @pytest.mark.usefixtures("full_at_the_report")

@@ -5,7 +5,7 @@ import pytest
 
 from me2e_compress import graph
 from me2e_compress.manager import recipe
-from me2e_compress.workflows.prepare_int8 import PreparedGraph
+from me2e_compress.workflows.plan import PreparedGraph
 from tests.nets import conv_attention
 
 

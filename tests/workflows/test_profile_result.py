@@ -11,7 +11,7 @@ from me2e_compress.runtime.latency_trace import (
     Load,
     OthersLoad,
 )
-from me2e_compress.workflows.profile_result import BEYOND_P99, ProfileResult
+from me2e_compress.workflows.profile import BEYOND_P99, ProfileResult
 
 ENOUGH = 100 * BEYOND_P99
 

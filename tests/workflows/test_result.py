@@ -3,7 +3,8 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from me2e_compress.workflows.result import Result, Table, table
+from me2e_compress.display import Table, table
+from me2e_compress.workflows.result import Result
 
 NAMES = ("<b>", "a & b")
 

@@ -11,7 +11,7 @@ import me2e_compress as me2e
 from me2e_compress.manager import recipe
 from me2e_compress.registry.drafts import IN_JSON
 from me2e_compress.simulator.routes import save_routes
-from me2e_compress.workflows.export import export_stack
+from me2e_compress.workflows.files import export_stack
 from me2e_compress.workflows.result import Result
 from me2e_compress.workflows.routes import RoutesOptions, examine_routes, make_routes
 from tests.command import Command
@@ -79,11 +79,11 @@ CASES: dict[str, tuple[str, Call]] = {
     ),
     "inspect": (
         "inspect dense.onnx --map map.toml",
-        lambda: me2e.inspect("dense.onnx", MAP),
+        lambda: me2e.inspect("dense.onnx", me2e.InspectOptions(module_map=MAP)),
     ),
     "lint": (
         "lint dense.onnx --target onnxruntime",
-        lambda: me2e.lint("dense.onnx", me2e.LintOptions("onnxruntime")),
+        lambda: me2e.lint("dense.onnx", me2e.LintOptions(target="onnxruntime")),
     ),
     "sensitivity": (
         "sensitivity dense.onnx frames -o s.toml --map map.toml --limit 1",
@@ -109,7 +109,9 @@ CASES: dict[str, tuple[str, Call]] = {
     ),
     "record_frames": (
         "frames highway -n 1 -o made --seed 3",
-        lambda: me2e.record_frames("highway", "made", me2e.FramesOptions(1, 3)),
+        lambda: me2e.record_frames(
+            "highway", "made", me2e.FramesOptions(count=1, seed=3)
+        ),
     ),
     "evaluate": (
         "evaluate blind -o results --routes ParkedObstacle_R2_0 --latency fps:4",
@@ -216,12 +218,6 @@ def test_a_result_shows_itself(
     assert isinstance(found, Result)
     assert "\n" not in found.headline
     assert found.headline in repr(found)
-
-
-def test_a_result_says_in_one_line_what_it_is(dense: Path) -> None:
-    found: Result = me2e.inspect(dense / "dense.onnx")
-
-    assert repr(found) == "<InspectResult: dense.onnx: 0.00 MB, opset 17>"
 
 
 def written(folder: Path) -> dict[str, object]:

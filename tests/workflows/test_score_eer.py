@@ -6,10 +6,9 @@ import re
 from pathlib import Path
 
 import pytest
-from typer.testing import CliRunner
 
 from me2e_compress.cli.app import app
-from me2e_compress.errors import EnergyError, EvaluationError
+from me2e_compress.errors import EnergyError, EvaluationError, RecipeError
 from me2e_compress.evaluators.highway.results import ResultsFolder
 from me2e_compress.evaluators.highway.worker import Driven
 from me2e_compress.metrics.episode import (
@@ -20,8 +19,9 @@ from me2e_compress.metrics.episode import (
 )
 from me2e_compress.runtime.energy import EnergyResult
 from me2e_compress.simulator.routes import ROAD_VERSION, VERSION
-from me2e_compress.workflows.score_eer import EerOptions, joules_named, score_eer
-from tests.docs.documents import faults
+from me2e_compress.workflows.options import EerOptions
+from me2e_compress.workflows.score_eer import score_eer
+from tests.command import Cli
 from tests.metrics.drives import cruise, drive, infraction
 
 CRASH = infraction(InfractionKind.COLLISION_VEHICLE)
@@ -151,35 +151,28 @@ def test_other_routes_cannot_be_compared() -> None:
 
 
 def test_joules_by_name() -> None:
-    found = joules_named(["a=1.5", "runs/b=e=2.json"])
+    words = ["score", "runs", "--joules", "a=1.5", "--joules", "runs/b=e=2.json"]
+    _, bound, _ = app.parse_args(words)
+    found = bound.arguments["eer"].energy
 
     assert found == {"a": 1.5, "runs/b=e": "2.json"}
 
 
 @pytest.mark.parametrize("words", [["1.5"], ["a="], ["=2"], ["a=1", "a=2"]])
 def test_joules_without_a_name_or_with_two(words: list[str]) -> None:
-    with pytest.raises(EvaluationError, match="energy"):
-        joules_named(words)
+    given = [each for word in words for each in ("--joules", word)]
+    with pytest.raises(RecipeError, match="--joules"):
+        app.parse_args(["score", "runs", *given])
 
 
-def test_the_command_prints_what_the_page_says(tmp_path: Path) -> None:
+def test_the_command_prints_what_the_page_says(tmp_path: Path, cli: Cli) -> None:
     for name, episodes in FOLDERS.items():
         path = tmp_path / Path(name).name
         made_by = {"routes": ["a", "b"], "set_size": 2, VERSION: ROAD_VERSION}
         folder = ResultsFolder.create(path, made_by)
         for each in episodes:
             folder.save(Driven(each, 0.0, 0))
-    words = [
-        "score",
-        str(tmp_path / "fast"),
-        str(tmp_path / "slow"),
-        "--joules",
-        "fast=2",
-    ]
+    document = cli.document("score fast slow --joules fast=2 --joules slow=3")
 
-    result = CliRunner().invoke(app, [*words, "--joules", "slow=3", "--json"])
-
-    document = json.loads(result.stdout)
-    assert faults("score", document) == []
     scores = document["eer"]["scores"]
     assert {Path(name).name for name in scores} == {"fast", "slow"}

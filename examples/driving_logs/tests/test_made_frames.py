@@ -11,9 +11,9 @@ import pytest
 
 from me2e_compress import graph
 from me2e_compress.calibration.dataset import CalibrationSet
-from me2e_compress.calibration.recording import LOGS
 from me2e_compress.errors import FramesError
-from me2e_compress.workflows.frames import FramesOptions, record_frames
+from me2e_compress.workflows.frames import record_frames
+from me2e_compress.workflows.options import FramesOptions
 from small_logs import MAKERS, SPEED, car_at, pixel, seen_point, write_nuscenes
 
 FRONT = """
@@ -80,7 +80,7 @@ def write_graph(
 def made(
     model: Path, text: str, adapter: Path | None = None, count: int = 256
 ) -> CalibrationSet:
-    options = FramesOptions(count, log=LOGS.parse(text), adapter=adapter)
+    options = FramesOptions(count=count, log=text, adapter=adapter)
     return CalibrationSet(record_frames(model, model.parent / "out", options))
 
 

@@ -24,7 +24,8 @@ from me2e_compress.evaluators.highway.expert.expert_policy import Expert
 from me2e_compress.evaluators.highway.runner import Listeners, drive
 from me2e_compress.metrics.episode import Ending, InfractionKind
 from me2e_compress.runtime.children import pool
-from me2e_compress.simulator.routes import SCENARIO_ABILITIES, VARIANTS, Route
+from me2e_compress.simulator.routes import SCENARIO_ABILITIES, Route
+from me2e_compress.simulator.scenarios import VARIANTS
 from me2e_compress.simulator.scenarios.builders import stage_of
 from me2e_compress.simulator.scene import INFRACTIONS, EventKind
 from me2e_compress.simulator.traffic.stage import TRAFFIC

@@ -7,8 +7,8 @@ from pathlib import Path
 from jinja2 import Environment, FileSystemLoader, StrictUndefined, Template
 from markupsafe import Markup
 
+from me2e_compress.display import Table
 from me2e_compress.registry.drafts import MARK
-from me2e_compress.workflows.result import Table
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ import pytest
 
 from me2e_compress.driving.onnx_policy import OnnxPolicy
 from me2e_compress.simulator.routes import load_routes
-from me2e_compress.workflows.listener import Listener
+from me2e_compress.workflows.result import Listener
 from models.driver.checkpoint import TrainingCheckpoint
 from models.driver.course import frames_in, run
 from models.driver.curriculum import (

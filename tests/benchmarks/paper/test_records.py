@@ -17,7 +17,7 @@ from me2e_compress.errors import StudyError
 from me2e_compress.simulator.routes import Route
 from me2e_compress.study import Condition, Study, Timing, Variant, load_study, run_study
 from me2e_compress.study.study_blocks import StudyBlock
-from me2e_compress.workflows.listener import SILENT
+from me2e_compress.workflows.result import SILENT
 from tests.benchmarks.paper.made import write_records
 from tests.command import write_frames
 from tests.evaluators.highway.drivers import straight_on

@@ -24,9 +24,9 @@ from me2e_compress.runtime.frames import Frame
 from me2e_compress.runtime.providers import CpuProvider
 from me2e_compress.runtime.runnable import compiled_or_expanded
 from me2e_compress.runtime.session import Session, open_graph
-from me2e_compress.workflows.doctor import doctor
-from me2e_compress.workflows.first_opening import try_first
-from me2e_compress.workflows.listener import SILENT
+from me2e_compress.workflows.checks import try_first
+from me2e_compress.workflows.listing import doctor
+from me2e_compress.workflows.result import SILENT
 from tests.operators.running import graph_of
 from tests.operators.test_deformable_attention import CALL, arrays_of
 

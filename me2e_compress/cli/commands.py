@@ -1,0 +1,408 @@
+"""The commands: arguments, options by their dataclass, one workflow, what it gives.
+
+What is heavy is imported in the bodies, so that a command explains itself at once.
+"""
+
+import time
+from pathlib import Path
+from typing import Annotated, TypeAlias
+
+from cyclopts import Parameter
+
+from me2e_compress.cli.console import (
+    is_json,
+    is_verbose,
+    listening,
+    say,
+    show,
+    show_of,
+    tell,
+)
+from me2e_compress.errors import EvaluationError, OptionError, RecipeError
+from me2e_compress.extras import need_extra
+from me2e_compress.workflows.options import (
+    BuildOptions,
+    CalibrateOptions,
+    CompareOptions,
+    CompressOptions,
+    FramesOptions,
+    InspectOptions,
+    LintOptions,
+    PlanOptions,
+    ProfileOptions,
+    SearchOptions,
+    SensitivityOptions,
+    WriteOptions,
+)
+from me2e_compress.workflows.result import Result
+
+Output: TypeAlias = Annotated[Path, Parameter(name=["--output", "-o"])]
+WRITING = WriteOptions()
+
+
+def demo(
+    *,
+    output: Annotated[Path, Parameter(name=["--output", "-o", "--out"])] = Path("out"),
+    writing: WriteOptions = WRITING,
+) -> None:
+    """Run the main job on what ships: compress, verify, compare, drive, report.
+
+    The trained driver is compressed and drives before and after.
+
+    Args:
+        output: the folder to write
+    """
+    need_extra("highway", "driving in the demo")
+    from me2e_compress.study.demo import DemoResult, DriverDemo, figure
+
+    steps = DriverDemo(output, writing.force).steps
+    # each step says what it found as soon as it is done
+    output.mkdir(parents=True, exist_ok=True)
+    results = dict[str, Result]()
+    for name, step in steps.items():
+        begun = time.monotonic()
+        with listening() as listener:
+            results[name] = step(listener)
+        if not is_json():
+            seconds = time.monotonic() - begun
+            say(f"{name:<10}{seconds:4.0f} s   {figure(results[name])}")
+            if is_verbose():
+                show(results[name])
+    # with -v every step was shown in full already
+    if is_json() or not is_verbose():
+        show(DemoResult(results))
+
+
+def doctor() -> None:
+    """Show what this machine can do, and what to install for the rest."""
+    from me2e_compress.workflows.listing import doctor as workflow
+
+    show(workflow())
+
+
+def list_entries(kind: str | None = None, /) -> None:
+    """Show what can be named: ours, and what other packages add by entry point.
+
+    Args:
+        kind: passes, rules, ...: one kind, and what its options mean
+    """
+    from me2e_compress.workflows.listing import list_entries as workflow
+
+    show(workflow(kind))
+
+
+def export(stack: str, /, *, output: Output, writing: WriteOptions = WRITING) -> None:
+    """Write a trained driver that ships.
+
+    Args:
+        stack: highway
+        output: the ONNX file
+    """
+    from me2e_compress.workflows.files import export_stack
+
+    show(export_stack(stack, output, force=writing.force))
+
+
+def inspect(model: str, /, *, options: InspectOptions | None = None) -> None:
+    """Show what a graph holds: interface, and nodes, parameters, MACs by module.
+
+    With --trace also each module's share of the time of a frame.
+
+    Args:
+        model: the ONNX file, or highway; not changed
+    """
+    from me2e_compress.workflows.inspect import inspect as workflow
+
+    show(workflow(model, options))
+
+
+def join(stack: Path, /, *, output: Output, writing: WriteOptions = WRITING) -> None:
+    """Join the files of a model into one graph, which all commands take.
+
+    Args:
+        stack: the TOML file that names the files
+        output: the joined graph
+    """
+    from me2e_compress.workflows.files import join as workflow
+
+    show(workflow(stack, output, force=writing.force))
+
+
+def split(
+    model: str, stack: Path, /, *, output: Output, writing: WriteOptions = WRITING
+) -> None:
+    """Cut a graph that was joined, and made smaller, into its files again.
+
+    Args:
+        model: the ONNX file, or highway; not changed
+        stack: the TOML file that names the files
+        output: the folder of the files
+    """
+    from me2e_compress.workflows.files import split as workflow
+
+    show(workflow(model, stack, output, force=writing.force))
+
+
+def frames(
+    stack: str, /, *, output: Output, options: FramesOptions | None = None
+) -> None:
+    """Write calibration frames, coherent in time, seen by six cameras.
+
+    For a driver that ships, or any ONNX file that keeps the policy contract
+    (--adapter), the expert drives fresh routes. With --from, recorded driving is laid
+    out as the file takes it (docs/writing-logs.md).
+
+    Args:
+        stack: highway, or M.onnx
+        output: the folder
+    """
+    from me2e_compress.workflows.frames import FramesResult, record_frames
+
+    with listening() as listener:
+        record_frames(stack, output, options, listener)
+    show(FramesResult(stack, output, options or FramesOptions()))
+
+
+def plan(
+    model: str,
+    /,
+    *,
+    output: Output | None = None,
+    against: Path | None = None,
+    options: PlanOptions | None = None,
+) -> None:
+    """Show which nodes become int8, which stay float, by which rule, and why.
+
+    With -v a row a node that could be int8.
+
+    Args:
+        model: the ONNX file, or highway; float or with a plan
+        output: the plan as JSON
+        against: a plan or model: compare; float: no overrides
+    """
+    from me2e_compress.workflows.plan import plan as workflow
+
+    result = workflow(model, output, against, options)
+    show(result, result.shown(every=is_verbose()).tables)
+
+
+def calibrate(
+    model: str,
+    frames: Path | None = None,
+    /,
+    *,
+    output: Output = Path("ranges.json"),
+    options: CalibrateOptions | None = None,
+) -> None:
+    """Measure the ranges of every tensor that any scheme, rule set or target needs.
+
+    Frames are taken in whole scenes; of a recipe, the passes before int8 are run.
+    A run that was killed goes on from OUTPUT.checkpoint; compress takes what is
+    measured by --ranges.
+
+    Args:
+        model: the ONNX file, or highway; not changed
+        frames: the recorded FRAMES; --import needs none
+        output: the ranges as JSON
+    """
+    from me2e_compress.workflows.calibrate import calibrate as workflow
+
+    show_of(workflow, model, frames, output, options)
+
+
+def ranges(first: Path, second: Path | None = None, /) -> None:
+    """Say which saved ranges deserve a look, and what to record instead.
+
+    Ranges are held against the root mean square of their own tensor and against a
+    second file: another recording's ranges, a TensorRT or an onnxruntime cache.
+
+    Args:
+        first: saved RANGES.json, or another tool's cache
+        second: ranges or a cache to hold them against
+    """
+    from me2e_compress.workflows.calibrate import ranges as workflow
+
+    show(workflow(first, second))
+
+
+def compress(
+    model: str,
+    /,
+    *,
+    output: Output,
+    recipe: Annotated[str | None, Parameter(name=["--recipe", "-r"])] = None,
+    passes: str | None = None,
+    frames: Path | None = None,
+    options: CompressOptions | None = None,
+) -> None:
+    """Apply passes to a graph, check each, and write the smaller graph and a report.
+
+    A pipeline names passes in order: fold-constants,fuse-basic{swish=true}
+
+    Args:
+        model: the ONNX file, or highway; not changed
+        output: the smaller graph
+        recipe: a TOML file, or a shipped recipe's name
+        passes: a pipeline, as text; see above
+        frames: the recorded FRAMES
+    """
+    from me2e_compress.manager.recipe import parse
+    from me2e_compress.workflows.compress import compress as workflow
+
+    if recipe is not None and passes is not None:
+        raise RecipeError("give a recipe (-r) or a pipeline (--passes), not both")
+    wanted = recipe if passes is None else parse(passes)
+    show_of(workflow, model, output, wanted, frames, options)
+
+
+def lint(model: str, /, *, options: LintOptions | None = None) -> None:
+    """Check a graph for the runtime that will run it; exit code 1 if it refuses.
+
+    Args:
+        model: the ONNX file, or highway; not changed
+    """
+    from me2e_compress.workflows.lint import lint as workflow
+
+    with listening() as listener:
+        result = workflow(model, options, listener)
+    show(result, result.shown(every=is_verbose()).tables)
+    result.check()
+
+
+def build(
+    model: str, /, *, output: Output, options: BuildOptions | None = None
+) -> None:
+    """Build a TensorRT engine of a graph, for the GPU of this machine.
+
+    Args:
+        model: the ONNX file, or highway; not changed
+        output: the engine
+    """
+    from me2e_compress.workflows.files import build as workflow
+
+    show_of(workflow, model, output, options)
+
+
+def sensitivity(
+    model: str,
+    frames: Path,
+    /,
+    *,
+    output: Output,
+    options: SensitivityOptions | None = None,
+) -> None:
+    """Measure what int8 costs module by module, and write a recipe within a limit.
+
+    Halves of the worst module's nodes are tried next, to find those to blame.
+    The loss is how far the plan moves, metres, mean over the frames; of a model
+    whose plan is not known, the noise of its worst output relative to the signal.
+
+    Args:
+        model: the ONNX file, or highway; float
+        frames: the recorded FRAMES
+        output: the RECIPE.toml
+    """
+    from me2e_compress.workflows.search import measure_sensitivity
+
+    show_of(measure_sensitivity, model, frames, output, options)
+
+
+def search(
+    model: str, frames: Path, /, *, output: Output, options: SearchOptions | None = None
+) -> None:
+    """Find the scheme within the budgets that costs the plan least.
+
+    Args:
+        model: the ONNX file, or highway; float
+        frames: the recorded FRAMES
+        output: the RECIPE.toml
+    """
+    from me2e_compress.workflows.search import search as workflow
+
+    show_of(workflow, model, frames, output, options or SearchOptions())
+
+
+def compare(
+    reference: str,
+    candidate: str,
+    frames: Path | None = None,
+    /,
+    *,
+    outputs: Path | None = None,
+    float_graph: Annotated[str | None, Parameter(name="--float")] = None,
+    first_difference: bool = False,
+    options: CompareOptions | None = None,
+) -> None:
+    """Run two graphs over frames: SQNR of every output, plan displacement in metres.
+
+    Exit code 1 if an output of the second hardly moves any more.
+
+    Args:
+        reference: graph to be true to
+        candidate: the graph that is judged; not with --outputs
+        frames: the recorded FRAMES
+        outputs: what an engine of the graph answered: DUMP/ or JSON
+        float_graph: the graph's float source, with --outputs
+        first_difference: name the first module after which the second differs
+    """
+    from me2e_compress.workflows import compare as between
+    from me2e_compress.workflows import compare_dump as against_engine
+
+    options = options or CompareOptions()
+    if first_difference and (options.as_it_stands or outputs is not None):
+        raise RecipeError(
+            "--first-difference holds two graphs together, all nodes as they stand:"
+            " leave out --reference and --outputs"
+        )
+    if float_graph is not None and outputs is None:
+        raise RecipeError("--float is for --outputs, which is not given")
+    if outputs is not None and frames is None:
+        workflow = against_engine.compare_dump
+        show_of(workflow, reference, outputs, candidate, float_graph, options)
+    elif outputs is not None or frames is None:
+        words = "M.onnx FRAMES --outputs DUMP" if frames else "A.onnx B.onnx FRAMES"
+        raise OptionError(f"expected {words}")
+    elif first_difference:
+        show_of(between.first_difference, reference, candidate, frames, options)
+    else:
+        show_of(between.compare, reference, candidate, frames, options)
+
+
+def profile(
+    model: str,
+    frames: Path | None = None,
+    /,
+    *,
+    output: Output,
+    imported: Annotated[Path | None, Parameter(name="--import")] = None,
+    options: ProfileOptions | None = None,
+) -> None:
+    """Measure a model alone and warm, and write its latencies as a trace.
+
+    With --import nothing is run: the latencies are those that another tool measured.
+
+    Args:
+        model: the ONNX file, or highway; not changed
+        frames: the recorded FRAMES; none for --import
+        output: the trace
+        imported: what another tool measured
+    """
+    from me2e_compress.workflows import profile as workflow
+    from me2e_compress.workflows.profile import import_profile, refuse_both
+
+    options = options or ProfileOptions()
+    with listening() as listener:
+        if imported is not None:
+            refuse_both(frames, options)
+            budget_ms, force = options.budget_ms, options.force
+            result = import_profile(
+                model, [imported], output, budget_ms=budget_ms, force=force
+            )
+        elif frames is None:
+            raise EvaluationError("profile: give recorded FRAMES, or --import FILE")
+        else:
+            result = workflow.profile(model, frames, output, options, listener)
+    show(result)
+    # files besides the trace are named on stderr
+    for file in filter(None, (result.figure, result.energy_output)):
+        tell(f"wrote {file}")

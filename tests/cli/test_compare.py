@@ -1,0 +1,113 @@
+"""``compare``: what differs, where first, and what is the runtime's alone."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from me2e_compress import graph
+from tests.command import Cli, write_frames
+from tests.frames import record
+from tests.nets import conv_attention, image, save_text, turn_softmax
+from tests.targets.onnxruntime.rewritten import Drawn
+
+
+def test_a_graph_compared_with_itself_is_equal(cli: Cli, files: Path) -> None:
+    found = cli.document("compare in.onnx in.onnx frames")
+    assert [item["error"] for item in found["outputs"]] == [0.0]
+    assert [item["sqnr_db"] for item in found["outputs"]] == [None]
+    assert found["frames"] == 2
+
+
+def test_a_reference_shows_what_the_runtime_makes_of_a_graph(
+    cli: Cli, tmp_path: Path
+) -> None:
+    save_text(
+        tmp_path / "m.onnx",
+        "pool (float[1,1,2,2] camera) => (float[1,1,2,2] plan)\n"
+        "<int64[8] around = {0, 0, 1, 1, 0, 0, 1, 1}>\n"
+        "{ q = Pad(camera, around) plan = MaxPool<kernel_shape=[3,3]>(q) }",
+    )
+    write_frames(tmp_path / "frames", camera=np.full((1, 1, 2, 2), -9, np.float32))
+
+    (same,) = cli.document("compare m.onnx m.onnx frames")["outputs"]
+    (wrong,) = cli.document("compare m.onnx m.onnx frames --reference")["outputs"]
+
+    assert (same["sqnr_db"], wrong["sqnr_db"]) == (None, None)
+    assert same["error"] == 0.0
+    assert wrong["error"] is None  # infinite: zeros became negative
+
+
+@pytest.fixture
+def drawn(cli: Cli) -> Drawn:
+    """Files of a Gemm whose int32 bias has a scale of its own, and of a float one."""
+    layer = Drawn("Gemm", bias="own")
+    graph.save(layer.model(), cli.folder / "own.onnx")
+    graph.save(Drawn("Gemm", bias="float").model(), cli.folder / "clean.onnx")
+    record(cli.folder / "frames", [layer.frame()] * 2)
+    return layer
+
+
+@pytest.mark.usefixtures("drawn")
+def test_compare_says_what_the_runtime_answers_otherwise(cli: Cli) -> None:
+    found = cli.document("compare own.onnx own.onnx frames")
+
+    (output,) = found["outputs"]
+    assert output["sqnr_db"] is None  # a file is equal to itself
+    assert found["runtime"]["sqnr_db"]["y"] < 20
+    assert found["runtime"]["nodes_db"] == {"y": None}
+    (cause,) = found["runtime"]["causes"]
+    assert cause.startswith("layer: onnxruntime's QGemm takes its int32 bias")
+    assert (
+        "answers otherwise than the file: y"
+        in cli.done("compare own.onnx own.onnx frames").words
+    )
+
+
+@pytest.mark.usefixtures("drawn")
+def test_nothing_is_said_of_what_it_answers_alike(cli: Cli) -> None:
+    found = cli.document("compare clean.onnx clean.onnx frames")
+
+    assert found["runtime"] == {"sqnr_db": {}, "nodes_db": {}, "causes": []}
+    assert (
+        "answers otherwise"
+        not in cli.done("compare clean.onnx clean.onnx frames").words
+    )
+
+
+@pytest.mark.usefixtures("drawn")
+def test_with_reference_the_runtime_is_what_is_compared(cli: Cli) -> None:
+    found = cli.document("compare own.onnx own.onnx frames --reference")
+
+    assert found["runtime"] is None
+    assert found["outputs"][0]["sqnr_db"] < 20
+
+
+def test_the_command_names_the_module(cli: Cli) -> None:
+    record(cli.folder / "frames", [image(0), image(1)])
+    graph.save(conv_attention(), cli.folder / "a.onnx")
+    wrong = conv_attention()
+    turn_softmax(wrong)
+    graph.save(wrong, cli.folder / "b.onnx")
+
+    said = cli.done("compare a.onnx b.onnx frames --first-difference")
+
+    assert "first below 80 dB: module head, y of" in said.words
+    found = cli.document("compare a.onnx b.onnx frames --first-difference")
+    assert found["outputs_differ"]
+    assert {each["module"] for each in found["values"]} == {"backbone", "head"}
+
+
+def test_the_command_says_that_nothing_differs(cli: Cli) -> None:
+    record(cli.folder / "frames", [image(0)])
+    graph.save(conv_attention(), cli.folder / "a.onnx")
+
+    said = cli.done("compare a.onnx a.onnx frames --first-difference")
+
+    assert "no difference: 3 values at 80 dB or more" in said.words
+
+
+def test_two_ways_to_run_the_nodes_are_refused(cli: Cli) -> None:
+    said = cli.refused("compare a.onnx a.onnx frames --first-difference --reference")
+
+    assert "--first-difference holds two graphs together" in said
