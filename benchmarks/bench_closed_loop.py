@@ -28,15 +28,16 @@ from me2e_compress.driving.contract import Observation, RouteInfo
 from me2e_compress.driving.latency import FixedLatency
 from me2e_compress.driving.onnx_policy import OnnxPolicy
 from me2e_compress.driving.policies import Driver, driver_named
-from me2e_compress.evaluators.highway.conditions import Conditions
+from me2e_compress.evaluators import Drive
 from me2e_compress.evaluators.highway.engine import LocalEngine
-from me2e_compress.evaluators.highway.evaluator import HighwayEvaluator
+from me2e_compress.evaluators.highway.evaluator import Highway
 from me2e_compress.evaluators.highway.expert.expert_policy import Expert
-from me2e_compress.evaluators.highway.worker import Job
+from me2e_compress.evaluators.results import drive_routes
 from me2e_compress.metrics.bench2drive import ABILITIES
 from me2e_compress.metrics.measure import Estimate
 from me2e_compress.metrics.scores import Scores, score
 from me2e_compress.simulator.routes import Route, load_routes, pick_routes
+from me2e_compress.workflows.result import SILENT
 
 LATENCIES_S = (0.0, 0.05, 0.15, 0.25, 0.45, 0.85)
 MODEL_MS = 10.0
@@ -137,9 +138,9 @@ def evaluate(
 ) -> tuple[Scores, float]:
     """Drive, and return the scores and the wall-clock seconds."""
     begun = time.perf_counter()
-    job = Job(driver, Conditions(FixedLatency(latency_us)))
-    one = HighwayEvaluator(job, routes, folder, 220, LocalEngine(workers))
-    scores = score(tuple(one.episodes()))
+    engine, latency = LocalEngine(workers), FixedLatency(latency_us)
+    drive = Drive(latency, routes=routes, set_size=220, engine=engine)
+    scores = score(drive_routes(Highway(), driver, drive, folder, SILENT))
     return scores, time.perf_counter() - begun
 
 

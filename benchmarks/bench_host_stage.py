@@ -19,7 +19,7 @@ import numpy.typing as npt
 
 from me2e_compress.driving.host_stage import CollisionOptimizer, HostWork
 from me2e_compress.driving.onnx_policy import OnnxPolicy
-from me2e_compress.evaluators.highway.conditions import Conditions
+from me2e_compress.evaluators import Drive
 from me2e_compress.evaluators.highway.runner import drive
 from me2e_compress.metrics.route_scores import route_score
 from me2e_compress.shipped.drivers import shipped
@@ -47,7 +47,7 @@ def recorded(routes: str) -> list[tuple[Floats, Outputs]]:
     policy = OnnxPolicy.open(shipped("highway"), stage=Recorder())
     for route in pick_routes(load_routes(), routes):
         scores = [
-            route_score(drive(route, each, Conditions())).composed
+            route_score(drive(route, each, Drive())).composed
             for each in (plain, policy)
         ]
         print(f"{route.id}: driving score {scores[0]:.1f}, with it {scores[1]:.1f}")

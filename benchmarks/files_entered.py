@@ -118,14 +118,17 @@ def compress(folder: Path) -> list[str]:
 
 def evaluate(folder: Path) -> list[str]:
     """Drive one route: in this process, as a worker would in its own."""
+    from me2e_compress.driving.policies import Driver
+    from me2e_compress.evaluators.contract import Drive, Driven
+    from me2e_compress.evaluators.highway import runner
     from me2e_compress.evaluators.highway.engine import LocalEngine
-    from me2e_compress.evaluators.highway.runner import drive
-    from me2e_compress.evaluators.highway.worker import Driven, Job
     from me2e_compress.simulator.routes import Route
 
-    def here(self: LocalEngine, job: Job, routes: Sequence[Route]) -> Iterator[Driven]:
+    def here(
+        self: LocalEngine, policy: Driver, drive: Drive, routes: Sequence[Route]
+    ) -> Iterator[Driven]:
         for route in routes:
-            yield Driven(drive(route, job.driver.open(), job.conditions), 0.0, 0)
+            yield Driven(runner.drive(route, policy.open(), drive), 0.0, 0)
 
     LocalEngine.drive = here  # type: ignore[method-assign]
     return ["evaluate", "highway", "--routes", "1", "-o", str(folder / "driven")]

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from me2e_compress.manager import PassManager, Report, Step, Verification
     from me2e_compress.passes import PASSES, Context, Pass, PassResult
     from me2e_compress.study import StudyResult, load_study, run_study
-    from me2e_compress.study.write import write_study
+    from me2e_compress.study.report.page import write_study
     from me2e_compress.workflows.calibrate import (
         CalibrateResult,
         RangesResult,

@@ -14,7 +14,6 @@ from matplotlib.patches import Polygon
 from pydantic import ConfigDict, TypeAdapter, with_config
 
 from me2e_compress.errors import StudyError
-from me2e_compress.evaluators.highway.worker import Job
 from me2e_compress.metrics.episode import COLLISIONS, InfractionKind
 from me2e_compress.metrics.route_summary import RouteSummary
 from me2e_compress.registry import documents, drafts
@@ -24,9 +23,7 @@ from me2e_compress.simulator.routes import Route
 from me2e_compress.simulator.scene import Actor, Ego
 from me2e_compress.simulator.world import World
 from me2e_compress.study.drive_record import DriveRecord
-from me2e_compress.study.report.figures import WIDTH_IN
-from me2e_compress.study.report.style import MUTED, RULE, styled
-from me2e_compress.study.side_by_side import watch
+from me2e_compress.study.report.figures import MUTED, RULE, WIDTH_IN, styled
 
 FILE = "accident.json"
 BEFORE_US, EVERY_US = 3_000_000, 500_000
@@ -105,14 +102,14 @@ def first_accident(record: DriveRecord) -> RouteSummary | None:
     return None
 
 
-def watched(
-    record: DriveRecord, happened: RouteSummary, route: Route, job: Job
+def accident_of(
+    record: DriveRecord, happened: RouteSummary, route: Route, seen: Sequence[Moment]
 ) -> Accident:
-    """Drive the route of an accident again, and keep its last seconds."""
+    """Return the last seconds of a route that was driven again."""
     from_us = happened.duration_us - BEFORE_US
     moments = (
         _planned(each)
-        for each in watch(job, route, happened.duration_us)
+        for each in seen
         if (since_us := each.scene.time_us - from_us) >= 0 and not since_us % EVERY_US
     )
     partner = next(who for kind, _, who in happened.infractions if kind in COLLISIONS)

@@ -119,7 +119,7 @@ def _crossed_steps(
         median = result.fact(each.variant).latency_ms(50)
         if condition is None or not condition.traced or median is None:
             continue
-        step = condition.settings.dt_us / 1e3
+        step = condition.drive.dt_us / 1e3
         edge = step * round(median / step)
         if abs(median - edge) <= NOISE * median:
             found.append(

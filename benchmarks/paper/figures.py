@@ -13,8 +13,15 @@ from benchmarks.paper.cells import held_at
 from benchmarks.paper.drives import PaperDrives
 from benchmarks.paper.published import RATES
 from me2e_compress.metrics.route_summary import DC, DE, DS, RouteColumn
-from me2e_compress.study.report.figures import WIDTH_IN
-from me2e_compress.study.report.style import ACCENT, BASELINE, INK, MUTED, RULE, styled
+from me2e_compress.study.report.figures import (
+    ACCENT,
+    BASELINE,
+    INK,
+    MUTED,
+    RULE,
+    WIDTH_IN,
+    styled,
+)
 from me2e_compress.study.workload import held_frames
 
 RATE_TICKS = (1, 2, 3, 5, 10, 20, 30)

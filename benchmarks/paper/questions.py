@@ -12,7 +12,7 @@ from pydantic import ConfigDict, TypeAdapter, with_config
 from me2e_compress.errors import StudyError
 from me2e_compress.registry import documents
 from me2e_compress.study.cells import MINUS, number
-from me2e_compress.study.study_blocks import check_unique
+from me2e_compress.study.definition import check_unique
 
 SHIPPED = Path(__file__).parent / "questions.toml"
 FILE = "questions.toml"

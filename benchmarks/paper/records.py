@@ -7,7 +7,7 @@ from functools import partial
 from pathlib import Path
 
 from benchmarks.paper.accident import FILE as ACCIDENT
-from benchmarks.paper.accident import Accident, first_accident, watched
+from benchmarks.paper.accident import Accident, accident_of, first_accident
 from benchmarks.paper.drives import FILE, KeptFacts
 from benchmarks.paper.questions import FILE as QUESTIONS
 from benchmarks.paper.questions import SHIPPED, PaperQuestions
@@ -15,11 +15,12 @@ from benchmarks.paper.result import PaperResult
 from benchmarks.paper.weigh import weigh, weighed
 from me2e_compress.errors import StudyError
 from me2e_compress.evaluators.highway.engine import LocalEngine
+from me2e_compress.evaluators.highway.render import watch
+from me2e_compress.simulator.routes import Route
 from me2e_compress.study import Listener, Study
 from me2e_compress.study.drive_record import DriveRecord
-from me2e_compress.study.drives import DriveSetup
 from me2e_compress.study.prepared import PreparedVariant
-from me2e_compress.study.run import prepare_study
+from me2e_compress.study.run import StudyCells, prepare_study
 from me2e_compress.study.workload import held_frames
 from me2e_compress.study.workspace import Workspace
 
@@ -103,7 +104,7 @@ def _of_these_routes(study: Study, found: Sequence[DriveRecord], folder: Path) -
     return replace(study, routes=routes, set_size=found[0].made_by["set_size"])
 
 
-def _keep_accident(setup: DriveSetup, prepared: Sequence[PreparedVariant]) -> None:
+def _keep_accident(setup: StudyCells, prepared: Sequence[PreparedVariant]) -> None:
     """Record the baseline's first accident, at the highest rate that has one, once."""
     path = setup.workspace.folder / RECORDS / ACCIDENT
     if path.is_file():
@@ -115,12 +116,14 @@ def _keep_accident(setup: DriveSetup, prepared: Sequence[PreparedVariant]) -> No
         file = setup.workspace.record(study.reference, condition)
         record = DriveRecord.load(file) if file.is_file() else None
         happened = None if record is None else first_accident(record)
-        job = None if happened is None else setup.job(driver, condition)
-        if record is None or happened is None or job is None:
+        drive = None if happened is None else setup.drive(driver, condition)
+        if record is None or happened is None or drive is None:
             continue
         # drive the route again, this time watched
-        route = next(each for each in study.routes if each.id == happened.route)
-        found = watched(record, happened, route, job)
+        routes = (each for each in study.routes if isinstance(each, Route))
+        route = next(each for each in routes if each.id == happened.route)
+        moments = watch(driver.driver, drive, route, happened.duration_us)
+        found = accident_of(record, happened, route, moments)
         if found.moments:
             found.save(path)
             return

@@ -17,8 +17,8 @@ from benchmarks.paper.findings import (
 )
 from benchmarks.paper.tables import all_paper_tables
 from me2e_compress.display import Table
+from me2e_compress.study.report.figures import styled, svg
 from me2e_compress.study.report.page import Drawing, Page, Section
-from me2e_compress.study.report.style import styled, svg
 
 
 @dataclass(frozen=True)

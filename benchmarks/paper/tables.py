@@ -28,7 +28,7 @@ from benchmarks.paper.published import PublishedDrive
 from me2e_compress.display import Cell, Table
 from me2e_compress.metrics.route_summary import PERCENTS
 from me2e_compress.study.cells import MISSING
-from me2e_compress.study.study_blocks import StudyBlock
+from me2e_compress.study.definition import StudyBlock
 from me2e_compress.study.workload import held_frames
 
 OURS = (

@@ -22,9 +22,9 @@ from me2e_compress.runtime.energy.meter import measure_energy
 from me2e_compress.runtime.profile import record_traces
 from me2e_compress.runtime.providers import CPU
 from me2e_compress.study.definition import Study
-from me2e_compress.study.drives import DriveSetup
 from me2e_compress.study.outcome import this_machine
 from me2e_compress.study.prepared import PreparedVariant
+from me2e_compress.study.run import StudyCells
 from me2e_compress.study.timing import Clock
 from me2e_compress.workflows.inspect import inspect
 from me2e_compress.workflows.options import InspectOptions, ProfileOptions
@@ -73,7 +73,7 @@ def int8_counts(path: Path) -> Int8Counts | None:
 
 
 def weigh(
-    setup: DriveSetup,
+    setup: StudyCells,
     prepared: Sequence[PreparedVariant],
     others: Sequence[ModelFacts],
 ) -> None:

@@ -151,12 +151,12 @@ def study(
         engine: local, ray, or ray:ADDRESS of a cluster
     """
     need_extra("highway", "a study")
-    from me2e_compress.evaluators.highway.evaluator import engine_of
+    from me2e_compress.evaluators.highway.engine import engine_of
     from me2e_compress.study import load_study
+    from me2e_compress.study.report.page import write_study
     from me2e_compress.study.run import run_study
     from me2e_compress.study.workload import workload
     from me2e_compress.study.workspace import HTML, JSON, MARKDOWN
-    from me2e_compress.study.write import write_study
     from me2e_compress.workflows.checks import check_folder
 
     # read and check everything that the study needs before it starts

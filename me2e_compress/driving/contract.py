@@ -1,4 +1,4 @@
-"""The driving contract: what a policy and an evaluator implement.
+"""The driving contract: what a policy implements.
 
 A policy is any object with the members of `Policy`; there is no class to derive from.
 An evaluator calls ``reset`` before each route and ``plan`` at each decision. The
@@ -22,15 +22,13 @@ in `me2e_compress.driving.realtime`, what a decision costs in
 `me2e_compress.driving.latency`.
 """
 
-from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import ClassVar, NamedTuple, Protocol, TypeAlias, runtime_checkable
+from typing import NamedTuple, Protocol, TypeAlias, runtime_checkable
 
 import numpy as np
 import numpy.typing as npt
 
 from me2e_compress.errors import EvaluationError
-from me2e_compress.metrics.episode import Episode
 from me2e_compress.runtime.frames import Array
 from me2e_compress.runtime.plan_adapter import Trajectory
 from me2e_compress.runtime.session import DTYPES, SessionPort
@@ -41,14 +39,12 @@ __all__ = [
     "PLAN_STEP_US",
     "Answer",
     "EgoKinematics",
-    "Evaluator",
     "HostedPolicy",
     "Observation",
     "PedalsAndWheel",
     "Plan",
     "Policy",
     "RouteInfo",
-    "SizedEvaluator",
     "Trajectory",
 ]
 
@@ -235,30 +231,6 @@ class HostedPolicy(Policy, Protocol):
     @property
     def host_cells(self) -> int:
         """Return the number of occupied cells taken into account."""
-        ...
-
-
-class Evaluator(Protocol):
-    """A source of driven episodes; it reports what happened and scores nothing."""
-
-    name: ClassVar[str]
-
-    def episodes(self) -> Iterator[Episode]:
-        """Yield one episode per route, in a fixed order, reproducible for a given seed.
-
-        Raises:
-            EvaluationError: It cannot go on; the message is one line.
-        """
-        ...
-
-
-@runtime_checkable
-class SizedEvaluator(Evaluator, Protocol):
-    """An evaluator that may yield a part of its set."""
-
-    @property
-    def set_size(self) -> int:
-        """The number of routes of the whole set; fewer make a partial result."""
         ...
 
 

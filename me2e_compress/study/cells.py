@@ -3,12 +3,13 @@
 from me2e_compress.display import Cell
 from me2e_compress.display import number as plain_number
 from me2e_compress.metrics.measure import Estimate, Measure
-from me2e_compress.study.plan_fidelity import EXACT
 
 MISSING = "\N{EN DASH}"
 """Shown if nothing was measured."""
 INFINITE = "\N{INFINITY}"
 MINUS = "\N{MINUS SIGN}"
+EXACT = "no noise: equal to the bit"
+"""Reason why an unchanged plan has no signal-to-noise ratio."""
 
 
 def estimate_cell(
@@ -22,8 +23,7 @@ def estimate_cell(
     text = number(measure.value, form)
     if estimate.low is None or estimate.high is None:
         return Cell(text)
-    low, high = (number(each, form) for each in (estimate.low, estimate.high))
-    return Cell(text, f"{low} to {high}")
+    return Cell(text, f"{number(estimate.low, form)} to {number(estimate.high, form)}")
 
 
 def anew_cell(estimate: Estimate) -> Cell:

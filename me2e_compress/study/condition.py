@@ -1,9 +1,11 @@
 """A condition of a study: latency of decisions, world step, weather."""
 
 import functools
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+import re
+from dataclasses import dataclass
 from typing import Any
+
+from pydantic import ConfigDict, with_config
 
 from me2e_compress.display import counted
 from me2e_compress.driving.latency import (
@@ -13,16 +15,27 @@ from me2e_compress.driving.latency import (
     with_draws,
 )
 from me2e_compress.errors import EvaluationError, StudyError
-from me2e_compress.evaluators.highway.conditions import ConditionOptions, Conditions
+from me2e_compress.evaluators import Drive
 from me2e_compress.registry import name_in
-from me2e_compress.study.study_blocks import check_name
 
 TRACE = "trace"
 """The latency of each model's own trace, times the device scale."""
 
+FORM = ConfigDict(strict=True, extra="forbid", arbitrary_types_allowed=True)
+_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_+-]*")
 
+
+def check_name(kind: str, name: str) -> None:
+    """Check that a name can name a folder: it begins with a letter or digit."""
+    if _NAME.fullmatch(name) is None:
+        raise StudyError(
+            f"{kind} {name!r}: a name is made of letters, digits, '_', '+' and '-'"
+        )
+
+
+@with_config(FORM)
 @dataclass(frozen=True)
-class Condition(ConditionOptions):
+class Condition:
     """The conditions that a variant drives under.
 
     Args:
@@ -37,6 +50,7 @@ class Condition(ConditionOptions):
         seed: Seed of draws from traces; None takes the study's.
         against: Another condition that differs from this one in one thing: drives are
             compared with those under it, route by route.
+        latency_model: As of ``evaluate``, and so ``dt_ms``, ``weather``, ``drive_on``.
 
     Raises:
         StudyError: The name is invalid, or options do not go together.
@@ -50,6 +64,10 @@ class Condition(ConditionOptions):
     limit_fps: float | None = None
     seed: int | None = None
     against: str = ""
+    latency_model: str = "drop"
+    dt_ms: float = 50.0
+    weather: str = ""
+    drive_on: bool = False
 
     def __post_init__(self) -> None:
         check_name("condition", self.name)
@@ -61,11 +79,18 @@ class Condition(ConditionOptions):
             )
         try:
             source = None if self.mean_of else self.source(0)
-            self.settings  # noqa: B018
+            self.drive  # noqa: B018
         except EvaluationError as error:
             raise EvaluationError(f"condition {self.name}: {error}") from error
         if source is not None and source.measures:
             raise StudyError(self._refusal())
+
+    @functools.cached_property
+    def drive(self) -> Drive:
+        """The drive without its latency, which is each variant's, and its routes."""
+        return Drive.of_words(
+            self.latency_model, self.dt_ms, self.weather, self.drive_on
+        )
 
     def source(self, seed: int) -> LatencySource:
         """Return the latency source; one that lacks its trace waits for a model's.
@@ -78,9 +103,11 @@ class Condition(ConditionOptions):
 
     @functools.cached_property
     def _parsed(self) -> LatencySource:
-        if self._names_a_file:
+        text = self.latency
+        names_a_file = text.startswith(TRACE) and name_in(text) != TRACE
+        if names_a_file or "trace:" in text or "trace=" in text:
             raise StudyError(self._refusal())
-        source = LATENCY_SOURCES.parse(self.latency)
+        source = LATENCY_SOURCES.parse(text)
         if self.limit_fps is None:
             return source
         return LimitedLatency(source, self.limit_fps)
@@ -91,18 +118,40 @@ class Condition(ConditionOptions):
         return not self.mean_of and self._parsed.lacks_trace
 
     @property
-    def mean_cell(self) -> tuple[str, str]:
-        """Variant and condition of the drive whose mean is charged."""
-        variant, _, condition = self.mean_of.partition(".")
-        return variant, condition
-
-    def drives(self, latency: LatencySource, image_size: tuple[int, int]) -> Conditions:
-        """Return the conditions of a drive; ``image_size`` is rows and columns."""
-        return replace(self.settings, latency=latency, image_size=image_size)
+    def asks_for(self) -> tuple[str, ...]:
+        """What an evaluator must take to drive under it."""
+        asked = {
+            "latency": self.latency != "none",
+            "latency_model": self.latency_model != "drop",
+            "dt_ms": self.dt_ms != 50.0,
+            "weather": bool(self.weather),
+            "drive_on": self.drive_on,
+        }
+        return tuple(name for name, is_asked in asked.items() if is_asked)
 
     def described(self, device: str) -> str:
         """Describe it for the head of a table; ``device`` is that of the traces."""
-        return ", ".join([f"{self.name}: {self._cost(device)}", *self._changes()])
+        changes = {
+            "in the trace's order": self.in_order,
+            f"limited to {_per_second(self.limit_fps or 0)}": self.limit_fps,
+            "every control late (fifo)": self.latency_model != "drop",
+            f"a step of {self.dt_ms:g} ms": self.dt_ms != 50.0,
+            f"weather {self.weather}": self.weather,
+            "driving on after collisions": self.drive_on,
+        }
+        words = [words for words, changed in changes.items() if changed]
+        return ", ".join([f"{self.name}: {self._cost(device)}", *words])
+
+    def _cost(self, device: str) -> str:
+        if self.mean_of:
+            return f"every decision costs the mean of {self.mean_of}"
+        if self.latency == "none":
+            return "decisions cost no time"
+        if self.latency == TRACE:
+            return f"each model's own latency, {device}"
+        if name_in(self.latency) == "fps" and ":" in self.latency:
+            return _per_second(float(self.latency.removeprefix("fps:")))
+        return f"{self.latency}, {device}" if self.traced else self.latency
 
     def to_json(self) -> dict[str, Any]:
         """Return every option; ``charged`` is the latency, None for a mean."""
@@ -119,12 +168,6 @@ class Condition(ConditionOptions):
             "against": self.against or None,
         } | ({"drive_on": True} if self.drive_on else {})
 
-    @property
-    def _names_a_file(self) -> bool:
-        if self.latency.startswith(TRACE) and name_in(self.latency) != TRACE:
-            return True
-        return "trace:" in self.latency or "trace=" in self.latency
-
     def _refusal(self) -> str:
         return (
             f"condition {self.name}: latency {self.latency!r}: a study knows none, "
@@ -132,72 +175,6 @@ class Condition(ConditionOptions):
             "trace = FILE)"
         )
 
-    def _cost(self, device: str) -> str:
-        if self.mean_of:
-            return f"every decision costs the mean of {self.mean_of}"
-        if self.latency == "none":
-            return "decisions cost no time"
-        if self.latency == TRACE:
-            return f"each model's own latency, {device}"
-        if name_in(self.latency) == "fps" and ":" in self.latency:
-            return _per_second(float(self.latency.removeprefix("fps:")))
-        return f"{self.latency}, {device}" if self.traced else self.latency
-
-    def _changes(self) -> list[str]:
-        said = {
-            "in the trace's order": self.in_order,
-            f"limited to {_per_second(self.limit_fps or 0)}": self.limit_fps,
-            "every control late (fifo)": self.latency_model != "drop",
-            f"a step of {self.dt_ms:g} ms": self.dt_ms != 50.0,
-            f"weather {self.weather}": self.weather,
-            "driving on after collisions": self.drive_on,
-        }
-        return [words for words, true in said.items() if true]
-
 
 def _per_second(fps: float) -> str:
     return f"{counted(fps, 'decision')} a second"
-
-
-def check_conditions(conditions: Sequence[Condition], variants: Sequence[str]) -> None:
-    """Check that means refer to earlier drives, and ``against`` to conditions."""
-    before = list[str]()
-    names = [each.name for each in conditions]
-    for each in conditions:
-        variant, condition = each.mean_cell
-        if each.mean_of and (variant not in variants or condition not in before):
-            raise StudyError(
-                f"condition {each.name}: mean_of {each.mean_of!r} is no"
-                " VARIANT.CONDITION of a condition before it"
-            )
-        if each.against and (each.against not in names or each.against == each.name):
-            raise StudyError(
-                f"condition {each.name}: against {each.against!r} is not another"
-                f" condition; there are {', '.join(names)}"
-            )
-        before.append(each.name)
-
-
-def check_conditions_elsewhere(evaluator: str, conditions: Sequence[Condition]) -> None:
-    """Refuse conditions that only highway understands."""
-    for each in conditions:
-        if each != Condition(each.name, "none"):
-            raise StudyError(
-                f"condition {each.name}: {evaluator} has conditions of its own, in its "
-                'options: only latency = "none" goes with it'
-            )
-
-
-def check_pairs(
-    pairs: Sequence[tuple[str, str]],
-    variants: Sequence[str],
-    conditions: Sequence[str],
-) -> None:
-    """Check that pairs name drives of the study."""
-    there = {f"{one}.{other}" for one in variants for other in conditions}
-    for name in (name for pair in pairs for name in pair):
-        if name not in there:
-            raise StudyError(
-                f"pair: {name!r} is no VARIANT.CONDITION; there are "
-                f"{', '.join(variants)} and {', '.join(conditions)}"
-            )

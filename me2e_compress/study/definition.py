@@ -1,64 +1,146 @@
-"""Definition of a study: variants, conditions, baseline, routes."""
+"""A study, as its file says it: variants, conditions, baseline, routes."""
 
-from collections.abc import Iterator, Sequence
+from __future__ import annotations
+
+import functools
+from collections import Counter
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Annotated, NamedTuple
+
+from pydantic import (
+    AfterValidator,
+    BeforeValidator,
+    Field,
+    PlainValidator,
+    ValidationInfo,
+    with_config,
+)
+from pydantic_core import PydanticCustomError
 
 from me2e_compress.calibration.dataset import CalibrationSet
-from me2e_compress.driving.policies import driver_named
-from me2e_compress.errors import FramesError, StudyError
+from me2e_compress.driving.contract import RouteInfo
+from me2e_compress.driving.policies import POLICIES, driver_named
+from me2e_compress.driving.shipped_adapters import adapter_file, shipped_adapters
+from me2e_compress.errors import EvaluationError, FramesError, StudyError
+from me2e_compress.evaluators.contract import Evaluator, evaluator_named
 from me2e_compress.evaluators.highway.drivers import OnnxDriver
+from me2e_compress.manager import recipe as recipes
 from me2e_compress.passes import Pass
 from me2e_compress.runtime.providers import CPU, Provider
-from me2e_compress.simulator.routes import Route
-from me2e_compress.study.condition import (
-    Condition,
-    check_conditions,
-    check_conditions_elsewhere,
-    check_pairs,
-)
-from me2e_compress.study.study_blocks import (
-    FramesToRecord,
-    StudyBlock,
-    check_name,
-    check_unique,
-)
-from me2e_compress.workflows.other_evaluators import HIGHWAY, is_highway
+from me2e_compress.shipped.drivers import SHIPPED
+from me2e_compress.study.condition import FORM, Condition, check_name
+from me2e_compress.workflows.checks import model_path
 
 
+def check_unique(kind: str, names: Iterable[str]) -> None:
+    """Check that there are names, without repetition."""
+    counts = Counter(names)
+    if not counts:
+        raise StudyError(f"the study has no {kind}")
+    name, count = counts.most_common(1)[0]
+    if count > 1:
+        raise StudyError(f"{count} {kind}s are named {name}")
+
+
+# What a file names lies beside it: its folder is the context of the validation, which
+# Python's own objects do not go through.
+
+
+def _folder(info: ValidationInfo) -> Path:
+    return Path(info.context or "")
+
+
+def _beside(name: object, info: ValidationInfo) -> object:
+    return str(_folder(info) / name) if isinstance(name, str) else name
+
+
+def _adapter(name: object, info: ValidationInfo) -> object:
+    """Return the path of a file beside the study, else of an adapter that ships."""
+    if isinstance(name, str) and name in shipped_adapters():
+        file = _folder(info) / name
+        return str(file if file.is_file() else adapter_file(Path(name)))
+    return _beside(name, info)
+
+
+def _file_or_name(name: str, info: ValidationInfo) -> str:
+    """Return the path of a file beside the study, else what ships by that name."""
+    file = _folder(info) / name
+    return str(file) if file.is_file() else name
+
+
+def _policy(text: str, info: ValidationInfo) -> str:
+    """Return the policy with the path of its model; a file of a model's name wins."""
+    folder = _folder(info)
+    if not text:
+        return text
+    if text in SHIPPED:
+        text = str(model_path(text, folder))
+    driver = driver_named(text)
+    if not isinstance(driver, OnnxDriver):
+        return text
+    return POLICIES.text(replace(driver, path=model_path(driver.path, folder)))
+
+
+def _passes(given: object) -> tuple[Pass, ...]:
+    if not isinstance(given, str):
+        raise PydanticCustomError("passes", "Input should be a valid string")
+    return recipes.parse(given)
+
+
+File = Annotated[Path, BeforeValidator(_beside)]
+Name = Annotated[str, AfterValidator(_file_or_name)]
+PolicyText = Annotated[str, AfterValidator(_policy)]
+
+
+@with_config(FORM)
 @dataclass(frozen=True)
 class Variant:
     """One driver to compare: a file as it is, or the result of passes.
 
     Args:
         name: Letters, digits, ``_``, ``+`` and ``-``; names its folder of results.
-        policy: A policy by name, ``blind:8``, or the path of an ONNX file.
+        policy: A policy by name, ``blind:8``, or the path of an ONNX file; what it says
+            of adapter and host stage holds where the variant says nothing. Empty takes
+            the study's.
         passes: Passes applied to the file; none leaves it as it is.
         module_map: Preset or TOML file for the passes; None finds the preset.
         adapter: TOML file that adapts the model to the policy contract.
         trace: Latencies recorded on a device; None measures them here.
         host_stage: Changes the model's plan on the host, as a text; a trace does not
             include its time, see the latency source ``host-stage``.
+        recipe: Passes by the name or the file of a recipe, instead of ``passes``.
 
     Raises:
         StudyError: The name is invalid, or passes, an adapter or a trace lack a model.
     """
 
     name: str
-    policy: str
-    passes: tuple[Pass, ...] = ()
-    module_map: str | None = None
-    adapter: Path | None = None
-    trace: Path | None = None
+    policy: PolicyText = ""
+    passes: Annotated[tuple[Pass, ...], PlainValidator(_passes)] = ()
+    module_map: Annotated[Name | None, Field(alias="map")] = None
+    adapter: Annotated[Path | None, BeforeValidator(_adapter)] = None
+    trace: File | None = None
     host_stage: str = ""
+    recipe: Name | None = None
 
     def __post_init__(self) -> None:
         check_name("variant", self.name)
-        options = (
-            *(self.passes, self.module_map, self.adapter, self.trace),
-            self.host_stage,
-        )
-        if not self.is_model and any(options):
+        if self.recipe is not None and self.passes:
+            raise StudyError(f"variant {self.name}: give a recipe or passes, not both")
+        if self.recipe is not None:
+            object.__setattr__(self, "passes", recipes.load(self.recipe))
+            object.__setattr__(self, "recipe", None)
+        driver = driver_named(self.policy) if self.policy else None
+        if isinstance(driver, OnnxDriver):
+            object.__setattr__(self, "policy", str(driver.path))
+            object.__setattr__(self, "adapter", self.adapter or driver.adapter)
+            stage = self.host_stage or str(driver.host_stage or "")
+            object.__setattr__(self, "host_stage", stage)
+        elif driver is not None and any(
+            (self.passes, self.module_map, self.adapter, self.trace, self.host_stage)
+        ):
             raise StudyError(
                 f"variant {self.name}: {self.policy} is not a model: there is nothing "
                 "to compress, adapt or time"
@@ -70,6 +152,7 @@ class Variant:
         return isinstance(driver_named(self.policy), OnnxDriver)
 
 
+@with_config(FORM)
 @dataclass(frozen=True)
 class Timing:
     """How latencies are measured, and which device they represent.
@@ -99,6 +182,61 @@ class Timing:
             raise StudyError(f"latency: a median of {median_s} s is not positive")
 
 
+@with_config(FORM)
+@dataclass(frozen=True)
+class StudyBlock:
+    """Some variants under some conditions, named in the order of the block's tables.
+
+    Raises:
+        StudyError: A name is invalid, or there is nothing to drive.
+    """
+
+    name: str
+    variants: tuple[str, ...]
+    conditions: tuple[str, ...]
+
+    def __post_init__(self) -> None:
+        check_name("block", self.name)
+        if not self.variants or not self.conditions:
+            raise StudyError(f"block {self.name}: there is nothing to drive")
+
+
+@with_config(FORM)
+@dataclass(frozen=True)
+class FramesToRecord:
+    """Frames of the baseline that a study records itself, on fresh routes.
+
+    Args:
+        frames: Number of frames to calibrate on.
+        held_out: Number of frames to measure fidelity and latency on, of the next seed.
+        seed: Seed of the routes.
+
+    Raises:
+        StudyError: There are none at all, or the seed is negative.
+    """
+
+    frames: int
+    held_out: int
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        if min(self.frames, self.held_out) < 1:
+            raise StudyError(
+                f"record: {self.frames} frames and {self.held_out} held out: both must"
+                " be 1 or more"
+            )
+        if self.seed < 0:
+            raise StudyError(f"record: seed {self.seed}: must be 0 or more")
+
+
+class Pair(NamedTuple):
+    """Two drives to compare, ``VARIANT.CONDITION`` of both."""
+
+    of: str
+    against: str
+
+
+@with_config(FORM)
 @dataclass(frozen=True)
 class Study:
     """Variants x conditions on the same routes.
@@ -108,38 +246,44 @@ class Study:
         variants: In the order of the tables.
         conditions: In the order of the tables.
         baseline: Name of the variant that the others are compared with.
+        routes: Empty only where the evaluator takes none.
         set_size: Number of routes of the whole set.
         frames: Folder of recorded frames that passes calibrate on.
         held_out: Folder of other frames, for measuring fidelity and latency.
+        timing: How latencies are measured.
         seed: Seed of bootstraps, of passes and of draws from traces.
         provider: Execution provider for all models.
         to_record: Frames that the study records itself; None uses the folders.
         blocks: Which variants drive under which conditions; empty means all under all.
             Under each condition the baseline drives too.
-        pairs: Drives to compare, ``VARIANT.CONDITION`` of both.
-        evaluator: ``highway``, or another evaluator by its name and options, with
-            routes and conditions of its own.
+        pairs: Drives to compare.
+        evaluator: Who drives, ``name{option=value}``.
+        policy: That of variants that name none.
+        plugins: Libraries of operators for the provider.
 
     Raises:
         StudyError: There is nothing to drive, a name is repeated or unknown, the seed
             is negative, or passes or a trace lack frames.
+        EvaluationError: The evaluator or its routes are unknown.
     """
 
     title: str
-    variants: tuple[Variant, ...]
-    conditions: tuple[Condition, ...]
+    variants: Annotated[tuple[Variant, ...], Field(alias="variant")]
+    conditions: Annotated[tuple[Condition, ...], Field(alias="condition")]
     baseline: str
-    routes: tuple[Route, ...]
-    set_size: int
-    frames: Path | None = None
-    held_out: Path | None = None
-    timing: Timing = field(default_factory=Timing)
+    routes: Annotated[Sequence[RouteInfo], PlainValidator(tuple)] = ()
+    set_size: int = 0
+    frames: File | None = None
+    held_out: File | None = None
+    timing: Annotated[Timing, Field(alias="latency")] = field(default_factory=Timing)
     seed: int = 0
     provider: Provider = CPU
-    to_record: FramesToRecord | None = None
-    blocks: tuple[StudyBlock, ...] = ()
-    pairs: tuple[tuple[str, str], ...] = ()
-    evaluator: str = HIGHWAY
+    to_record: Annotated[FramesToRecord | None, Field(alias="record")] = None
+    blocks: Annotated[tuple[StudyBlock, ...], Field(alias="block")] = ()
+    pairs: Annotated[tuple[Pair, ...], Field(alias="pair")] = ()
+    evaluator: str = "highway"
+    policy: PolicyText = ""
+    plugins: tuple[File, ...] = ()
 
     def __post_init__(self) -> None:
         # names must be unique, and refer to something
@@ -151,20 +295,29 @@ class Study:
                 f"baseline {self.baseline!r} is not a variant; there are"
                 f" {', '.join(names)}"
             )
-        check_conditions(self.conditions, names)
-        check_pairs(self.pairs, names, [each.name for each in self.conditions])
-        # routes belong to highway only
-        if self.elsewhere:
-            self._check_elsewhere()
-        elif not self.routes:
-            raise StudyError(f"{self.title}: there is no route to drive")
+        self._check_conditions(names)
+        self._check_blocks_and_pairs(names)
         if self.seed < 0:
             raise StudyError(f"seed {self.seed}: must be 0 or more")
-        # blocks name variants and conditions
-        for block in self.blocks:
-            block.check(names, [each.name for each in self.conditions])
+        # variants that name no policy take the study's
+        for each in self.variants:
+            if not (each.policy or self.policy):
+                raise StudyError(
+                    f"variant {each.name}: neither it nor the study names a policy"
+                )
+        variants = (
+            each if each.policy else replace(each, policy=self.policy)
+            for each in self.variants
+        )
+        object.__setattr__(self, "variants", tuple(variants))
+        self._check_evaluator()
         if self.to_record is None:
             self._check_frames()
+
+    @functools.cached_property
+    def driven_by(self) -> Evaluator:
+        """The evaluator, built from its text."""
+        return evaluator_named(self.evaluator)
 
     @property
     def preview(self) -> str:
@@ -173,22 +326,58 @@ class Study:
         partial = 0 < driven < whole
         return f" (preview: {driven} of {whole} routes)" if partial else ""
 
-    @property
-    def elsewhere(self) -> bool:
-        """Whether an evaluator other than highway drives."""
-        return not is_highway(self.evaluator)
-
-    def _check_elsewhere(self) -> None:
-        adapted = [each.name for each in self.variants if each.adapter is not None]
-        for what, given in (
-            ("routes", bool(self.routes)),
-            (f"the adapter of {', '.join(adapted)}", bool(adapted)),
-        ):
-            if given:
+    def _check_conditions(self, variants: Sequence[str]) -> None:
+        """Check that means refer to earlier drives, and ``against`` to conditions."""
+        before = list[str]()
+        names = [each.name for each in self.conditions]
+        for each in self.conditions:
+            variant, _, condition = each.mean_of.partition(".")
+            if each.mean_of and (variant not in variants or condition not in before):
                 raise StudyError(
-                    f"{what}: only highway understands that, not {self.evaluator}"
+                    f"condition {each.name}: mean_of {each.mean_of!r} is no"
+                    " VARIANT.CONDITION of a condition before it"
                 )
-        check_conditions_elsewhere(self.evaluator, self.conditions)
+            if each.against and each.against not in {*names} - {each.name}:
+                raise StudyError(
+                    f"condition {each.name}: against {each.against!r} is not another"
+                    f" condition; there are {', '.join(names)}"
+                )
+            before.append(each.name)
+
+    def _check_blocks_and_pairs(self, variants: Sequence[str]) -> None:
+        conditions = [each.name for each in self.conditions]
+        for block in self.blocks:
+            for kind, named, there in (
+                ("variant", block.variants, variants),
+                ("condition", block.conditions, conditions),
+            ):
+                for name in named:
+                    if name not in there:
+                        raise StudyError(
+                            f"block {block.name}: no {kind} {name}; there are "
+                            f"{', '.join(there)}"
+                        )
+        drives = {f"{one}.{other}" for one in variants for other in conditions}
+        for name in (name for pair in self.pairs for name in pair):
+            if name not in drives:
+                raise StudyError(
+                    f"pair: {name!r} is no VARIANT.CONDITION; there are "
+                    f"{', '.join(variants)} and {', '.join(conditions)}"
+                )
+
+    def _check_evaluator(self) -> None:
+        """Check that the evaluator takes all that variants and conditions ask for."""
+        try:
+            for variant in self.variants:
+                asked = ["policy"] if variant.adapter is None else ["policy", "adapter"]
+                self.driven_by.check_takes(asked, f"variant {variant.name}: ")
+            for condition in self.conditions:
+                whose = f"condition {condition.name}: "
+                self.driven_by.check_takes(condition.asks_for, whose)
+            if self.routes:
+                self.driven_by.check_takes(["routes"], "routes: ")
+        except EvaluationError as error:
+            raise StudyError(str(error)) from error
 
     def _check_frames(self) -> None:
         # passes that calibrate need frames
@@ -221,17 +410,22 @@ class Study:
             yield from filter(None, named)
             yield from (file for step in each.passes for file in step.files())
 
-    def check_recordings(self) -> None:
-        """Check that its recordings are valid and its variants' files exist."""
+    def check(self) -> None:
+        """Check that there are routes and recordings, and that files exist.
+
+        Raises:
+            StudyError: There are none, or one is not valid.
+        """
+        if not self.routes and "routes" in self.driven_by.takes:
+            raise StudyError(f"{self.title}: there is no route to drive")
         for each in self.variants:
             for key, file in (("adapter", each.adapter), ("trace", each.trace)):
                 if file is not None and not file.is_file():
                     raise StudyError(f"variant {each.name}: {key} {file}: no such file")
         for name, folder in (("frames", self.frames), ("held_out", self.held_out)):
-            if folder is None:
-                continue
             try:
-                CalibrationSet(folder)
+                if folder is not None:
+                    CalibrationSet(folder)
             except FramesError as error:
                 raise StudyError(f"{name}: {error}") from error
 
@@ -243,15 +437,14 @@ class Study:
         wanted = {name for each in blocks for name in (*each.variants, self.baseline)}
         return tuple(each for each in self.variants if each.name in wanted)
 
-    def of_blocks(self, names: Sequence[str]) -> "Study":
+    def of_blocks(self, names: Sequence[str]) -> Study:
         """Return the part that some blocks need."""
         there = {each.name: each for each in self.blocks}
-        chosen = list[StudyBlock]()
         for name in names:
             if name not in there:
                 known = ", ".join(there) or "none"
                 raise StudyError(f"no block {name}; there are {known}")
-            chosen.append(there[name])
+        chosen = [there[name] for name in names]
         drive = {self.baseline, *(name for each in chosen for name in each.variants)}
         under = {name for each in chosen for name in each.conditions}
         return replace(
@@ -265,3 +458,9 @@ class Study:
     def reference(self) -> Variant:
         """The baseline variant."""
         return next(each for each in self.variants if each.name == self.baseline)
+
+    def drive_of(self, name: str) -> tuple[Variant, Condition]:
+        """Return variant and condition of ``VARIANT.CONDITION``."""
+        variant, _, condition = name.partition(".")
+        variants = {each.name: each for each in self.variants}
+        return variants[variant], {e.name: e for e in self.conditions}[condition]

@@ -4,17 +4,20 @@ import dataclasses
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
+from me2e_compress.display import Cell, Table
 from me2e_compress.evaluators.highway.engine import LocalEngine
+from me2e_compress.metrics.measure import Estimate, Measure
+from me2e_compress.metrics.route_summary import shown_by
+from me2e_compress.metrics.scores import Scores
 from me2e_compress.quantization.plan import plan_of
 from me2e_compress.simulator.routes import load_routes, pick_routes
+from me2e_compress.study.cells import MISSING, measure_cell, number
 from me2e_compress.study.condition import Condition
 from me2e_compress.study.definition import Study, Timing, Variant
-from me2e_compress.study.report.page import Section
+from me2e_compress.study.report.page import Section, StudyFiles, write_study
 from me2e_compress.study.run import run_study
 from me2e_compress.study.study_result import StudyResult
-from me2e_compress.study.verdict import before_and_after, road_verdict
 from me2e_compress.study.workspace import HTML, JSON, MARKDOWN
-from me2e_compress.study.write import StudyFiles, write_study
 from me2e_compress.targets import DEFAULT_TARGET
 from me2e_compress.workflows.checks import check_folder, check_ours
 from me2e_compress.workflows.compare import CompareResult, compare
@@ -30,6 +33,80 @@ LATENCY_SAMPLES, WORKERS = 100, 2
 DRIVER, FLOAT, RECIPE = "highway", "float", "full-fused"
 ROUTES = "5"
 """What both drive: a number of routes, or their names."""
+
+
+def before_and_after(outcome: StudyResult, name: str) -> Table:
+    """Compare the baseline and a variant of a study with one condition."""
+    before, after = outcome.variant(outcome.study.baseline), outcome.variant(name)
+    drives = {each.variant: each for each in outcome.drives}
+    driven = [drives[each.name] for each in (before, after)]
+    # size, latency and plan
+    most = after.fidelity.max_m.value
+    rows = [
+        _row("size, MB", before.size_mb, after.size_mb, ".2f"),
+        _row(
+            "time of a decision, ms", before.latency_ms[50], after.latency_ms[50], ".1f"
+        ),
+        (
+            Cell("the plan moves by, m"),
+            Cell(MISSING),
+            measure_cell(after.fidelity.mean_m, ".3f"),
+            Cell("" if most is None else f"{most:.2f} m at most"),
+        ),
+    ]
+    # the drives, and their paired difference in points with its 95 % interval
+    gap = driven[1].difference
+    picks: dict[str, Callable[[Scores], Estimate]] = {
+        "driving score": lambda scores: scores.driving_score,
+        "room kept, %": lambda scores: scores.safety.room_kept,
+    }
+    for what, pick in picks.items():
+        cells = [
+            Cell(MISSING, reason=each.reason)
+            if each.scores is None
+            else measure_cell(pick(each.scores).measure, ".1f")
+            for each in driven
+        ]
+        points = None
+        if gap is not None:
+            points = gap.room_kept if "room" in what else gap.driving_score
+        rows.append((Cell(what), *cells, Cell(_points(points))))
+    return Table("Before and after", ("", before.name, after.name, ""), tuple(rows))
+
+
+def _row(what: str, before: Measure, after: Measure, form: str) -> tuple[Cell, ...]:
+    share = ""
+    if before.value and after.value is not None:
+        share = f"{after.value / before.value:.0%}"
+    cells = measure_cell(before, form), measure_cell(after, form)
+    return Cell(what), *cells, Cell(share)
+
+
+def _points(gap: Estimate | None) -> str:
+    if gap is None or gap.value is None:
+        return ""
+    points = number(gap.value, "+.1f")
+    if gap.low is None or gap.high is None:
+        return points
+    return f"{points} ({number(gap.low, '+.1f')} to {number(gap.high, '+.1f')})"
+
+
+def road_verdict(outcome: StudyResult, name: str) -> str:
+    """Say how a variant drives, and what so many routes can show."""
+    (drive,) = (each for each in outcome.drives if each.variant == name)
+    gap = drive.difference
+    if gap is None:
+        return f"on the road: not measured ({drive.reason})"
+    routes, whole = gap.driving_score.n, outcome.coverage[1]
+    verdict = f"on the road: {gap.verdict}"
+    if not gap.differ:
+        most = f"{gap.unseen_percent:.0f} %"
+        verdict += f"; 0 of {routes} routes differ, with 95 % at most {most} of all do"
+    limit = f"{routes} route{'s' * (routes > 1)} cannot show a difference below"
+    verdict += f"; {limit} {gap.smallest_shown:.0f} points"
+    if routes < whole:
+        verdict += f", all {whole} none below {shown_by(whole):.1f}"
+    return verdict
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
@@ -78,11 +155,10 @@ def figure(result: Result) -> str:
     return result.size if isinstance(result, CompressResult) else result.headline
 
 
-@dataclasses.dataclass(frozen=True)
 class DriverDemo:
     """Compress the shipped driver and compare both, on frames and on the road.
 
-    Attributes:
+    Args:
         out: The folder that everything is written to.
         force: Replace files that we did not write, too.
 
@@ -90,19 +166,20 @@ class DriverDemo:
         GraphError: The output folder is a file, or a user's file would be overwritten.
     """
 
-    out: Path
-    force: bool = False
-    _told: list[Section] = dataclasses.field(default_factory=list, init=False)
-
-    def __post_init__(self) -> None:
+    def __init__(self, out: Path, force: bool = False) -> None:
         """Check the outputs first: the work takes minutes."""
-        check_folder(self.out, ())
+        self.out, self.force = out, force
+        self._source = out / f"{DRIVER}.onnx"
+        self._small = out / f"{DRIVER}.{RECIPE}.onnx"
+        self._frames, self._held_out = out / "frames", out / "frames-held-out"
+        self._sections = list[Section]()
+        check_folder(out, ())
         records = (beside(self._small, what) for what in ("report", "plan"))
-        pages = (self.out / name for name in (JSON, MARKDOWN, HTML))
+        pages = (out / name for name in (JSON, MARKDOWN, HTML))
         check_ours(
             [self._source, self._small, *records, *pages],
             trees=[self._frames, self._held_out],
-            force=self.force,
+            force=force,
         )
 
     @property
@@ -118,26 +195,35 @@ class DriverDemo:
     def compress(self, listener: Listener) -> CompressResult:
         """Copy the driver, record frames, and compress it."""
         export_stack(DRIVER, self._source, force=self.force)
-        self._record(listener)
-        found = self._compressed(listener)
-        self._told.append(Section("The passes", found.tables()))
-        plan = plan_of(found.report.model)
+        # frames to calibrate on, and others to compare on, of the next seed
+        folders = {self._frames: CALIBRATION_FRAMES, self._held_out: HELD_OUT_FRAMES}
+        for seed, (folder, count) in enumerate(folders.items()):
+            frames = FramesOptions(count=count, seed=seed, force=self.force)
+            record_frames(self._source, folder, frames, listener)
+        # fidelity is measured on frames of another seed, see `compare`
+        options = CompressOptions(
+            target=DEFAULT_TARGET, measure_frames=0, allow_empty=True, force=self.force
+        )
+        result = compress(
+            self._source, self._small, RECIPE, self._frames, options, listener
+        )
+        self._sections.append(Section("The passes", result.tables()))
+        plan = plan_of(result.report.model)
         if plan is not None:
-            self._told.append(Section("What became int8", plan.tables()))
-        return found
+            self._sections.append(Section("What became int8", plan.tables()))
+        return result
 
     def weigh(self, listener: Listener) -> ModuleChanges:
         """Compare the modules before and after."""
-        found = compare_modules(self._source, self._small)
-        self._told.append(Section("The modules", found.tables()))
-        return found
+        result = compare_modules(self._source, self._small)
+        self._sections.append(Section("The modules", result.tables()))
+        return result
 
     def compare(self, listener: Listener) -> CompareResult:
         """Compare the compressed graph with the driver on other frames."""
-        graphs = self._source, self._small
-        found = compare(*graphs, self._held_out, listener=listener)
-        self._told.append(Section("The outputs", found.tables()))
-        return found
+        result = compare(self._source, self._small, self._held_out, listener=listener)
+        self._sections.append(Section("The outputs", result.tables()))
+        return result
 
     def drive(self, listener: Listener) -> DriveResult:
         """Drive the routes with both, and write the report."""
@@ -145,10 +231,7 @@ class DriverDemo:
         everything = load_routes()
         study = Study(
             f"{DRIVER} before and after {RECIPE}",
-            (
-                Variant(FLOAT, str(self._source)),
-                Variant(RECIPE, str(self._small)),
-            ),
+            (Variant(FLOAT, str(self._source)), Variant(RECIPE, str(self._small))),
             (Condition("ideal", "none"),),
             FLOAT,
             pick_routes(everything, ROUTES),
@@ -156,72 +239,27 @@ class DriverDemo:
             held_out=self._held_out,
             timing=Timing(LATENCY_SAMPLES),
         )
-        # run it, and write its report with the demo's own sections
         engine = LocalEngine(WORKERS)
-        found = run_study(study, self.out, engine, listener, 1, force=self.force)
-        told = (*self._told, self._files())
-        written = write_study(found, self.out, self._words(), told, force=self.force)
-        ending = (
-            f"{self._small} is yours; {written.report} tells all of it.",
-            *self._elsewhere(),
-        )
-        return DriveResult(found, written, RECIPE, ending)
-
-    def _record(self, listener: Listener) -> None:
-        """Record frames to calibrate on, and others to compare on, of the next seed."""
-        folders = {self._frames: CALIBRATION_FRAMES, self._held_out: HELD_OUT_FRAMES}
-        for seed, (folder, count) in enumerate(folders.items()):
-            asked = FramesOptions(count=count, seed=seed, force=self.force)
-            record_frames(self._source, folder, asked, listener)
-
-    def _compressed(self, listener: Listener) -> CompressResult:
-        """Compress on the recorded frames."""
-        # fidelity is measured on frames of another seed, see `compare`
-        options = CompressOptions(
-            target=DEFAULT_TARGET, measure_frames=0, allow_empty=True, force=self.force
-        )
-        return compress(
-            self._source, self._small, RECIPE, self._frames, options, listener
-        )
-
-    @property
-    def _source(self) -> Path:
-        return self.out / f"{DRIVER}.onnx"
-
-    @property
-    def _small(self) -> Path:
-        return self.out / f"{DRIVER}.{RECIPE}.onnx"
-
-    @property
-    def _frames(self) -> Path:
-        return self.out / "frames"
-
-    @property
-    def _held_out(self) -> Path:
-        return self.out / "frames-held-out"
-
-    def _files(self) -> Section:
-        """List the files linked from the page."""
-        report, plan = (beside(self._small, what) for what in ("report", "plan"))
+        result = run_study(study, self.out, engine, listener, 1, force=self.force)
+        # its report, with the demo's own sections and the files linked from the page
         files = (
             ("the driver", self._source),
             ("the small one", self._small),
-            ("pass by pass", report),
-            ("node by node", plan),
+            ("pass by pass", beside(self._small, "report")),
+            ("node by node", beside(self._small, "plan")),
             ("calibration", self._frames),
             ("held out", self._held_out),
             ("drives", self.out / "results"),
         )
         there = ((words, path.name) for words, path in files if path.exists())
-        return Section("Files", files=(*there, ("for programs", JSON)))
-
-    def _words(self) -> tuple[str, ...]:
-        return ("me2e-compress", "demo", "-o", str(self.out))
-
-    def _elsewhere(self) -> tuple[str, ...]:
-        """Say how to compress for TensorRT."""
-        return (
+        linked = Section("Files", files=(*there, ("for programs", JSON)))
+        words = ("me2e-compress", "demo", "-o", str(self.out))
+        sections = (*self._sections, linked)
+        written = write_study(result, self.out, words, sections, force=self.force)
+        ending = (
+            f"{self._small} is yours; {written.report} tells all of it.",
             f"Its int8 is for {DEFAULT_TARGET}, which drives here. For TensorRT:",
             f"  me2e-compress compress {DRIVER} -r {RECIPE} --target"
             f" tensorrt --frames {self._frames} -o {DRIVER}.trt.onnx",
         )
+        return DriveResult(result, written, RECIPE, ending)

@@ -5,7 +5,7 @@ A drive of 220 routes takes 30 MB of episodes and 0.1 MB of these lines.
 
 import json
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Self
 
@@ -17,6 +17,8 @@ from me2e_compress.metrics.episode import Episode
 from me2e_compress.metrics.measure import Estimate
 from me2e_compress.metrics.route_summary import (
     DS,
+    ROOM,
+    SR,
     PairedDifference,
     RouteColumn,
     RouteSummary,
@@ -25,6 +27,7 @@ from me2e_compress.metrics.route_summary import (
 from me2e_compress.metrics.scores import Scores
 from me2e_compress.registry import documents, drafts
 from me2e_compress.runtime.atomic import write_bytes
+from me2e_compress.study.condition import Condition
 
 
 @dataclass(frozen=True)
@@ -166,20 +169,177 @@ def apart(
     episodes: Sequence[Episode], reference: Sequence[Episode]
 ) -> dict[str, Apart]:
     """Return how far two drives of the same routes part, by route."""
-    both = zip(episodes, reference, strict=True)
-    return {
-        one.route: _apart(one, other)
-        for one, other in both
-        if one.frames and other.frames
-    }
+    by_route = dict[str, Apart]()
+    for one, other in zip(episodes, reference, strict=True):
+        if one.frames and other.frames:
+            count = min(len(one.frames), len(other.frames))
+            here, there = (
+                np.array([(frame.x, frame.y) for frame in each.frames[:count]])
+                for each in (one, other)
+            )
+            gaps = np.hypot(*(here - there).T)
+            at = int(gaps.argmax())
+            by_route[one.route] = Apart(float(gaps[at]), one.frames[at].time_us)
+    return by_route
 
 
-def _apart(one: Episode, other: Episode) -> Apart:
-    count = min(len(one.frames), len(other.frames))
-    here, there = (
-        np.array([(frame.x, frame.y) for frame in each.frames[:count]])
-        for each in (one, other)
+_CHANGED = {"driving_score": DS, "room_kept": ROOM, "success_rate": SR}
+
+
+@dataclass(frozen=True)
+class Change:
+    """One drive (``VARIANT.CONDITION``) minus another over the same routes, in points.
+
+    Attributes:
+        beyond: The change minus the baseline's, by the estimate's name; empty for the
+            baseline itself, and for a pair.
+    """
+
+    drive: str
+    against: str
+    driving_score: Estimate
+    room_kept: Estimate
+    success_rate: Estimate
+    beyond: Mapping[str, Estimate] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, drive: DriveRecord, other: DriveRecord, seed: int) -> Self:
+        """Compare two drives."""
+        score, room, rate = (drive.minus(other, e, seed) for e in _CHANGED.values())
+        return cls(drive.name, other.name, score, room, rate)
+
+    def to_json(self) -> dict[str, Any]:
+        """Return both names and every estimate."""
+        beyond = {name: self.beyond.get(name) for name in _CHANGED}
+        return {
+            "drive": self.drive,
+            "against": self.against,
+            "driving_score": self.driving_score.to_json(),
+            "room_kept": self.room_kept.to_json(),
+            "success_rate": self.success_rate.to_json(),
+            "beyond_baseline": {
+                name: each and each.to_json() for name, each in beyond.items()
+            },
+        }
+
+
+def changes(
+    conditions: Sequence[Condition],
+    drives: Sequence[DriveRecord],
+    baseline: str,
+    seed: int,
+) -> tuple[Change, ...]:
+    """Compare every drive with the one that its condition changes, if there is one.
+
+    What the change costs a variant beyond what it costs the baseline is a mean of
+    paired differences of differences.
+    """
+    there = {each.name: each for each in drives if each.routes}
+    costs = list[Change]()
+    for condition in (each for each in conditions if each.against):
+        for drive in (each for each in drives if each.condition == condition.name):
+            # the drive and its counterpart, of the variant and the baseline
+            ours, before, theirs, theirs_before = (
+                there.get(f"{variant}.{name}")
+                for variant in (drive.variant, baseline)
+                for name in (condition.name, condition.against)
+            )
+            if not (ours and before and theirs and theirs_before):
+                continue
+            change = Change.of(ours, before, seed)
+            if drive.variant != baseline:
+                beyond = {
+                    name: (
+                        (ours.values(column) - before.values(column))
+                        - (theirs.values(column) - theirs_before.values(column))
+                    ).mean(seed)
+                    for name, column in _CHANGED.items()
+                }
+                change = replace(change, beyond=beyond)
+            costs.append(change)
+    return tuple(costs)
+
+
+def held_against(
+    pairs: Sequence[tuple[str, str]], drives: Sequence[DriveRecord], seed: int
+) -> tuple[Change, ...]:
+    """Compare pairs of drives (``VARIANT.CONDITION``) if both were driven."""
+    there = {each.name: each for each in drives if each.routes}
+    return tuple(
+        Change.of(there[one], there[other], seed)
+        for one, other in pairs
+        if one in there and other in there
     )
-    gaps = np.hypot(*(here - there).T)
-    at = int(gaps.argmax())
-    return Apart(float(gaps[at]), one.frames[at].time_us)
+
+
+SCORED, MOVED_M = 1.0, 0.5
+"""Two drives whose scores are closer, and that were never farther apart, look alike."""
+
+
+@dataclass(frozen=True)
+class Contrast:
+    """One route as two drivers drove it: ``route`` is the baseline's.
+
+    Attributes:
+        picture: A PNG of the moment, the baseline in grey under the variant, once it
+            is drawn.
+    """
+
+    drive: DriveRecord
+    route: RouteSummary
+    other: RouteSummary
+    picture: Path = Path()
+
+    @property
+    def apart(self) -> Apart:
+        """How far the two were from each other at most."""
+        return self.drive.apart.get(self.other.route, Apart(0.0, 0))
+
+    @property
+    def gap(self) -> float:
+        """How far the driving scores differ."""
+        return abs(self.route.driving_score - self.other.driving_score)
+
+    @property
+    def moment_us(self) -> int:
+        """Time of the worse drive's infraction, else of the greatest distance."""
+        if self.gap < SCORED:
+            return self.apart.time_us
+        worse, better = self.route, self.other
+        if worse.driving_score > better.driving_score:
+            worse, better = better, worse
+        kinds = [kind for kind, _ in better.moments]
+        timed = [(kind, us) for kind, us in worse.moments if us is not None]
+        alone = [us for kind, us in timed if kind not in kinds]
+        times = alone or [us for _, us in timed]
+        return times[0] if times else min(worse.duration_us, better.duration_us)
+
+
+def chosen_pairs(
+    baseline: str, drives: Sequence[DriveRecord], limit: int
+) -> list[Contrast]:
+    """Choose the widest gaps: one of each variant first, and no route twice."""
+    references = {each.condition: each for each in drives if each.variant == baseline}
+    pairs = [
+        Contrast(drive, route, other)
+        for drive in drives
+        if drive.variant != baseline and drive.routes
+        for route, other in zip(
+            references[drive.condition].routes, drive.routes, strict=True
+        )
+        if route.duration_us and other.duration_us  # who hung or crashed has no frames
+    ]
+    ranked = sorted(pairs, key=lambda pair: (-pair.gap, -pair.apart.distance_m))
+    # where all look alike, one picture shows just that
+    ranked = [
+        pair for pair in ranked if pair.gap >= SCORED or pair.apart.distance_m > MOVED_M
+    ] or ranked[:1]
+    chosen = list[Contrast]()
+    for others_only in (True, False):
+        for pair in ranked:
+            shown = [each.drive.variant for each in chosen]
+            if len(chosen) == limit or (others_only and pair.drive.variant in shown):
+                continue
+            if pair.route.route not in [each.route.route for each in chosen]:
+                chosen.append(pair)
+    return chosen

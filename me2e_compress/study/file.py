@@ -1,27 +1,33 @@
 """Read a study from a TOML file."""
 
-import inspect
+import dataclasses
 import json
 from pathlib import Path
+from typing import get_type_hints
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import TypeAdapter, ValidationError
+from pydantic.fields import FieldInfo
 
 from me2e_compress.driving.policies import PythonDriver, driver_named
-from me2e_compress.driving.shipped_adapters import adapter_file, shipped_adapters
 from me2e_compress.errors import FORMER, StudyError
-from me2e_compress.evaluators.highway.drivers import OnnxDriver
-from me2e_compress.evaluators.highway.evaluator import routes_named
-from me2e_compress.manager import recipe
-from me2e_compress.passes import Pass
 from me2e_compress.registry import documents
-from me2e_compress.runtime.providers import PROVIDERS, provider_named
-from me2e_compress.shipped.drivers import SHIPPED
-from me2e_compress.simulator.routes import Route
 from me2e_compress.study.condition import Condition
-from me2e_compress.study.definition import Study, Timing, Variant
-from me2e_compress.study.study_blocks import FramesToRecord, StudyBlock
-from me2e_compress.workflows.checks import model_path
-from me2e_compress.workflows.other_evaluators import HIGHWAY, is_highway
+from me2e_compress.study.definition import (
+    FramesToRecord,
+    Study,
+    StudyBlock,
+    Timing,
+    Variant,
+)
+
+_STUDY = TypeAdapter(Study)
+_TABLES: dict[object, type] = {
+    "variant": Variant,
+    "condition": Condition,
+    "latency": Timing,
+    "block": StudyBlock,
+    "record": FramesToRecord,
+}
 
 
 def load_study(
@@ -52,38 +58,61 @@ def load_study(
         EvaluationError: Routes or latency are unknown.
         ProviderError: A provider or library is missing.
     """
-    # read the file, and check its form
+    # read the file, and check its form; options of the caller take precedence
     path = Path(path)
     content = _content(path)
+    which = content.pop("routes", None) if routes is None else routes
+    content.pop("routes", None)
+    if provider:
+        content["provider"] = provider
     try:
-        # JSON has tables and lists for dataclasses and tuples, but no dates
+        # JSON has lists for tuples, but no dates
         text = json.dumps(content, default=lambda date: {"date": str(date)})
-        table = _Study.model_validate_json(text)
+        study = _STUDY.validate_json(text, context=path.parent)
     except ValidationError as error:
         raise StudyError(f"{path}: {_complaint(error)}") from error
-    for each in table.variant:
-        each.policy = each.policy or table.policy
-        if not each.policy:
-            raise StudyError(
-                f"{path}: variant {each.name}: neither it nor the study names a policy"
-            )
-    # options of the caller take precedence, and need no trust
-    theirs = not provider
-    table.provider = provider or table.provider
-    if not trust_code and (named := _code(table, their_provider=theirs)):
+    except StudyError as error:
+        raise StudyError(f"{path}: {error}") from error
+    if study.to_record is not None and (study.frames or study.held_out):
+        raise StudyError(f"{path}: give folders of frames, or what to record, not both")
+    # what the caller names needs no trust
+    made = [
+        each.policy
+        for each in study.variants
+        if isinstance(driver_named(each.policy), PythonDriver)
+    ]
+    theirs = () if provider else study.provider.plugins
+    code = [*made, *map(str, (*study.plugins, *theirs))]
+    if code and not trust_code:
         raise StudyError(
-            f"{path} runs code: {named[0]}; look at it first, then say --trust-code"
+            f"{path} runs code: {code[0]}; look at it first, then say --trust-code"
         )
-    # resolve its names, and check what it refers to
-    study = _Reader(path).study(table, routes)
-    study.check_recordings()
+    plugins = (*study.provider.plugins, *study.plugins)
+    study = dataclasses.replace(
+        study,
+        provider=dataclasses.replace(study.provider, plugins=plugins),
+        plugins=(),
+    )
+    study.provider.check()
+    # routes are the evaluator's, which may take none
+    if which is not None or "routes" in study.driven_by.takes:
+        study = _with_routes(study, "all" if which is None else which, path)
+    study.check()
     return study
 
 
+def _with_routes(study: Study, which: object, path: Path) -> Study:
+    if isinstance(which, bool) or not isinstance(which, str | int):
+        raise StudyError(f"{path}: routes: it must be a number, names or a file")
+    study.driven_by.check_takes(["routes"], "routes: ")
+    routes, set_size = study.driven_by.routes(str(which), path.parent)
+    return dataclasses.replace(study, routes=routes, set_size=set_size)
+
+
 def _content(path: Path) -> dict[str, object]:
-    """Return the tables of a file."""
+    """Return the tables of a file, none of which is of an older version."""
     try:
-        return documents.from_toml(documents.content(path))
+        content = documents.from_toml(documents.content(path))
     except FileNotFoundError as error:
         gone = FORMER.get(f"study {path}")
         raise StudyError(gone or f"no study {path}: no such file") from error
@@ -91,166 +120,34 @@ def _content(path: Path) -> dict[str, object]:
         raise StudyError(f"{path}: cannot be read: {error.strerror}") from error
     except documents.MalformedError as error:
         raise StudyError(f"{path}: not TOML: {error}") from error
-
-
-class _Table(BaseModel):
-    model_config = ConfigDict(strict=True, extra="forbid")
-
-
-class _Variant(_Table):
-    name: str
-    policy: str = ""
-    recipe: str | None = None
-    passes: str | None = None
-    map: str | None = None
-    adapter: str | None = None
-    trace: str | None = None
-    host_stage: str = ""
-
-
-class _Pair(_Table):
-    of: str
-    against: str
-
-
-class _Study(_Table):
-    title: str
-    baseline: str
-    policy: str = ""
-    """Of the variants that name none."""
-    evaluator: str = HIGHWAY
-    routes: str | int | None = None
-    seed: int = 0
-    frames: str | None = None
-    held_out: str | None = None
-    provider: str = "cpu"
-    plugins: list[str] = Field(default_factory=list)
-    record: FramesToRecord | None = None
-    latency: Timing = Field(default_factory=Timing)
-    variant: list[_Variant]
-    condition: tuple[Condition, ...]
-    block: tuple[StudyBlock, ...] = ()
-    pair: list[_Pair] = Field(default_factory=list)
-
-
-_KINDS: dict[object, type] = {
-    "variant": _Variant,
-    "condition": Condition,
-    "latency": Timing,
-    "block": StudyBlock,
-    "pair": _Pair,
-    "record": FramesToRecord,
-}
+    for key, table in content.items():
+        inner = [f"{key}.{each}" for each in table] if isinstance(table, dict) else []
+        for where in (key, *inner):
+            if gone := FORMER.get(f"study {where}"):
+                raise StudyError(f"{path}: {gone}")
+    if "set_size" in content:  # Python's own
+        raise StudyError(f"{path}: {_no_key('set_size', Study)}")
+    return content
 
 
 def _complaint(error: ValidationError) -> str:
     """Describe the first error; unknown keys go first, as they may explain others."""
-    found = error.errors(include_url=False)
-    kinds = ("extra_forbidden", "unexpected_keyword_argument")
-    unknown = [each for each in found if each["type"] in kinds]
-    first = (unknown or found)[0]
+    errors = error.errors(include_url=False)
+    unknown = [each for each in errors if each["type"] == "unexpected_keyword_argument"]
+    first = (unknown or errors)[0]
     where = ".".join(str(part) for part in first["loc"])
-    if gone := FORMER.get(f"study {where}"):
-        return gone
     if not unknown:
         return f"{where}: {first['msg']}"
-    inside = _KINDS.get(first["loc"][0], _Study) if len(first["loc"]) > 1 else _Study
-    keys = inspect.signature(inside).parameters
+    table = _TABLES.get(first["loc"][0]) if len(first["loc"]) > 1 else Study
+    return _no_key(where, table)
+
+
+def _no_key(where: str, table: type | None) -> str:
+    if table is None:
+        return f"no key {where}"
+    keys = list[str]()
+    for name, kind in get_type_hints(table, include_extras=True).items():
+        marks = getattr(kind, "__metadata__", ())
+        aliases = [e.alias for e in marks if isinstance(e, FieldInfo) and e.alias]
+        keys += (aliases or [name]) if name != "set_size" else []
     return f"no key {where}; there are {', '.join(keys)}"
-
-
-def _code(table: _Study, *, their_provider: bool) -> list[str]:
-    """List the code that a study runs besides ours and installed packages'."""
-    policies = [each.policy for each in table.variant if each.policy not in SHIPPED]
-    made = [each for each in policies if isinstance(driver_named(each), PythonDriver)]
-    libraries = PROVIDERS.parse(table.provider).plugins if their_provider else ()
-    return [*made, *table.plugins, *map(str, libraries)]
-
-
-class _Reader:
-    """Turns tables into a study, with paths relative to its file."""
-
-    def __init__(self, path: Path) -> None:
-        self.path = path
-
-    def study(self, table: _Study, routes: str | None) -> Study:
-        if table.record is not None and (table.frames or table.held_out):
-            raise StudyError(
-                f"{self.path}: give folders of frames, or what to record, not both"
-            )
-        # the caller's routes take precedence over the file's
-        libraries = [self._beside(each) for each in table.plugins]
-        which = routes if table.routes is None or routes else str(table.routes)
-        driven, set_size = self._routes(which, table)
-        return Study(
-            title=table.title,
-            variants=tuple(self._variant(each) for each in table.variant),
-            conditions=table.condition,
-            baseline=table.baseline,
-            evaluator=table.evaluator,
-            routes=driven,
-            set_size=set_size,
-            frames=self._file(table.frames),
-            held_out=self._file(table.held_out),
-            timing=table.latency,
-            seed=table.seed,
-            provider=provider_named(table.provider, libraries),
-            to_record=table.record,
-            blocks=table.block,
-            pairs=tuple((each.of, each.against) for each in table.pair),
-        )
-
-    def _variant(self, table: _Variant) -> Variant:
-        policy, adapter, stage = table.policy, table.adapter, table.host_stage
-        if policy in SHIPPED:  # a file of that name beside the study wins
-            policy = str(model_path(policy, self.path.parent))
-        # a named policy may bring its own adapter and host stage
-        driver = driver_named(policy)
-        if isinstance(driver, OnnxDriver):
-            policy = str(model_path(driver.path, self.path.parent))
-            if adapter is None and driver.adapter is not None:
-                adapter = str(driver.adapter)
-            if not stage and driver.host_stage is not None:
-                stage = str(driver.host_stage)
-        return Variant(
-            table.name,
-            policy,
-            self._passes(table),
-            None if table.map is None else self._file_or_name(table.map),
-            self._adapter(adapter),
-            self._file(table.trace),
-            stage,
-        )
-
-    def _adapter(self, name: str | None) -> Path | None:
-        if name in shipped_adapters() and not self._beside(name).is_file():
-            return adapter_file(Path(name))
-        return self._file(name)
-
-    def _passes(self, table: _Variant) -> tuple[Pass, ...]:
-        if table.recipe is not None and table.passes is not None:
-            raise StudyError(
-                f"{self.path}: variant {table.name}: give a recipe or passes, not both"
-            )
-        if table.passes is not None:
-            return recipe.parse(table.passes)
-        if table.recipe is None:
-            return ()
-        return recipe.load(self._file_or_name(table.recipe))
-
-    def _file_or_name(self, name: str) -> str:
-        """Return the path of a file beside the study, else what ships by that name."""
-        return str(self._beside(name)) if self._beside(name).is_file() else name
-
-    def _routes(
-        self, which: str | None, table: _Study
-    ) -> tuple[tuple[Route, ...], int]:
-        if which is None and not is_highway(table.evaluator):
-            return (), 0
-        return routes_named(which or "all", self.path.parent)
-
-    def _file(self, name: str | None) -> Path | None:
-        return None if name is None else self._beside(name)
-
-    def _beside(self, name: str) -> Path:
-        return self.path.parent / name

@@ -1,24 +1,52 @@
-"""What a study found, apart from how it is shown."""
+"""What a study knows of a variant without its drives: size, latency, plan."""
 
+import math
 import os
 import platform
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from me2e_compress.calibration.dataset import CalibrationSet
+from me2e_compress.errors import EvaluationError, FramesError
+from me2e_compress.fidelity.compare import compare
 from me2e_compress.metrics.measure import Measure
+from me2e_compress.runtime.frames import Frame
 from me2e_compress.runtime.latency_trace import Load
 from me2e_compress.runtime.profile import processor
-from me2e_compress.study.changes import Change, changes, held_against
-from me2e_compress.study.condition import Condition
+from me2e_compress.runtime.session import Session
+from me2e_compress.study.cells import EXACT
 from me2e_compress.study.definition import Study
-from me2e_compress.study.drive_record import DriveRecord
-from me2e_compress.study.plan_fidelity import PlanFidelity
 from me2e_compress.study.prepared import PreparedVariant
-from me2e_compress.study.side_by_side import Contrast
 from me2e_compress.study.timing import Clock
+from me2e_compress.workflows.result import Listener
 
 LATENCY_PERCENTILES = (50, 99)
+
+
+@dataclass(frozen=True)
+class PlanFidelity:
+    """The plan of a variant compared with the baseline's on held-out frames."""
+
+    mean_m: Measure
+    max_m: Measure
+    plan_sqnr_db: Measure
+    frames: int = 0
+
+    @classmethod
+    def unknown(cls, reason: str) -> "PlanFidelity":
+        """Return the result for a variant that was not compared."""
+        metres = Measure(None, "m", reason)
+        return cls(metres, metres, Measure(None, "dB", reason))
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the three measures with their units, and the number of frames."""
+        return {
+            "plan_mean": self.mean_m.to_json(),
+            "plan_max": self.max_m.to_json(),
+            "plan_sqnr": self.plan_sqnr_db.to_json(),
+            "frames": self.frames,
+        }
 
 
 @dataclass(frozen=True)
@@ -43,19 +71,18 @@ class VariantOutcome:
         name, size = prepared.variant.name, prepared.size_bytes
         why = prepared.failure or "no model"
         unknown = Measure(None, "ms", why)
-        return cls(
-            prepared,
-            Measure(None, "MB", why) if size is None else Measure(size / 1e6, "MB"),
-            {
-                percent: clock.latency(name, percent) if prepared.model else unknown
-                for percent in LATENCY_PERCENTILES
-            },
-            fidelity,
+        latency_ms = {
+            percent: clock.latency(name, percent) if prepared.model else unknown
+            for percent in LATENCY_PERCENTILES
+        }
+        size_mb = (
+            Measure(None, "MB", why) if size is None else Measure(size / 1e6, "MB")
         )
+        return cls(prepared, size_mb, latency_ms, fidelity)
 
     def to_json(self) -> dict[str, Any]:
         """Return all facts; everything timed is below the key `latency`."""
-        prepared = self.prepared
+        prepared, latencies = self.prepared, self.latency_ms.items()
         return {
             "name": self.name,
             "policy": prepared.variant.policy,
@@ -64,77 +91,56 @@ class VariantOutcome:
             "weights": prepared.weights,
             "size": self.size_mb.to_json(),
             "fidelity": self.fidelity.to_json(),
-            "latency": {
-                f"p{percent}": measure.to_json()
-                for percent, measure in self.latency_ms.items()
-            },
+            "latency": {f"p{percent}": each.to_json() for percent, each in latencies},
         }
 
 
-@dataclass(frozen=True, repr=False)
-class StudyOutcome:
-    """All that a study found, and what it was made with.
+def judge(
+    study: Study,
+    baseline: PreparedVariant,
+    prepared: PreparedVariant,
+    listener: Listener,
+) -> PlanFidelity:
+    """Run both models over the held-out frames, and compare their plans.
 
-    Attributes:
-        drives: Condition by condition, the variants in the study's order.
-        contrasts: Pictures of moments at which two drives differ.
-        device_scale: How many times slower the device is than the machine timed on.
-        versions: Versions of the packages that decide the result.
-        load: Load by other processes while latencies were measured; None if none was
-            measured here.
+    A model with another interface is not an error: the result has a reason instead.
     """
+    # reasons why there is nothing to compare
+    if study.held_out is None:
+        return PlanFidelity.unknown("no held-out frames were given")
+    if prepared.model is None or baseline.model is None:
+        lacks = prepared if prepared.model is None else baseline
+        why = prepared.failure or f"{lacks.variant.name} is not a model"
+        return PlanFidelity.unknown(why)
+    if prepared is baseline:
+        return PlanFidelity.unknown("the baseline itself")
+    # both models over all held-out frames
+    recording = CalibrationSet(study.held_out)
+    stage = f"fidelity of {prepared.variant.name}"
+    left, right = (
+        Session(path, provider=study.provider)
+        for path in (baseline.model, prepared.model)
+    )
 
-    study: Study
-    variants: tuple[VariantOutcome, ...]
-    drives: tuple[DriveRecord, ...]
-    contrasts: tuple[Contrast, ...]
-    device_scale: float
-    machine: str
-    versions: Mapping[str, str]
-    load: Load | None = None
+    def reported() -> Iterator[Frame]:
+        for frame in recording:
+            listener.on_progress(stage, frame.index, len(recording), "frames")
+            yield frame
 
-    @property
-    def title(self) -> str:
-        """The study's title, with a note if not all routes were driven."""
-        return f"{self.study.title}{self.study.preview}"
-
-    @property
-    def timed(self) -> bool:
-        """Whether the latency of any variant is known."""
-        return any(each.latency_ms[50].value is not None for each in self.variants)
-
-    @property
-    def coverage(self) -> tuple[int, int]:
-        """Number of routes driven, and of routes in the whole set."""
-        if self.study.routes:
-            return len(self.study.routes), self.study.set_size
-        scores = [each.scores for each in self.drives if each.scores is not None]
-        return (scores[0].routes, scores[0].expected) if scores else (0, 0)
-
-    def label(self, drive: DriveRecord) -> str:
-        """Name a drive by its variant, and by its condition if there are several."""
-        if len(self.study.conditions) == 1:
-            return drive.variant
-        return f"{drive.variant}, {drive.condition}"
-
-    def under(self, condition: Condition) -> tuple[DriveRecord, ...]:
-        """Return the drives under one condition."""
-        return tuple(each for each in self.drives if each.condition == condition.name)
-
-    @property
-    def changes(self) -> tuple[Change, ...]:
-        """Cost of each change of a condition, by variant."""
-        study = self.study
-        return changes(study.conditions, self.drives, study.baseline, study.seed)
-
-    @property
-    def pairs(self) -> tuple[Change, ...]:
-        """Comparisons of the pairs that the study names."""
-        return held_against(self.study.pairs, self.drives, self.study.seed)
-
-    def variant(self, name: str) -> VariantOutcome:
-        """Return a variant by its name."""
-        return next(each for each in self.variants if each.name == name)
+    try:
+        fidelity = compare(left, right, reported())
+    except (EvaluationError, FramesError) as error:
+        return PlanFidelity.unknown(str(error))
+    if fidelity.plan is None:
+        return PlanFidelity.unknown(fidelity.plan_reason)
+    # an identical plan has an infinite ratio
+    noise = {each.name: each.sqnr_db for each in fidelity.outputs}[fidelity.plan_output]
+    sqnr = Measure(None, "dB", EXACT if noise == math.inf else "no plan")
+    if math.isfinite(noise):
+        sqnr = Measure(noise, "dB")
+    mean_m, max_m = fidelity.plan.mean_m, fidelity.plan.max_m
+    metres = Measure(mean_m, "m"), Measure(max_m, "m")
+    return PlanFidelity(*metres, sqnr, fidelity.frames)
 
 
 def this_machine(load: Load | None = None) -> str:

@@ -55,22 +55,17 @@ def prepare_all(
     study: Study, workspace: Workspace, listener: Listener
 ) -> list[PreparedVariant]:
     """Prepare every variant; only a failure of the baseline is an error."""
-    return [
-        _prepared_or_failed(study, each, workspace, listener) for each in study.variants
-    ]
-
-
-def _prepared_or_failed(
-    study: Study, variant: Variant, workspace: Workspace, listener: Listener
-) -> PreparedVariant:
-    try:
-        return prepare_variant(study, variant, workspace, listener)
-    except Me2eError as error:
-        if variant is study.reference:
-            raise
-        listener.on_warning(f"variant {variant.name} is left out: {error}")
-        driver = driver_named(variant.policy, variant.adapter)
-        return PreparedVariant(variant, driver, failure=str(error))
+    prepared = list[PreparedVariant]()
+    for variant in study.variants:
+        try:
+            prepared.append(prepare_variant(study, variant, workspace, listener))
+        except Me2eError as error:
+            if variant == study.reference:
+                raise
+            listener.on_warning(f"variant {variant.name} is left out: {error}")
+            driver = driver_named(variant.policy, variant.adapter)
+            prepared.append(PreparedVariant(variant, driver, failure=str(error)))
+    return prepared
 
 
 def prepare_variant(
@@ -80,8 +75,7 @@ def prepare_variant(
     # drivers without a file need no preparation
     driver = driver_named(variant.policy, variant.adapter)
     if not isinstance(driver, OnnxDriver):
-        if not study.elsewhere:
-            driver.open()
+        study.driven_by.check_policy(driver)
         return PreparedVariant(variant, driver)
     # apply the passes, if there are any
     model = source = driver.path
@@ -93,8 +87,7 @@ def prepare_variant(
     driver = replace(driver, path=model, provider=study.provider, host_stage=stage)
     # fail early on a model that cannot run or drive
     try_first(model, model.name, listener=listener, provider=study.provider)
-    if not study.elsewhere:  # another evaluator may ask for another interface
-        driver.open()
+    study.driven_by.check_policy(driver)
     # origin of the file
     sha256 = graph.sha256_of(model)
     origin = source.name, to_text(variant.passes)
@@ -110,17 +103,6 @@ def prepare_variant(
     )
 
 
-def _reported_beside(model: Path) -> tuple[str, str] | None:
-    """Read source and passes from the report next to a file, if it is of that file."""
-    try:
-        report = _Report.model_validate_json(beside(model, "report").read_bytes())
-        if report.output.sha256 != graph.sha256_of(model):
-            return None
-    except (OSError, DecodeError, GraphError, ValidationError):
-        return None
-    return report.source.file, report.pipeline
-
-
 class _File(BaseModel):
     file: str
     sha256: str
@@ -130,6 +112,17 @@ class _Report(BaseModel):
     source: _File
     output: _File
     pipeline: str
+
+
+def _reported_beside(model: Path) -> tuple[str, str] | None:
+    """Read source and passes from the report next to a file, if it is of that file."""
+    try:
+        report = _Report.model_validate_json(beside(model, "report").read_bytes())
+        if report.output.sha256 != graph.sha256_of(model):
+            return None
+    except (OSError, DecodeError, GraphError, ValidationError):
+        return None
+    return report.source.file, report.pipeline
 
 
 def _compressed(
@@ -168,7 +161,14 @@ def _key(
     study: Study, variant: Variant, source: Path, frames: CalibrationSet | None
 ) -> str:
     """Hash everything that decides the result of the passes."""
-    modules = variant.module_map
+    modules, contents = variant.module_map, list[str]()
+    for file in (file for each in variant.passes for file in each.files()):
+        try:
+            contents.append(hashlib.sha256(file.read_bytes()).hexdigest())
+        except OSError as error:
+            raise StudyError(
+                f"variant {variant.name}: {file}: cannot be read: {error.strerror}"
+            ) from error
     decisive = (
         __version__,
         graph.sha256_of(source),
@@ -178,15 +178,6 @@ def _key(
         str(study.seed),
         # as before there was a choice, so that what was made then is still found
         *(() if study.provider == CPU else (PROVIDERS.text(study.provider),)),
-        *(_content(variant, file) for each in variant.passes for file in each.files()),
+        *contents,
     )
     return hashlib.sha256("\n".join(decisive).encode()).hexdigest()
-
-
-def _content(variant: Variant, file: Path) -> str:
-    try:
-        return hashlib.sha256(file.read_bytes()).hexdigest()
-    except OSError as error:
-        raise StudyError(
-            f"variant {variant.name}: {file}: cannot be read: {error.strerror}"
-        ) from error

@@ -1,20 +1,31 @@
-"""Run a study."""
+"""Run a study: prepare the variants, drive each under each condition, record it."""
 
-from dataclasses import replace
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
+from me2e_compress.driving.latency import FixedLatency
 from me2e_compress.errors import StudyError
-from me2e_compress.evaluators.highway.engine import Engine, LocalEngine
+from me2e_compress.evaluators.contract import Drive, Engine
+from me2e_compress.evaluators.highway.engine import LocalEngine
+from me2e_compress.evaluators.results import MEASURED, ResultsFolder, drive_routes
 from me2e_compress.manager.report import versions
+from me2e_compress.metrics.episode import Episode
+from me2e_compress.metrics.route_summary import difference
+from me2e_compress.metrics.scores import score
+from me2e_compress.study.condition import Condition
 from me2e_compress.study.definition import Study
-from me2e_compress.study.drives import DriveSetup
+from me2e_compress.study.drive_record import (
+    Contrast,
+    DriveRecord,
+    apart,
+    chosen_pairs,
+)
 from me2e_compress.study.file import load_study
-from me2e_compress.study.outcome import VariantOutcome, this_machine
-from me2e_compress.study.plan_fidelity import judge
+from me2e_compress.study.outcome import VariantOutcome, judge, this_machine
 from me2e_compress.study.prepared import PreparedVariant, prepare_all
-from me2e_compress.study.side_by_side import take_pictures
 from me2e_compress.study.study_result import StudyResult
-from me2e_compress.study.timing import time_all
+from me2e_compress.study.timing import Clock, time_all
 from me2e_compress.study.workspace import HTML, JSON, MARKDOWN, Workspace
 from me2e_compress.workflows.checks import check_folder, check_ours, writing
 from me2e_compress.workflows.frames import record_frames
@@ -34,14 +45,13 @@ def run_study(
     """Make the models, time them, compare them with the baseline, drive them.
 
     With the same folder it resumes: finished models, traces and routes are reused.
-    Studies may share a folder if they share variants. Every drive of highway leaves a
-    line a route in ``records/``.
+    Studies may share a folder if they share variants. Every drive leaves a line a route
+    in ``records/``.
 
     Args:
         study: A study, or its TOML file.
         folder: Where models, traces and results go.
-        engine: Where routes are driven; None for one process of this machine. An
-            evaluator other than highway ignores it.
+        engine: Where routes are driven; None for one process of this machine.
         listener: Is called with progress and warnings.
         pictures: Number of routes on which two drives are shown side by side.
         force: Also replace a report that we did not write.
@@ -51,27 +61,28 @@ def run_study(
         Me2eError: The baseline cannot drive, frames do not fit, or the folder belongs
             to another study. Another variant that fails is left out, with a warning.
     """
-    study, folder = _read(study), Path(folder)
-    if study.elsewhere and engine not in (None, LocalEngine()):
-        raise StudyError(
-            f"workers and engine are highway's: {study.evaluator} drives where it will"
-        )
+    # check everything before any work
+    study = load_study(study) if isinstance(study, str | Path) else study
+    study.check()
+    if engine not in (None, LocalEngine()):
+        study.driven_by.check_takes(["engine"], "workers and engine: ")
+    folder = Path(folder)
     check_folder(folder, study.inputs(), (JSON, MARKDOWN, HTML))
     check_ours([folder / name for name in (JSON, MARKDOWN, HTML)], force=force)
     with writing(folders=[folder]):
-        begun = prepare_study(study, folder, engine or LocalEngine(), listener)
-        return _compared(*begun, pictures)
+        cells, prepared = prepare_study(study, folder, engine, listener)
+        return _compared(cells, prepared, pictures)
 
 
 def prepare_study(
-    study: Study, folder: Path, engine: Engine, listener: Listener
-) -> tuple[DriveSetup, list[PreparedVariant]]:
+    study: Study, folder: Path, engine: Engine | None, listener: Listener
+) -> tuple["StudyCells", list[PreparedVariant]]:
     """Record frames, make the models and time them; return what drives them."""
     workspace = Workspace(folder)
     study = _recorded(study, workspace, listener)
     prepared = prepare_all(study, workspace, listener)
     clock = time_all(study, prepared, workspace, listener)
-    return DriveSetup(study, clock, workspace, engine, listener), prepared
+    return StudyCells(study, clock, workspace, engine, listener), prepared
 
 
 def _recorded(study: Study, workspace: Workspace, listener: Listener) -> Study:
@@ -82,56 +93,166 @@ def _recorded(study: Study, workspace: Workspace, listener: Listener) -> Study:
     asked = study.to_record
     if asked is None:
         return study
-    model = Path(study.reference.policy)
-    # calibration frames, and held-out frames of the next seed
-    folders = list[Path]()
-    for name, count, seed in (
-        ("frames", asked.frames, asked.seed),
-        ("frames-held-out", asked.held_out, asked.seed + 1),
+    frames, held_out = (
+        workspace.folder / name for name in ("frames", "frames-held-out")
+    )
+    for folder, count, seed in (
+        (frames, asked.frames, asked.seed),
+        (held_out, asked.held_out, asked.seed + 1),
     ):
-        folder = workspace.folder / name
         if not (folder / "scenes.json").is_file():
             folder.parent.mkdir(parents=True, exist_ok=True)
             options = FramesOptions(count=count, seed=seed, provider=study.provider)
-            record_frames(model, folder, options, listener)
-        folders.append(folder)
-    frames, held_out = folders
+            record_frames(Path(study.reference.policy), folder, options, listener)
     return replace(study, frames=frames, held_out=held_out, to_record=None)
 
 
+@dataclass(frozen=True)
+class StudyCells:
+    """Drives variants under conditions; ``means_us`` caches those of ``mean_of``."""
+
+    study: Study
+    clock: Clock
+    workspace: Workspace
+    engine: Engine | None
+    listener: Listener
+    means_us: dict[str, int] = field(default_factory=dict)
+
+    def under(
+        self, condition: Condition, prepared: Sequence[PreparedVariant]
+    ) -> tuple[DriveRecord, ...]:
+        """Drive the variants of one condition, the baseline first."""
+        driven = self.study.driven_under(condition)
+        prepared = [each for each in prepared if each.variant in driven]
+        if not prepared:
+            return ()
+        names = [each.variant.name for each in prepared]
+        baseline = prepared[names.index(self.study.baseline)]
+        reference, theirs = self._driven(baseline, condition)
+        records = list[DriveRecord]()
+        for each in prepared:
+            if each is baseline:
+                records.append(reference)
+                continue
+            record, episodes = self._driven(each, condition)
+            if episodes and theirs:
+                seed = self.study.seed
+                record = replace(
+                    record,
+                    difference=difference(record.routes, reference.routes, seed),
+                    apart=apart(episodes, theirs),
+                )
+            records.append(record)
+        return tuple(records)
+
+    def drive(self, prepared: PreparedVariant, condition: Condition) -> Drive | None:
+        """Return what a cell drives; None without a driver or its latency."""
+        if prepared.failure:
+            return None
+        if not condition.mean_of:
+            latency = self.clock.source(prepared.variant, condition, self.study.seed)
+        else:
+            if condition.name not in self.means_us:
+                self.means_us[condition.name] = self._mean_us(condition)
+            latency = FixedLatency(self.means_us[condition.name])
+        if latency is None:
+            return None
+        return replace(
+            condition.drive,
+            latency=latency,
+            routes=self.study.routes,
+            set_size=self.study.set_size,
+            engine=self.engine,
+        )
+
+    def _mean_us(self, condition: Condition) -> int:
+        """Return the mean decision of a drive, which must be done."""
+        path = self.workspace.record(*self.study.drive_of(condition.mean_of))
+        mean_us = DriveRecord.load(path).mean_latency_us if path.is_file() else None
+        if mean_us is None:
+            raise StudyError(
+                f"condition {condition.name}: {condition.mean_of} took no decision"
+            )
+        return mean_us
+
+    def _driven(
+        self, prepared: PreparedVariant, condition: Condition
+    ) -> tuple[DriveRecord, tuple[Episode, ...]]:
+        """Drive a cell, or go on; record and score it. No episodes without a drive."""
+        study, names = self.study, (prepared.variant.name, condition.name)
+        drive = self.drive(prepared, condition)
+        if drive is None:
+            why = f"its latency was not measured: {self.clock.reason}"
+            if prepared.failure or prepared.model is None:
+                why = prepared.failure or "no model: it has no latency of its own"
+            return DriveRecord(*names, reason=why), ()
+        evaluator, policy = study.driven_by, prepared.driver
+        folder = self.workspace.results(prepared.variant, condition)
+        stage = ", ".join(names)
+        episodes = drive_routes(evaluator, policy, drive, folder, self.listener, stage)
+        made_by = dict(ResultsFolder.open(folder).made_by)
+        made_by.pop(MEASURED, None)  # of the trace, which the latency names
+        record = DriveRecord.of(*names, made_by, episodes)
+        record.save(self.workspace.record(prepared.variant, condition))
+        set_size = study.set_size or evaluator.set_size or len(episodes)
+        return replace(record, scores=score(episodes, set_size, study.seed)), episodes
+
+    def pictures(
+        self,
+        prepared: Sequence[PreparedVariant],
+        drives: Sequence[DriveRecord],
+        limit: int,
+    ) -> tuple[Contrast, ...]:
+        """Drive the routes on which variants diverge the most, up to that moment.
+
+        Existing pictures are reused; no route is shown twice, and variants alternate.
+        """
+        study = self.study
+        if "render" not in study.driven_by.takes:
+            return ()
+        contrasts = list[Contrast]()
+        by_name = {each.variant.name: each for each in prepared}
+        routes = {each.id: each for each in study.routes}
+        pairs = chosen_pairs(study.baseline, drives, limit)
+        for done, pair in enumerate(pairs):
+            self.listener.on_progress("pictures", done, len(pairs), pair.route.route)
+            variant, condition = study.drive_of(pair.drive.name)
+            route, us = routes[pair.route.route], pair.moment_us
+            path = self.workspace.picture(variant, condition, route.id, us)
+            both = [by_name[name] for name in (variant.name, study.baseline)]
+            labelled = [
+                (each.variant.name, each.driver, drive)
+                for each in both
+                if (drive := self.drive(each, condition)) is not None
+            ]
+            if not path.is_file() and len(labelled) == len(both):
+                study.driven_by.overlay(labelled, route, us, path)
+            contrasts.append(replace(pair, picture=path))
+        return tuple(contrasts)
+
+
 def _compared(
-    setup: DriveSetup, prepared: list[PreparedVariant], pictures: int
+    cells: StudyCells, prepared: list[PreparedVariant], pictures: int
 ) -> StudyResult:
     """Compare the plans and the drives of every variant with the baseline's."""
-    study, clock = setup.study, setup.clock
-    baseline = next(each for each in prepared if each.variant is study.reference)
+    study, clock = cells.study, cells.clock
+    baseline = next(each for each in prepared if each.variant == study.reference)
     variants = tuple(
-        VariantOutcome.of(each, clock, judge(study, baseline, each, setup.listener))
+        VariantOutcome.of(each, clock, judge(study, baseline, each, cells.listener))
         for each in prepared
     )
     drives = [
         drive
         for condition in study.conditions
-        for drive in setup.under(condition, prepared)
+        for drive in cells.under(condition, prepared)
     ]
-    # only highway can show two drives side by side
-    contrasts = (
-        () if study.elsewhere else take_pictures(setup, prepared, drives, pictures)
-    )
     return StudyResult(
         study,
         variants,
         tuple(drives),
-        contrasts,
+        cells.pictures(prepared, drives, pictures),
         clock.scale,
         this_machine(),
         versions(),
         clock.load,
     )
-
-
-def _read(study: Study | str | Path) -> Study:
-    if isinstance(study, str | Path):
-        return load_study(study)
-    study.check_recordings()
-    return study

@@ -1,27 +1,98 @@
-"""Result of a study: what it found, as lines, tables and JSON."""
+"""Result of a study: every table is a pure function of its records."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 from me2e_compress.display import Cell, Table, counted
+from me2e_compress.metrics.bench2drive import ABILITIES
+from me2e_compress.metrics.route_summary import COLUMNS, PairedDifference, holm
+from me2e_compress.metrics.scores import Scores
+from me2e_compress.runtime.latency_trace import Load
 from me2e_compress.runtime.providers import PROVIDERS
-from me2e_compress.study.cells import MISSING, estimate_cell
-from me2e_compress.study.drive_record import DriveRecord
-from me2e_compress.study.outcome import StudyOutcome
-from me2e_compress.study.tables import (
-    abilities,
-    change_tables,
-    differences,
-    route_table,
-    scoreboards,
+from me2e_compress.study.cells import MISSING, anew_cell, estimate_cell, measure_cell
+from me2e_compress.study.condition import Condition
+from me2e_compress.study.definition import Study
+from me2e_compress.study.drive_record import (
+    Change,
+    Contrast,
+    DriveRecord,
+    changes,
+    held_against,
 )
+from me2e_compress.study.outcome import VariantOutcome
 from me2e_compress.workflows.result import Result
+
+SCORES = tuple(each.name for each in COLUMNS)
+MOST_ROUTES = 40
+"""With more routes than this, the table of endings is left out."""
+COSTS = ("size MB", "p50 ms", "p99 ms", "plan m", "SQNR dB")
 
 
 @dataclass(frozen=True, repr=False)
-class StudyResult(StudyOutcome, Result):
-    """All results of a study, and what they were made with."""
+class StudyResult(Result):
+    """All that a study found, and what it was made with.
+
+    Attributes:
+        drives: Condition by condition, the variants in the study's order.
+        contrasts: Pictures of moments at which two drives differ.
+        device_scale: How many times slower the device is than the machine timed on.
+        versions: Versions of the packages that decide the result.
+        load: Load by other processes while latencies were measured; None if none was
+            measured here.
+    """
+
+    study: Study
+    variants: tuple[VariantOutcome, ...]
+    drives: tuple[DriveRecord, ...]
+    contrasts: tuple[Contrast, ...]
+    device_scale: float
+    machine: str
+    versions: Mapping[str, str]
+    load: Load | None = None
+
+    @property
+    def title(self) -> str:
+        """The study's title, with a note if not all routes were driven."""
+        return f"{self.study.title}{self.study.preview}"
+
+    @property
+    def timed(self) -> bool:
+        """Whether the latency of any variant is known."""
+        return any(each.latency_ms[50].value is not None for each in self.variants)
+
+    @property
+    def coverage(self) -> tuple[int, int]:
+        """Number of routes driven, and of routes in the whole set."""
+        if self.study.routes:
+            return len(self.study.routes), self.study.set_size
+        scores = [each.scores for each in self.drives if each.scores is not None]
+        return (scores[0].routes, scores[0].expected) if scores else (0, 0)
+
+    def label(self, drive: DriveRecord) -> str:
+        """Name a drive by its variant, and by its condition if there are several."""
+        if len(self.study.conditions) == 1:
+            return drive.variant
+        return f"{drive.variant}, {drive.condition}"
+
+    def under(self, condition: Condition) -> tuple[DriveRecord, ...]:
+        """Return the drives under one condition."""
+        return tuple(each for each in self.drives if each.condition == condition.name)
+
+    @property
+    def changes(self) -> tuple[Change, ...]:
+        """Cost of each change of a condition, by variant."""
+        study = self.study
+        return changes(study.conditions, self.drives, study.baseline, study.seed)
+
+    @property
+    def pairs(self) -> tuple[Change, ...]:
+        """Comparisons of the pairs that the study names."""
+        return held_against(self.study.pairs, self.drives, self.study.seed)
+
+    def variant(self, name: str) -> VariantOutcome:
+        """Return a variant by its name."""
+        return next(each for each in self.variants if each.name == name)
 
     @property
     def headline(self) -> str:
@@ -39,35 +110,36 @@ class StudyResult(StudyOutcome, Result):
 
     def alerts(self) -> tuple[str, ...]:
         """Return the variants that failed, and whether the machine was busy."""
-        failed = [each.prepared for each in self.variants if each.prepared.failure]
-        busy = [str(self.load)] if self.load is not None and self.load.busy else []
-        left_out = (
-            f"variant {each.variant.name} was left out: {each.failure}"
-            for each in failed
+        prepared = [each.prepared for each in self.variants]
+        return (
+            *(
+                f"variant {each.variant.name} was left out: {each.failure}"
+                for each in prepared
+                if each.failure
+            ),
+            *(
+                f"{each.variant}, {each.condition}: {each.scores.failed}"
+                for each in self.drives
+                if each.scores is not None and each.scores.failed
+            ),
+            *([str(self.load)] if self.load is not None and self.load.busy else []),
         )
-        broken = (
-            f"{each.variant}, {each.condition}: {each.scores.failed}"
-            for each in self.drives
-            if each.scores is not None and each.scores.failed
-        )
-        return (*left_out, *broken, *busy)
 
     @property
     def tables_by_section(self) -> Mapping[str, tuple[Table, ...]]:
         """Every table, in reading order; a preview is marked as such."""
-        route_by_route, several = route_table(self), len(self.variants) > 1
-        found = {
+        sections = {
             "Scoreboard": scoreboards(self),
-            "Paired differences": (differences(self),) if several else (),
+            "Paired differences": (differences(self),) * (len(self.variants) > 1),
             "One change at a time": change_tables(self),
-            "Route by route": () if route_by_route is None else (route_by_route,),
+            "Route by route": route_tables(self),
             "Near misses": (near_misses(self),),
             "Abilities": abilities(self),
         }
         preview = self.study.preview
         return {
             heading: tuple(replace(e, title=f"{e.title}{preview}") for e in tables)
-            for heading, tables in found.items()
+            for heading, tables in sections.items()
         }
 
     def tables(self) -> tuple[Table, ...]:
@@ -104,32 +176,236 @@ class StudyResult(StudyOutcome, Result):
         }
 
 
-def near_misses(outcome: StudyOutcome) -> Table:
+def scoreboards(result: StudyResult) -> tuple[Table, ...]:
+    """Show driving scores, size and latency of all variants, by condition."""
+    baseline, (driven, whole) = result.study.baseline, result.coverage
+    of = "" if driven == whole else f"{driven} of "
+    note = (
+        f"{of}{counted(whole, 'route')}. DS driving score, room kept to others, SR "
+        "success rate, DE efficiency, DC comfort, both also in the arithmetic of "
+        "Bench2Drive's tools (b2d), each with its 95 % interval over these scenario "
+        f"types. {MISSING} means not measured."
+    )
+    if len(result.variants) == 1:
+        rows = tuple((Cell(each.condition), *_scores(each)) for each in result.drives)
+        title = f"Scoreboard of {baseline}"
+        return (Table(title, ("condition", *SCORES), rows, note),)
+    # what the columns of costs are
+    if result.timed:
+        scale = result.device_scale
+        kind = f"times {scale:.3g}, one device scale for all"
+        kind = "on this machine" if scale == 1.0 else kind
+        note += f" Latency: models in turn, warm, {kind}."
+    note += (
+        f" Plan and SQNR: how far waypoints move from {baseline}'s on held-out frames, "
+        "and the noise on them."
+    )
+    return tuple(
+        Table(
+            f"Scoreboard, {_condition(result, condition)}",
+            ("variant", *SCORES, *COSTS),
+            tuple(
+                (Cell(each.variant), *_scores(each), *_costs(result, each))
+                for each in result.under(condition)
+            ),
+            note,
+            baseline,
+        )
+        for condition in result.study.conditions
+    )
+
+
+def _condition(result: StudyResult, condition: Condition) -> str:
+    scale = result.device_scale
+    device = "this machine" if scale == 1.0 else f"a device {scale:.3g} times slower"
+    return condition.described(device)
+
+
+def _scores(drive: DriveRecord) -> tuple[Cell, ...]:
+    if drive.scores is None:
+        return (Cell(MISSING, reason=drive.reason),) * len(SCORES)
+    of = drive.scores
+    shown = (
+        *(of.driving_score, of.safety.room_kept, of.success_rate, of.efficiency),
+        *(of.bench2drive_efficiency, of.comfort, of.bench2drive_smoothness),
+    )
+    return tuple(map(estimate_cell, shown))
+
+
+def _costs(result: StudyResult, drive: DriveRecord) -> tuple[Cell, ...]:
+    variant = result.variant(drive.variant)
+    return (
+        measure_cell(variant.size_mb, ".2f"),
+        measure_cell(variant.latency_ms[50], ".1f"),
+        measure_cell(variant.latency_ms[99], ".1f"),
+        measure_cell(variant.fidelity.mean_m, ".3f"),
+        measure_cell(variant.fidelity.plan_sqnr_db, ".1f"),
+    )
+
+
+def differences(result: StudyResult) -> Table:
+    """Show every variant minus the baseline, paired by route."""
+    labels = [each for each in result.drives if each.difference is not None]
+    gaps = [each.difference for each in labels if each.difference is not None]
+    # p-values are corrected for all comparisons shown
+    corrected = holm([each.p_value for each in gaps])
+    rows = tuple(
+        (
+            Cell(result.label(drive)),
+            *_gaps(gap),
+            *map(Cell, (f"{p:.2g}", str(gap.better), str(gap.worse))),
+        )
+        for drive, gap, p in zip(labels, gaps, corrected, strict=True)
+    )
+    columns = (
+        *("variant", "DS, points", "DS, other types", "room, points"),
+        *("SR, points", "SR p", "routes better", "routes worse"),
+    )
+    title = f"Difference to {result.study.baseline} on the same routes"
+    return Table(title, columns, rows, _differences_note(gaps))
+
+
+def _differences_note(gaps: Sequence[PairedDifference]) -> str:
+    note = (
+        "Mean over routes with its 95 % interval, paired: an interval that holds zero "
+        'shows no difference. It is for routes of these scenario types; "DS, other '
+        "types\" for types drawn anew. SR p: McNemar's exact test"
+    )
+    # several comparisons: the correction, and its limits
+    if len(gaps) > 1:
+        note += (
+            f", corrected for {len(gaps)} comparisons (Holm). Each interval is a 95 % "
+            "interval by itself: one in twenty misses zero by chance where nothing "
+            "differs"
+        )
+    note += "."
+    # what so few routes cannot show
+    if gaps:
+        on, least = counted(gaps[0].driving_score.n, "route"), gaps[0].smallest_shown
+        note += f" {on} cannot show a difference below {least:.1f} points."
+    alike = [each for each in gaps if not each.differ]
+    if alike:
+        routes, share = alike[0].driving_score.n, alike[0].unseen_percent
+        note += f" Where 0 of {routes} routes differ, at most {share:.1f} % do (95 %)."
+    return note
+
+
+def _gaps(of: Change | PairedDifference) -> tuple[Cell, ...]:
+    """Show differences: driving score with both intervals, room kept, success rate."""
+    estimates = of.driving_score, of.room_kept, of.success_rate
+    score, room, rate = (estimate_cell(each, signed=True) for each in estimates)
+    return score, anew_cell(of.driving_score), room, rate
+
+
+def abilities(result: StudyResult) -> tuple[Table, ...]:
+    """Show the success rate by ability, in tables like the scoreboards."""
+    baseline = result.study.baseline
+    if len(result.variants) == 1:
+        by_condition = {drive.condition: drive.scores for drive in result.drives}
+        title = f"Success of {baseline} by ability in %"
+        return (_abilities(title, by_condition, "", "condition"),)
+    return tuple(
+        _abilities(
+            f"Success by ability in %, {_condition(result, each)}",
+            {drive.variant: drive.scores for drive in result.under(each)},
+            baseline,
+            "variant",
+        )
+        for each in result.study.conditions
+    )
+
+
+def _abilities(
+    title: str, scores: Mapping[str, Scores | None], strong: str, heading: str
+) -> Table:
+    rows = tuple(
+        (Cell(name), *map(estimate_cell, (*of.each_ability.values(), of.abilities)))
+        for name, of in scores.items()
+        if of is not None
+    )
+    columns = (heading, *(name.replace("_", " ") for name in ABILITIES), "mean")
+    note = "A route may test two abilities. Intervals are exact, the mean's by "
+    return Table(title, columns, rows, f"{note}bootstrap.", strong)
+
+
+def change_tables(result: StudyResult) -> tuple[Table, ...]:
+    """Show costs of changed conditions, and pairs of drives, if there are any."""
+    baseline = result.study.baseline
+    note = (
+        "The first drive minus the second, mean over routes with its 95 % interval: one"
+        " that holds zero shows no difference."
+    )
+    further = (
+        f" Beyond: minus {baseline}'s own difference, route by route; below zero where"
+        " the change costs more than it."
+    )
+    columns = (
+        *("drive", "against", "DS, points", "DS, other types", "room, points"),
+        "SR, points",
+    )
+    titled = (
+        (
+            f"One change, the same routes and seeds; more than it costs {baseline}?",
+            (*columns, "DS beyond", "room beyond", "SR beyond"),
+            result.changes,
+            note + further,
+        ),
+        ("Pairs of drives on the same routes", columns, result.pairs, note),
+    )
+    return tuple(
+        Table(title, heads, tuple(_change(each)[: len(heads)] for each in rows), words)
+        for title, heads, rows, words in titled
+        if rows
+    )
+
+
+def _change(change: Change) -> tuple[Cell, ...]:
+    own = Cell(MISSING, reason="the baseline itself")
+    beyond = [estimate_cell(each, signed=True) for each in change.beyond.values()]
+    names = Cell(change.drive), Cell(change.against)
+    return (*names, *_gaps(change), *(beyond or [own] * 3))
+
+
+def route_tables(result: StudyResult) -> tuple[Table, ...]:
+    """Show how each route ended for each driver; nothing if there are too many."""
+    driven = [each for each in result.drives if each.routes]
+    if not driven or len(driven[0].routes) > MOST_ROUTES:
+        return ()
+    rows = list[tuple[Cell, ...]]()
+    for routes in zip(*(each.routes for each in driven), strict=True):
+        cells = [Cell(routes[0].route)]
+        for each in routes:
+            room = "" if each.room_kept is None else f"; room {each.room_kept:.0f} %"
+            cells.append(Cell(f"{each.driving_score:.1f}", f"{each.fate}{room}"))
+        rows.append(tuple(cells))
+    columns = ("route", *map(result.label, driven))
+    note = "Driving score, why it is not 100, and the room kept to others."
+    return (Table("How each route ended", columns, tuple(rows), note),)
+
+
+def near_misses(result: StudyResult) -> Table:
     """Show how near every drive came to collisions, which end few routes."""
     columns = ("TTC < 1.5 s, %", "least TTC s", "PET s", "distance m", "at fault %")
+    rows = list[tuple[Cell, ...]]()
+    for drive in result.drives:
+        cells = (Cell(MISSING, reason=drive.reason),) * len(columns)
+        if drive.scores is not None:
+            safety = drive.scores.safety
+            cells = (
+                estimate_cell(safety.ttc_exposure),
+                estimate_cell(safety.smallest_ttc, ".2f"),
+                estimate_cell(safety.smallest_pet, ".2f"),
+                estimate_cell(safety.smallest_distance, ".2f"),
+                estimate_cell(safety.at_fault_collisions),
+            )
+        rows.append((Cell(result.label(drive)), *cells))
     return Table(
         "Near misses",
         ("variant", *columns),
-        tuple(
-            (Cell(outcome.label(each)), *_safety(each, len(columns)))
-            for each in outcome.drives
-        ),
+        tuple(rows),
         "Means over routes with their 95 % intervals: share of the time with a time to "
         "collision below 1.5 s, the least of a route, post-encroachment time of "
         "crossing paths, smallest distance; and routes with a collision that the ego "
         "could have prevented. Least TTC and PET exist on some routes only.",
-        outcome.study.baseline,
-    )
-
-
-def _safety(drive: DriveRecord, columns: int) -> tuple[Cell, ...]:
-    if drive.scores is None:
-        return (Cell(MISSING, reason=drive.reason),) * columns
-    found = drive.scores.safety
-    return (
-        estimate_cell(found.ttc_exposure),
-        estimate_cell(found.smallest_ttc, ".2f"),
-        estimate_cell(found.smallest_pet, ".2f"),
-        estimate_cell(found.smallest_distance, ".2f"),
-        estimate_cell(found.at_fault_collisions),
+        result.study.baseline,
     )

@@ -65,9 +65,8 @@ def time_all(
 
     Models measured together share their noise. A kept trace must be of the same model,
     machine, threads and frames, with at least as many samples (studies in one folder
-    share the longest); otherwise it is measured again. Files from before traces named
-    their frames are assumed to match. Without a kept trace of the baseline, kept traces
-    cannot be compared with new ones, so all are measured again.
+    share the longest); otherwise it is measured again. Without a kept trace of the
+    baseline, kept traces cannot be compared with new ones, so all are measured again.
 
     Raises:
         EvaluationError: A trace cannot be read or written, or the baseline's median,
@@ -75,56 +74,38 @@ def time_all(
     """
     frames = None if study.held_out is None else CalibrationSet(study.held_out)
     seen = None if frames is None else frames.fingerprint
-    traces = dict[str, LatencyTrace]()
-    for each in prepared:
-        kept = _kept(study, each, seen, workspace, listener)
-        if kept is not None:
-            traces[each.variant.name] = kept
-    if frames is None:
-        why = "no held-out frames were given"
-        return Clock(traces, _scale(study, traces), why, _load(prepared, traces))
-    baseline = next(each for each in prepared if each.variant is study.reference)
-    kept_baseline = None if baseline.variant.trace else traces.get(study.baseline)
-    missing = _missing(prepared, traces, kept_baseline, workspace, listener)
-    measured = _measured(study, frames, missing, baseline, kept_baseline, listener)
-    # the baseline last: a kill before leaves none that old ones could stand beside
-    for each in sorted(missing, key=lambda one: one is baseline):
-        trace = replace(measured[each.variant.name], frames=seen)
-        trace.save(workspace.trace(each.variant))
-        traces[each.variant.name] = trace
-    load = _load(prepared, traces)
-    return Clock(traces, _scale(study, traces), "not a model", load)
-
-
-def _load(
-    prepared: Sequence[PreparedVariant], traces: Mapping[str, LatencyTrace]
-) -> Load | None:
-    """Return the highest load under which a trace was measured here."""
+    loaded = {
+        each.variant.name: _kept(study, each, seen, workspace, listener)
+        for each in prepared
+    }
+    traces = {name: trace for name, trace in loaded.items() if trace is not None}
+    reason = "no held-out frames were given"
+    if frames is not None:
+        reason = "not a model"
+        baseline = next(each for each in prepared if each.variant == study.reference)
+        kept_baseline = None if baseline.variant.trace else traces.get(study.baseline)
+        # all are missing, if new traces cannot be compared with old
+        ours = [each for each in prepared if each.model and not each.variant.trace]
+        missing = [each for each in ours if each.variant.name not in traces]
+        if kept_baseline is None and missing:
+            for each in (each for each in ours if each not in missing):
+                listener.on_warning(
+                    f"{workspace.trace(each.variant)}: no trace of the baseline is kept"
+                    " beside it: measured again"
+                )
+            missing = ours
+        found = _measured(study, frames, missing, baseline, kept_baseline, listener)
+        # the baseline last: a kill before leaves none that old ones could stand beside
+        for each in sorted(missing, key=lambda one: one is baseline):
+            trace = replace(found[each.variant.name], frames=seen)
+            trace.save(workspace.trace(each.variant))
+            traces[each.variant.name] = trace
+    # the highest load under which a trace was measured here
     names = [each.variant.name for each in prepared if not each.variant.trace]
-    found = [traces[name].others for name in names if name in traces]
-    known = [each for each in found if each is not None]
-    return max(known, key=lambda load: load.others, default=None)
-
-
-def _missing(
-    prepared: Sequence[PreparedVariant],
-    traces: Mapping[str, LatencyTrace],
-    kept_baseline: LatencyTrace | None,
-    workspace: Workspace,
-    listener: Listener,
-) -> list[PreparedVariant]:
-    """List what is to be measured: all, if new traces cannot be compared with old."""
-    ours = [each for each in prepared if each.model and not each.variant.trace]
-    missing = [each for each in ours if each.variant.name not in traces]
-    if kept_baseline is not None or not missing:
-        return missing
-    for each in ours:
-        if each not in missing:
-            path = workspace.trace(each.variant)
-            listener.on_warning(
-                f"{path}: no trace of the baseline is kept beside it: measured again"
-            )
-    return ours
+    loads = [traces[name].others for name in names if name in traces]
+    known = [each for each in loads if each is not None]
+    load = max(known, key=lambda load: load.others, default=None)
+    return Clock(traces, _scale(study, traces), reason, load)
 
 
 def _measured(
@@ -142,10 +123,8 @@ def _measured(
     """
     if not missing:
         return {}
-    # the baseline is always measured with the others
-    name = baseline.variant.name
     timed = missing if kept is None else (baseline, *missing)
-    found = record_traces(
+    traces = record_traces(
         {each.variant.name: each.model for each in timed if each.model is not None},
         frames,
         samples=study.timing.samples,
@@ -153,16 +132,16 @@ def _measured(
         provider=study.provider,
         on_sample=partial(listener.on_progress, "latency"),
     )
-    # put them on the scale of the kept baseline
     if kept is None:
-        return found
-    pace = kept.percentile_us(50) / max(1, found.pop(name).percentile_us(50))
-    return {each: _paced(trace, pace) for each, trace in found.items()}
-
-
-def _paced(trace: LatencyTrace, pace: float) -> LatencyTrace:
-    samples_us = tuple(round(sample * pace) for sample in trace.samples_us)
-    return replace(trace, samples_us=samples_us)
+        return traces
+    again = traces.pop(baseline.variant.name)
+    pace = kept.percentile_us(50) / max(1, again.percentile_us(50))
+    return {
+        name: replace(
+            each, samples_us=tuple(round(us * pace) for us in each.samples_us)
+        )
+        for name, each in traces.items()
+    }
 
 
 def _kept(
@@ -172,35 +151,28 @@ def _kept(
     workspace: Workspace,
     listener: Listener,
 ) -> LatencyTrace | None:
+    """Return the trace that is given or kept, unless it is of something else."""
     if each.variant.trace is not None:
         return LatencyTrace.load(each.variant.trace)
     path = workspace.trace(each.variant)
     if each.model is None or not path.is_file():
         return None
-    trace = LatencyTrace.load(path)
-    other = _other(trace, each, frames, study)
-    if other is None:
+    trace, wanted = LatencyTrace.load(path), study.timing.samples
+    machine = describe_machine(study.timing.threads, study.provider)
+    other = ""
+    if trace.model_sha256 != each.sha256:
+        other = "another model"
+    elif len(trace.samples_us) < wanted:
+        other = f"{len(trace.samples_us)} samples, not {wanted}"
+    # as it was written before 1 was singular
+    elif trace.machine.replace("on 1 threads", "on 1 thread") != machine:
+        other = f"another machine ({trace.machine}; this is {machine})"
+    elif None not in (trace.frames, frames) and trace.frames != frames:
+        other = "other frames"
+    if not other:
         return trace
     then = "left out" if study.held_out is None else "measured again"
     listener.on_warning(f"{path}: of {other}: {then}")
-    return None
-
-
-def _other(
-    trace: LatencyTrace, each: PreparedVariant, frames: str | None, study: Study
-) -> str | None:
-    """Return what a trace measured if it was something else; else None."""
-    wanted = study.timing.samples
-    machine = describe_machine(study.timing.threads, study.provider)
-    if trace.model_sha256 != each.sha256:
-        return "another model"
-    if len(trace.samples_us) < wanted:
-        return f"{len(trace.samples_us)} samples, not {wanted}"
-    # as it was written before 1 was singular
-    if trace.machine.replace("on 1 threads", "on 1 thread") != machine:
-        return f"another machine ({trace.machine}; this is {machine})"
-    if None not in (trace.frames, frames) and trace.frames != frames:
-        return "other frames"
     return None
 
 

@@ -1,18 +1,16 @@
 """Remaining drives of a study, and an estimate of their duration."""
 
 import json
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from me2e_compress.display import Cell, Table, counted, duration, number
+from me2e_compress.display import Table, counted, duration, number, table
 from me2e_compress.driving.latency import DecisionFacts
 from me2e_compress.driving.realtime import LatencyModel, skipped_decisions
-from me2e_compress.simulator.routes import EXPERT_S, Route
 from me2e_compress.study.condition import Condition
-from me2e_compress.study.definition import Study, Variant
+from me2e_compress.study.definition import Study
 from me2e_compress.study.workspace import Workspace
 from me2e_compress.workflows.result import Result
 
@@ -20,8 +18,6 @@ FRAME_S, DECISION_S = 0.0024, 0.021
 """CPU seconds of a frame of the world, and of a decision: six pictures and one
 inference of the driver that ships on one core of a Xeon (two routes, at every frame
 and at every eighth)."""
-LONGER = 1.5
-"""Frames of a route, by those of its type in `EXPERT_S`, which knows no traffic."""
 ENOUGH = 20
 """Fewest logged routes from which the machine's speed is fitted."""
 
@@ -71,15 +67,13 @@ class Workload(Result):
         """Return a table with one row per drive."""
         rows = [
             (
-                Cell(each.variant),
-                Cell(each.condition),
-                Cell(f"{each.done} of {each.routes}"),
-                Cell(duration(3600 * each.hours)),
+                *(each.variant, each.condition, f"{each.done} of {each.routes}"),
+                duration(3600 * each.hours),
             )
             for each in self.drives
         ]
         columns = ("variant", "condition", "routes driven", "time left")
-        return (Table("Drives", columns, tuple(rows), words=2),)
+        return (table("Drives", columns, rows, words=2),)
 
 
 def workload(study: Study, folder: str | Path, workers: int = 1) -> Workload:
@@ -96,33 +90,20 @@ def workload(study: Study, folder: str | Path, workers: int = 1) -> Workload:
         period = held_frames(study, condition)
         for variant in study.driven_under(condition):
             # frames and decisions of the missing routes
-            left = _left(study, place, variant, condition)
-            driven_s = sum(map(_expected_s, left))
-            frames = 1e6 * driven_s / condition.settings.dt_us
+            kept = place.folder / "results" / place.drive(variant, condition) / "routes"
+            recorded = place.record(variant, condition).is_file()
+            left = [
+                study.driven_by.expected_s(route)
+                for route in study.routes
+                if not recorded and not (kept / f"{route.id}.json").is_file()
+            ]
+            frames = 1e6 * sum(left) / condition.drive.dt_us
             hours = frames * (frame_s + decision_s / period) / 3600 / workers
             total = len(study.routes)
-            done = total - len(left)
-            drives.append(
-                PlannedDrive(variant.name, condition.name, done, total, hours)
-            )
-    return Workload(
-        study.title, tuple(drives), study.set_size, workers, known is not None
-    )
-
-
-def _left(
-    study: Study, place: Workspace, variant: Variant, condition: Condition
-) -> Sequence[Route]:
-    if place.record(variant, condition).is_file():
-        return ()
-    folder = place.folder / "results" / place.drive(variant, condition) / "routes"
-    return [
-        route for route in study.routes if not (folder / f"{route.id}.json").is_file()
-    ]
-
-
-def _expected_s(route: Route) -> float:
-    return EXPERT_S[route.scenario] * LONGER
+            names = variant.name, condition.name
+            drives.append(PlannedDrive(*names, total - len(left), total, hours))
+    measured = known is not None
+    return Workload(study.title, tuple(drives), study.set_size, workers, measured)
 
 
 def held_frames(study: Study, condition: Condition) -> int:
@@ -131,18 +112,15 @@ def held_frames(study: Study, condition: Condition) -> int:
     Frames are the condition's steps. For a trace, or a mean of one, it is based on the
     baseline's median on the device, if the study states it, with no road users in view.
     """
-    if condition.settings.latency_model is LatencyModel.FIFO:
+    if condition.drive.latency_model is LatencyModel.FIFO:
         return 1
     if condition.mean_of:
-        under = condition.mean_cell[1]
-        return held_frames(
-            study, next(each for each in study.conditions if each.name == under)
-        )
+        return held_frames(study, study.drive_of(condition.mean_of)[1])
     latency_us = round(1e6 * (study.timing.baseline_median_s or 0.0))
     source = condition.source(study.seed).with_trace((latency_us,), 1.0)
     nobody = DecisionFacts(latency_us, np.empty((0, 2)))
     latency_us = source.on_route("")(nobody)
-    return skipped_decisions(latency_us, condition.settings.dt_us) + 1
+    return skipped_decisions(latency_us, condition.drive.dt_us) + 1
 
 
 def _logged(folder: Path) -> tuple[float, float] | None:

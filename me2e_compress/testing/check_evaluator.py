@@ -2,56 +2,106 @@
 
 import itertools
 import json
+import tempfile
 from collections import Counter
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import NamedTuple
 
-from me2e_compress.driving.contract import Evaluator, SizedEvaluator
-from me2e_compress.errors import VerificationError
-from me2e_compress.evaluators import EVALUATORS
+from me2e_compress.driving.latency import FixedLatency
+from me2e_compress.driving.policies import Driver
+from me2e_compress.errors import EvaluationError, VerificationError
+from me2e_compress.evaluators import EVALUATORS, Drive, Evaluator
+from me2e_compress.evaluators.contract import with_abilities
 from me2e_compress.metrics.episode import Episode
 from me2e_compress.simulator.routes import is_route_id
 from me2e_compress.testing.form import check_form, require
 
+LATENCY_US = 250_000
+"""What every decision is charged where an evaluator declares that it takes latency."""
+
+
+class _Silent(NamedTuple):
+    on_progress: Callable[[str, int, int, str], None] = lambda *_: None
+    on_warning: Callable[[str], None] = lambda _: None
+
 
 def check_evaluator(
-    evaluator: Evaluator, again: Evaluator | None = None
+    evaluator: Evaluator, policy: Driver | None = None, routes: str = "all"
 ) -> tuple[Episode, ...]:
-    """Check that an evaluator yields each route once, and always the same.
+    """Check that an evaluator does what it declares, and always the same.
 
-    It passes :func:`check_form`; it yields at least one episode, no route twice; a
-    second evaluation yields equal episodes in the same order; and episodes can be
-    stored: a route's name is valid in a file name, its numbers are finite and in their
-    bounds, its frames are in order of time.
+    It passes :func:`check_form` and has what its ``takes`` declares; it yields at least
+    one episode, each of the routes that were asked for and no route twice; a second
+    evaluation yields equal episodes; a latency is charged to decisions; and episodes
+    can be stored: a route's name is valid in a file name, its numbers are finite and in
+    their bounds, its frames are in order of time.
 
-    ``again`` has equal options and drives anew, i.e. with another folder for results;
-    None asks the same evaluator twice. Returns the episodes.
+    ``policy`` is who drives, None for an evaluator that reads; ``routes`` are words of
+    the evaluator, which it is asked for if it takes routes. Returns the episodes.
 
     Raises:
         VerificationError: it broke a promise; the message says which.
         EvaluationError: it cannot evaluate.
     """
     check_form(evaluator, EVALUATORS)
-    name = evaluator.name
-    if isinstance(evaluator, SizedEvaluator):
-        size: object = evaluator.set_size
-        require(isinstance(size, int), f"{name}: set_size is no property of a number")
-    first = tuple(evaluator.episodes())
-    require(first, f"{name} yields no episode")
+    name, drive = evaluator.name, Drive()
+    try:
+        with_abilities(evaluator)
+    except EvaluationError as error:
+        raise VerificationError(str(error)) from error
+    size: object = evaluator.set_size
+    if not isinstance(size, int):
+        raise VerificationError(f"{name}: set_size is no property of a number")
+    if "routes" in evaluator.takes:
+        picked, set_size = evaluator.routes(routes)
+        drive = replace(drive, routes=picked, set_size=set_size)
     # episodes, each of its own route, that can be stored
-    for each in first:
-        require(isinstance(each, Episode), f"{name} yields {each!r}, no episode")
-    route, count = Counter(each.route for each in first).most_common(1)[0]
-    require(count == 1, f"{name} yields route {route} {count} times")
+    first = _episodes(evaluator, policy, drive)
     for each in first:
         _check_kept(name, each)
     # the same again
-    second = tuple((evaluator if again is None else again).episodes())
-    routes = [[each.route for each in episodes] for episodes in (first, second)]
-    same = routes[0] == routes[1]
-    require(same, f"{name} yields other routes, or in another order")
+    second = _episodes(evaluator, policy, drive)
+    if [each.route for each in second] != [each.route for each in first]:
+        raise VerificationError(f"{name} yields other routes, or in another order")
     for one, other in zip(first, second, strict=True):
-        differ = f"two runs of {name} give different episodes for {one.route}"
-        require(one == other, differ)
+        if one != other:
+            raise VerificationError(
+                f"two runs of {name} give different episodes for {one.route}"
+            )
+    if "latency" in evaluator.takes:
+        late = replace(drive, latency=FixedLatency(LATENCY_US))
+        for each in _episodes(evaluator, policy, late):
+            if {LATENCY_US} != {decision.latency_us for decision in each.decisions}:
+                raise VerificationError(
+                    f"{name} declares latency, and does not charge it on {each.route}"
+                )
     return first
+
+
+def _episodes(
+    evaluator: Evaluator, policy: Driver | None, drive: Drive
+) -> tuple[Episode, ...]:
+    """Drive in a folder of its own; routes that were asked for in their order."""
+    name = evaluator.name
+    with tempfile.TemporaryDirectory() as folder:
+        results = Path(folder) / "results"
+        episodes = tuple(evaluator.episodes(policy, drive, results, _Silent()))
+    if not episodes:
+        raise VerificationError(f"{name} yields no episode")
+    strange = [each for each in episodes if not isinstance(each, Episode)]
+    if strange:
+        raise VerificationError(f"{name} yields {strange[0]!r}, no episode")
+    route, count = Counter(each.route for each in episodes).most_common(1)[0]
+    if count > 1:
+        raise VerificationError(f"{name} yields route {route} {count} times")
+    if not drive.routes:
+        return episodes
+    wanted = [route.id for route in drive.routes]
+    if sorted(wanted) != sorted(each.route for each in episodes):
+        raise VerificationError(f"{name} yields other routes than were asked for")
+    return tuple(sorted(episodes, key=lambda each: wanted.index(each.route)))
 
 
 def _check_kept(name: str, episode: Episode) -> None:

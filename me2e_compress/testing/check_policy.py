@@ -70,7 +70,7 @@ def _numbers(answer: Trajectory | PedalsAndWheel) -> npt.NDArray[np.floating]:
 def _answers(driver: Driver, policy: Policy) -> Answers:
     """Drive the beginning of the route."""
     # the evaluator needs an extra that the other checks do not need
-    from me2e_compress.evaluators.highway.conditions import Conditions
+    from me2e_compress.evaluators import Drive
     from me2e_compress.evaluators.highway.drivers import image_size_of
     from me2e_compress.evaluators.highway.runner import Listeners, drive
     from me2e_compress.simulator.routes import load_routes, pick_routes
@@ -84,10 +84,11 @@ def _answers(driver: Driver, policy: Policy) -> Answers:
 
     # drive until the policy has answered often enough, then check the episode
     (route,) = pick_routes(load_routes(), ROUTE)
-    watched = _Watched(policy, policy.needs_images, policy.privileged)
+    watched = _Watched(
+        policy, policy.needs_images, policy.privileged, image_size_of(policy)
+    )
     listeners = Listeners(lambda world: asked.append((world, world.time_us)), answered)
-    conditions = Conditions(image_size=image_size_of(policy))
-    episode = drive(route, watched, conditions, listeners)
+    episode = drive(route, watched, Drive(), listeners)
     require(watched.enough, f"{driver.name}: {episode.failure}")
     return tuple(checked(answer) for answer in watched.answers)
 
@@ -99,6 +100,7 @@ class _Watched:
     policy: Policy
     needs_images: bool
     privileged: bool
+    image_size: tuple[int, int]
     answers: list[Answer] = field(default_factory=list)
     enough: bool = False
 

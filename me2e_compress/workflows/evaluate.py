@@ -1,69 +1,111 @@
-"""Drive a policy over routes of highway-env, and score it."""
+"""Drive a policy over routes of an evaluator, and score it."""
 
 import dataclasses
+from collections.abc import Sequence
 from pathlib import Path
+from typing import cast
 
 from me2e_compress import graph
-from me2e_compress.display import Table, number
+from me2e_compress.display import Table
+from me2e_compress.driving.contract import RouteInfo
+from me2e_compress.driving.latency import parse_latency
 from me2e_compress.driving.policies import POLICIES, Driver, driver_named
 from me2e_compress.errors import EvaluationError, GraphError
+from me2e_compress.evaluators.contract import Drive, Evaluator, evaluator_named
 from me2e_compress.evaluators.highway.drivers import OnnxDriver
-from me2e_compress.evaluators.highway.evaluator import DrivingOptions, DrivingProgress
-from me2e_compress.evaluators.highway.results import MANIFEST, log_beside
-from me2e_compress.evaluators.highway.worker import Job
-from me2e_compress.extras import need_extra
+from me2e_compress.evaluators.highway.engine import engine_of
+from me2e_compress.evaluators.results import MANIFEST, drive_routes, log_beside
 from me2e_compress.metrics.deadlines import Deadlines, charged, deadlines_table
 from me2e_compress.metrics.scores import Scores
 from me2e_compress.metrics.scores import score as score_episodes
+from me2e_compress.registry import options_of
 from me2e_compress.runtime.providers import CPU, Provider
 from me2e_compress.shipped.drivers import SHIPPED
 from me2e_compress.simulator.routes import Route, pick_routes
 from me2e_compress.targets.onnxruntime import slow_here
 from me2e_compress.workflows.checks import check_folder, model_path, try_first, writing
-from me2e_compress.workflows.other_evaluators import (
-    HIGHWAY,
-    driven_episodes,
-    evaluator_named,
-    expected_of,
-    files_of,
-    is_highway,
-    keep,
-)
 from me2e_compress.workflows.result import SILENT, Listener, Result
 from me2e_compress.workflows.score import driving_score, scores_table
 
 _FLAGS = {"module_map": "map"}
 """Command-line names of options that differ from their Python names."""
+_ABILITIES = {"seed": "latency", "workers": "engine", "address": "engine"}
+"""What an evaluator must take for an option, where that has another name."""
+_FOR_ALL = ("evaluator", "force")
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class EvaluateOptions(DrivingOptions):
-    """Which routes are driven, under which conditions, and what is made of them.
+class EvaluateOptions:
+    """Which routes are driven, under which conditions and where, in words.
 
     Attributes:
+        routes: ``all``, a number, ``ID,ID`` or a file of routes.
+        latency: what a decision costs: ``none``, ``fps:F``, ``trace:FILE``,
+            ``measured``.
+        seed: seed of the draws from a trace.
+        latency_model: ``drop`` the decisions due meanwhile, or ``fifo``: delay every
+            control.
+        dt_ms: time step of the simulation, in milliseconds; results at different steps
+            are not compared.
+        weather: ``fog_m=80,night=0.5,dropped=BACK+FRONT``; empty is what each route
+            says.
+        drive_on: go on after a collision, as Bench2Drive does; every collision then
+            multiplies the score.
+        workers: routes at a time.
+        engine: ``local``, processes of this machine, or ``ray``, a cluster.
+        address: address of a running Ray cluster; None starts one.
+        adapter: TOML file that adapts the model to the policy contract.
         module_map: preset or TOML file that says plan and state of the model; None
             leaves them to its metadata.
+        provider: what runs the model; policies other than graphs ignore it.
         render: draw these routes as GIF and PNG; chosen as ``routes`` is.
         force: replace outputs that we did not write, too.
-        evaluator: ``highway``, whose options are those above; or another by name,
-            ``name{option=value}``, which gets the policy as its option ``policy``.
+        evaluator: who drives, ``name{option=value}``; it takes those of the options
+            above that it declares.
     """
 
+    routes: str = "all"
+    latency: str = "none"
+    seed: int = 0
+    latency_model: str = "drop"
+    dt_ms: float = 50.0
+    weather: str = ""
+    drive_on: bool = False
+    workers: int = 1
+    engine: str = "local"
+    address: str | None = None
+    adapter: str | Path | None = None
     module_map: str | None = None
+    provider: Provider = CPU
     render: str | None = None
     force: bool = False
-    evaluator: str = HIGHWAY
+    evaluator: str = "highway"
 
-    def check_for_others(self) -> None:
-        """Raise EvaluationError if an option of highway alone is not at its default."""
+    def drive(self, evaluator: Evaluator) -> Drive:
+        """Read the words, for an evaluator that must take what they ask for.
+
+        Raises:
+            EvaluationError: An option is invalid, or not the evaluator's.
+        """
         for field in dataclasses.fields(self):
-            known = field.name in ("evaluator", "force")
-            if not known and getattr(self, field.name) != field.default:
-                option = _FLAGS.get(field.name, field.name.replace("_", "-"))
-                raise EvaluationError(
-                    f"--{option} is highway's: give {self.evaluator} options of its "
-                    "own, name{option=value}; `list evaluators` names them"
-                )
+            if (
+                field.name not in _FOR_ALL
+                and getattr(self, field.name) != field.default
+            ):
+                flag = _FLAGS.get(field.name, field.name.replace("_", "-"))
+                ability = _ABILITIES.get(field.name, field.name)
+                evaluator.check_takes([ability], f"--{flag}: ")
+        routes: Sequence[RouteInfo] = ()
+        set_size = 0
+        if "routes" in evaluator.takes:
+            routes, set_size = evaluator.routes(self.routes)
+        return dataclasses.replace(
+            Drive.of_words(self.latency_model, self.dt_ms, self.weather, self.drive_on),
+            latency=parse_latency(self.latency, seed=self.seed),
+            routes=routes,
+            set_size=set_size,
+            engine=engine_of(self.engine, self.workers, self.address),
+        )
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
@@ -116,11 +158,10 @@ def evaluate(
     options: EvaluateOptions | None = None,
     listener: Listener = SILENT,
 ) -> EvaluateResult:
-    """Drive a policy over routes of highway-env; run again, it goes on.
+    """Drive a policy over routes of an evaluator; run again, it goes on.
 
     The policy is an ONNX file, the name of a model that ships, ``expert``, ``blind`` or
-    ``blind:MPS``; None for an evaluator that drives none. Another evaluator than
-    highway is asked for all of its episodes, which are then kept in the same form.
+    ``blind:MPS``; None for an evaluator that drives none.
 
     Raises:
         EvaluationError: A policy, evaluator or option does not exist or fit, the policy
@@ -130,72 +171,61 @@ def evaluate(
         MissingExtraError: Driving in highway-env needs the extra ``highway``.
     """
     options, output = options or EvaluateOptions(), Path(output)
-    named = None if policy is None else str(policy)
-    if not is_highway(options.evaluator):
-        return _by_another(named, output, options)
-    if named is None:
-        raise EvaluationError("highway drives a policy: name one, M.onnx or highway")
-    policy = named
+    # every word is read before anything is written
+    evaluator = evaluator_named(options.evaluator)
+    drives = "policy" in evaluator.takes
+    if policy is None and drives:
+        raise EvaluationError(
+            f"{evaluator.name} drives a policy: name one, M.onnx or highway"
+        )
+    if policy is not None and not drives:
+        raise EvaluationError(f"{evaluator.name} drives no policy: leave out {policy}")
     # a trace that is no file is harmless here
     trace = options.latency.removeprefix("trace:")
     read = (policy, options.routes, trace, options.adapter, options.module_map)
-    check_folder(output, read, (MANIFEST,))
-    logs = [log_beside(output)]
-    with writing(logs, folders=[output], force=options.force):
-        return _evaluated(policy, output, options, listener)
-
-
-def _by_another(
-    policy: str | None, output: Path, options: EvaluateOptions
-) -> EvaluateResult:
-    options.check_for_others()
-    if policy in SHIPPED:
-        policy = str(model_path(policy))
-    evaluator = evaluator_named(options.evaluator, policy)
-    check_folder(output, (policy, *files_of(evaluator)), (MANIFEST,))
-    with writing(folders=[output], force=options.force):
-        episodes = driven_episodes(evaluator)
-        keep(evaluator, episodes, output, policy or "")
-    scores = score_episodes(episodes, expected_of(evaluator, episodes))
-    late = charged(episodes)
-    return EvaluateResult(policy or evaluator.name, output, scores, late=late)
+    values = [getattr(evaluator, each.name) for each in options_of(type(evaluator))]
+    files = [value for value in values if isinstance(value, Path)]
+    check_folder(output, (*read, *files), (MANIFEST,))
+    with writing([log_beside(output)], folders=[output], force=options.force):
+        return _evaluated(evaluator, policy, output, options, listener)
 
 
 def _evaluated(
-    policy: str, output: Path, options: EvaluateOptions, listener: Listener
+    evaluator: Evaluator,
+    policy: str | Path | None,
+    output: Path,
+    options: EvaluateOptions,
+    listener: Listener,
 ) -> EvaluateResult:
-    need_extra("highway", "driving")
-    routes, set_size = options.picked
-    shown = () if options.render is None else pick_routes(routes, options.render)
+    drive = options.drive(evaluator)
+    pictured: Sequence[RouteInfo] = ()
+    if options.render is not None:  # of those that are driven; it reads their ids alone
+        pictured = pick_routes(cast("Sequence[Route]", drive.routes), options.render)
     # find the driver, and open its graph in a process of its own first
-    driver = driver_of(policy, options.adapter, options.provider, options.module_map)
+    driver = None
+    if policy is not None:
+        adapter, module_map = options.adapter, options.module_map
+        driver = driver_of(str(policy), adapter, options.provider, module_map)
     if isinstance(driver, OnnxDriver):
-        file, provider = driver.path, options.provider
-        try_first(file, file.name, listener=listener, provider=provider)
-
-    def on_progress(now: DrivingProgress) -> None:
-        running = f"DS {number(now.driving_score, '.1f')}"
-        running += f" SR {number(now.success_rate, '.1f')} %"
-        listener.on_progress("evaluate", now.done, now.total, running)
-
+        file = driver.path
+        try_first(file, file.name, listener=listener, provider=options.provider)
     # drive, or go on where an earlier run stopped
-    evaluator = options.driven_by(driver, output, on_progress, listener.on_warning)
-    episodes = tuple(evaluator.episodes())
+    episodes = drive_routes(evaluator, driver, drive, output, listener)
     # score over the whole set, though only a part of it was asked for
+    set_size = max(drive.set_size or evaluator.set_size, len(episodes))
     scores = score_episodes(episodes, set_size)
-    pictures = _pictures(evaluator.job, shown, output)
-    late = charged(episodes, measured=options.source.measured)
-    model = graph.load(driver.path) if isinstance(driver, OnnxDriver) else None
-    slow = None if model is None else slow_here(model, options.provider)
-    return EvaluateResult(policy, output, scores, pictures, late, slow)
-
-
-def _pictures(job: Job, routes: tuple[Route, ...], folder: Path) -> tuple[Path, ...]:
-    if not routes:
-        return ()
-    from me2e_compress.evaluators.highway.render import render  # imports highway-env
-
-    return tuple(file for route in routes for file in render(job, route, folder))
+    pictures = tuple(
+        file
+        for route in pictured
+        if driver is not None
+        for file in evaluator.render(driver, drive, route, output)
+    )
+    late = charged(episodes, measured=drive.latency.measured)
+    slow = None
+    if isinstance(driver, OnnxDriver):
+        slow = slow_here(graph.load(driver.path), options.provider)
+    name = evaluator.name if policy is None else str(policy)
+    return EvaluateResult(name, output, scores, pictures, late, slow)
 
 
 def driver_of(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -93,15 +93,14 @@ class RoutesResult(Result):
 
     def tables(self) -> tuple[Table, ...]:
         """Return the routes admitted by scenario, and why others were not."""
-        rows = [
-            (
-                one.scenario,
-                str(len(one.routes)),
-                str(one.tried),
-                _by_reason(one.refusals),
+        rows = list[tuple[str, ...]]()
+        for one in self.harvests:
+            # each reason once, with how often it was given if more than once
+            reasons = "; ".join(
+                f"{reason} ({times} times)" if times > 1 else reason
+                for reason, times in Counter(one.refusals).items()
             )
-            for one in self.harvests
-        ]
+            rows.append((one.scenario, f"{len(one.routes)}", f"{one.tried}", reasons))
         columns = ("scenario", "admitted", "tried", "refused because")
         return (table("Routes", columns, rows, words=4),)
 
@@ -120,15 +119,6 @@ class RoutesResult(Result):
         return {**counts, "scenarios": scenarios}
 
 
-def _by_reason(refusals: Sequence[str]) -> str:
-    """Return each reason once, with how often it was given if more than once."""
-    counts = Counter(refusals)
-    return "; ".join(
-        f"{reason} ({times} times)" if times > 1 else reason
-        for reason, times in counts.items()
-    )
-
-
 def make_routes(
     output: str | Path,
     options: RoutesOptions | None = None,
@@ -136,44 +126,34 @@ def make_routes(
 ) -> RoutesResult:
     """Make a fresh set of routes, each admitted by the expert and the blind driver."""
     need_extra("highway", "making routes")
-    options, output = options or RoutesOptions(), Path(output)
-    with writing([output], force=options.force):
-        return _made(output, options, listener)
-
-
-def _made(output: Path, options: RoutesOptions, listener: Listener) -> RoutesResult:
     from me2e_compress.evaluators.highway.generate import generate
 
-    # go on where a run that was killed left off
-    draft = output.with_name(f"{output.name}.part")
-    begun = _begun(draft, options)
-    found = {one.scenario: one for one in begun}
-    names = [name for name in options.names if name not in found]
-    # keep and report each scenario type as soon as its routes are admitted
-    made = generate(options.seed, names, options.variants, options.workers)
-    for harvest in made:
-        found[harvest.scenario] = harvest
-        done = [dataclasses.asdict(one) for one in found.values()]
-        write_document(draft, _deciding(options) | {"done": done})
-        listener.on_progress(
-            "admitting", len(found), len(options.names), harvest.scenario
-        )
-    harvests = tuple(found[name] for name in options.names)
-    save_routes([route for one in harvests for route in one.routes], output)
-    draft.unlink(missing_ok=True)
-    return RoutesResult(output, harvests)
-
-
-def _deciding(options: RoutesOptions) -> dict[str, object]:
-    """Return what decides the routes of a type."""
-    return {
+    options, output = options or RoutesOptions(), Path(output)
+    deciding = {
         "version": f"{__version__}, road version {ROAD_VERSION}",
         "seed": options.seed,
         "variants": options.variants,
     }
+    with writing([output], force=options.force):
+        # go on where a run that was killed left off
+        draft = output.with_name(f"{output.name}.part")
+        harvests = {one.scenario: one for one in _begun(draft, deciding)}
+        names = [name for name in options.names if name not in harvests]
+        # keep and report each scenario type as soon as its routes are admitted
+        made = generate(options.seed, names, options.variants, options.workers)
+        for harvest in made:
+            harvests[harvest.scenario] = harvest
+            done = [dataclasses.asdict(one) for one in harvests.values()]
+            write_document(draft, deciding | {"done": done})
+            count = len(harvests), len(options.names)
+            listener.on_progress("admitting", *count, harvest.scenario)
+        ordered = tuple(harvests[name] for name in options.names)
+        save_routes([route for one in ordered for route in one.routes], output)
+        draft.unlink(missing_ok=True)
+        return RoutesResult(output, ordered)
 
 
-def _begun(draft: Path, options: RoutesOptions) -> list[ScenarioRoutes]:
+def _begun(draft: Path, deciding: Mapping[str, object]) -> list[ScenarioRoutes]:
     """Read the types that a run with these options has admitted already.
 
     Raises:
@@ -185,14 +165,13 @@ def _begun(draft: Path, options: RoutesOptions) -> list[ScenarioRoutes]:
         return []
     with documents.reading(draft, EvaluationError, "not a set that was begun"):
         record = TypeAdapter(dict[str, Any]).validate_json(documents.content(draft))
-        for key, wanted in _deciding(options).items():
+        for key, wanted in deciding.items():
             if record.get(key) != wanted:
                 raise EvaluationError(
                     f"{draft}: is a set that was begun with {key} {record.get(key)},"
                     f" not {wanted}; delete it, or choose another name"
                 )
-        done = TypeAdapter(list[ScenarioRoutes]).validate_python(record.get("done"))
-    return done
+        return TypeAdapter(list[ScenarioRoutes]).validate_python(record.get("done"))
 
 
 @dataclasses.dataclass(frozen=True, repr=False)

@@ -12,7 +12,7 @@ from me2e_compress.evaluators.bench2drive.real_results import (
     CollectedResults,
 )
 from me2e_compress.evaluators.bench2drive.result_files import holds_records
-from me2e_compress.evaluators.highway.results import MANIFEST, ResultsFolder
+from me2e_compress.evaluators.results import MANIFEST, ResultsFolder
 from me2e_compress.metrics import BUDGET_MS
 from me2e_compress.metrics import scores as metrics
 from me2e_compress.metrics.deadlines import Deadlines, charged, deadlines_table

@@ -5,11 +5,11 @@ from pathlib import Path
 from typing import Any
 
 from me2e_compress.driving.latency import LatencySource
-from me2e_compress.evaluators.highway.conditions import Conditions
-from me2e_compress.evaluators.highway.drivers import OnnxDriver, image_size_of
+from me2e_compress.evaluators import Drive
+from me2e_compress.evaluators.highway.drivers import OnnxDriver
 from me2e_compress.evaluators.highway.engine import LocalEngine
-from me2e_compress.evaluators.highway.evaluator import DrivingProgress, HighwayEvaluator
-from me2e_compress.evaluators.highway.worker import Job
+from me2e_compress.evaluators.highway.evaluator import Highway
+from me2e_compress.evaluators.results import drive_routes
 from me2e_compress.metrics.measure import Estimate
 from me2e_compress.metrics.scores import Scores, score
 from me2e_compress.simulator.routes import (
@@ -75,20 +75,12 @@ def drive(
         EvaluationError: the folder is of another driver or latency, or a process was
             killed.
     """
-
-    def on_progress(progress: DrivingProgress) -> None:
-        on_done(progress.done, progress.total)
-
-    who = OnnxDriver(driver)
-    evaluator = HighwayEvaluator(
-        Job(who, Conditions(latency, image_size=image_size_of(who.open()))),
-        routes,
-        folder,
-        len(routes),
-        LocalEngine(workers),
-        on_progress,
+    listener = Listener(lambda _stage, done, total, _words: on_done(done, total))
+    drive = Drive(
+        latency, routes=routes, set_size=len(routes), engine=LocalEngine(workers)
     )
-    return score(tuple(evaluator.episodes()), len(routes))
+    who = OnnxDriver(driver)
+    return score(drive_routes(Highway(), who, drive, folder, listener), len(routes))
 
 
 def row_of(scores: Scores) -> dict[str, Any]:

@@ -9,7 +9,7 @@ import pytest
 import me2e_compress.study.run
 from me2e_compress.cli.driving import study
 from me2e_compress.errors import StudyError
-from me2e_compress.evaluators.highway import evaluator
+from me2e_compress.evaluators.highway import engine
 from me2e_compress.registry.drafts import IN_JSON
 from me2e_compress.shipped.drivers import shipped
 from me2e_compress.simulator.routes import save_routes
@@ -46,9 +46,9 @@ latency = "trace"
 @pytest.fixture(autouse=True)
 def here(monkeypatch: pytest.MonkeyPatch) -> Here:
     """Drive in this process."""
-    engine = Here()
-    monkeypatch.setattr(evaluator, "engine_of", lambda *words: engine)
-    return engine
+    here = Here()
+    monkeypatch.setattr(engine, "engine_of", lambda *words: here)
+    return here
 
 
 @pytest.fixture

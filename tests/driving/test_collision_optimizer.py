@@ -9,7 +9,7 @@ from me2e_compress.driving.host_stage import HOST_STAGES, CollisionOptimizer, co
 from me2e_compress.driving.latency import parse_latency
 from me2e_compress.driving.policies import driver_named
 from me2e_compress.errors import EvaluationError
-from me2e_compress.evaluators.highway.conditions import Conditions
+from me2e_compress.evaluators import Drive
 from me2e_compress.evaluators.highway.drivers import OnnxDriver
 from me2e_compress.evaluators.highway.runner import drive
 from me2e_compress.testing import check_form
@@ -152,7 +152,7 @@ def test_what_it_does_is_charged_where_it_has_something_to_do(tmp_path: Path) ->
     policy = OnnxDriver(model, host_stage=CollisionOptimizer()).open()
     source = parse_latency("host-stage{source=fps:10, per_iteration_us=1000}")
 
-    decisions = drive(PARKED, policy, Conditions(source)).decisions
+    decisions = drive(PARKED, policy, Drive(source)).decisions
 
     more = [each.time_us for each in decisions if each.latency_us > 100_000]
     assert more == [each.time_us for each in decisions if each.time_us < 2_000_000]

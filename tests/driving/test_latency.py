@@ -18,7 +18,7 @@ from me2e_compress.driving.latency import (
     with_draws,
 )
 from me2e_compress.errors import EvaluationError
-from me2e_compress.evaluators.highway.conditions import Conditions
+from me2e_compress.evaluators import Drive
 from me2e_compress.runtime.latency_trace import LatencyTrace
 from me2e_compress.testing import check_form
 
@@ -242,4 +242,4 @@ def test_what_a_layer_has_of_the_source_below() -> None:
     with pytest.raises(EvaluationError, match="fps has no option 'in_order'"):
         with_draws(parse_latency("limited{source=fps:10, fps=5}"), in_order=True)
     with pytest.raises(EvaluationError, match=r"names no file \(trace:FILE\)"):
-        Conditions(parse_latency("limited{source=trace, fps=10}"))
+        Drive(parse_latency("limited{source=trace, fps=10}"))

@@ -8,8 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from me2e_compress.driving.policies import Driver
+from me2e_compress.evaluators import Drive
+from me2e_compress.evaluators.contract import Driven
 from me2e_compress.evaluators.highway.runner import drive
-from me2e_compress.evaluators.highway.worker import Driven, Job
 from me2e_compress.simulator.routes import Route
 from me2e_compress.study import (
     Condition,
@@ -37,10 +39,12 @@ class Here:
 
     driven: list[tuple[str, str]] = field(default_factory=list)
 
-    def drive(self, job: Job, routes: Sequence[Route]) -> Iterator[Driven]:
+    def drive(
+        self, policy: Driver, asked: Drive, routes: Sequence[Route]
+    ) -> Iterator[Driven]:
         for route in routes:
-            self.driven.append((job.driver.label, route.id))
-            yield Driven(drive(route, job.driver.open(), job.conditions), 0.0, 0)
+            self.driven.append((policy.label, route.id))
+            yield Driven(drive(route, policy.open(), asked), 0.0, 0)
 
 
 @pytest.fixture(scope="session")

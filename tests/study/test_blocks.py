@@ -7,8 +7,8 @@ import pytest
 
 from me2e_compress.errors import StudyError
 from me2e_compress.study import Condition, Study, run_study
+from me2e_compress.study.definition import FramesToRecord, StudyBlock
 from me2e_compress.study.drive_record import DriveRecord
-from me2e_compress.study.study_blocks import FramesToRecord, StudyBlock
 from me2e_compress.study.workload import held_frames, workload
 from tests.study.conftest import BLIND, FASTER, IDEAL, ROUTES, SLOW, Here
 

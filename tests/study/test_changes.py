@@ -5,9 +5,8 @@ import pytest
 
 from me2e_compress.metrics.route_summary import RouteSummary
 from me2e_compress.study import Condition, Study
-from me2e_compress.study.changes import changes, held_against
-from me2e_compress.study.drive_record import DriveRecord
-from me2e_compress.study.tables import change_tables
+from me2e_compress.study.drive_record import DriveRecord, changes, held_against
+from me2e_compress.study.study_result import change_tables
 from tests.study.conftest import IDEAL, Make
 
 FOG = Condition("fog", "none", against="ideal")
@@ -42,22 +41,20 @@ def test_a_change_is_held_against_the_same_routes_without_it() -> None:
     assert float_.driving_score.value == pytest.approx(-2.5)
     assert float_.success_rate.value == pytest.approx(-25.0)
     assert float_.room_kept.value == pytest.approx(-2.5 / 2)
-    assert float_.beyond_driving_score is None
+    assert float_.beyond == {}
     assert int8.driving_score.value == pytest.approx((-40 - 10 - 40) / 4)
 
 
 def test_int8_loses_more_is_a_difference_of_differences() -> None:
     _, int8 = changes(CONDITIONS, DRIVES, "float", 0)
 
-    found = int8.beyond_driving_score
-    assert found is not None
+    found = int8.beyond["driving_score"]
     assert found.value == pytest.approx((-40 + 0 + 0 - 40) / 4)
     assert found.low is not None
     assert found.high is not None
     assert found.low < -20.0 < found.high
     assert found.n == 4
-    assert int8.beyond_room_kept is not None
-    assert int8.beyond_room_kept.value == pytest.approx(-10.0)
+    assert int8.beyond["room_kept"].value == pytest.approx(-10.0)
 
 
 def test_what_was_not_driven_is_left_out() -> None:

@@ -26,6 +26,12 @@ from tests.study.conftest import BLIND, IDEAL, Here, Make
         ({"latency": "trace", "seed": -1}, "seed -1: must be 0 or more"),
         ({"latency": "agents{source=trace:t.json, per_agent_us=1}"}, "is a variant's"),
         ({"latency": "limited{source=measured, fps=10}"}, "a study knows none"),
+        ({"latency": "measured"}, "none, fps:F and trace"),
+        ({"latency": "trace:t.json"}, "none, fps:F and trace"),
+        ({"latency": "traces"}, "none, fps:F and trace"),
+        ({"latency": "fast"}, "no latency source 'fast'"),
+        ({"latency": "fps:0"}, "fps 0 is not a positive number"),
+        ({"latency": "fps:x"}, "fps: fps: Input should be"),
     ],
 )
 def test_options_that_do_not_go_together(options: dict[str, Any], words: str) -> None:

@@ -16,7 +16,7 @@ from me2e_compress.runtime.providers import CPU, CpuProvider
 from me2e_compress.shipped.drivers import shipped
 from me2e_compress.simulator.routes import load_routes, save_routes
 from me2e_compress.study import Condition, load_study
-from me2e_compress.study.study_blocks import FramesToRecord, StudyBlock
+from me2e_compress.study.definition import FramesToRecord, StudyBlock
 from tests.command import write_frames
 from tests.evaluators.highway.drivers import CROSSING, PARKED
 
@@ -171,14 +171,14 @@ def test_routes_of_the_command_line_win(models: Path) -> None:
 @pytest.mark.parametrize(
     ("old", "new", "error", "message"),
     [
-        ("title =", "titel =", StudyError, r"no key titel; there are title, baseline"),
-        ("[latency]", "[timing]", StudyError, r"no key timing; there are title, b"),
+        ("title =", "titel =", StudyError, r"no key titel; there are title, variant"),
+        ("[latency]", "[timing]", StudyError, r"no key timing; there are title, v"),
         ("samples", "sample", StudyError, r"no key latency\.sample; there are sam"),
         (
             'name = "small"',
             'name = "small"\nrecip = "exact"',
             StudyError,
-            r"no key variant\.1\.recip; there are name, policy, recipe",
+            r"no key variant\.1\.recip; there are name, policy, passes",
         ),
         ('baseline = "float"', "", StudyError, "baseline: Field required"),
         ('policy = "slow.onnx"', "", StudyError, "float: neither it nor the study nam"),

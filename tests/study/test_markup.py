@@ -4,8 +4,8 @@ import matplotlib.pyplot as plt
 from markupsafe import Markup
 
 from me2e_compress.display import Cell, Table
+from me2e_compress.study.report.figures import svg
 from me2e_compress.study.report.page import Drawing, Page, Section
-from me2e_compress.study.report.style import svg
 
 MARKUP = "<script>alert(1)</script>"
 

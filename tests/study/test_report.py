@@ -13,11 +13,9 @@ from me2e_compress.registry.drafts import IN_JSON, IN_MARKDOWN, is_marked
 from me2e_compress.runtime.latency_trace import Load
 from me2e_compress.study import Condition, StudyResult
 from me2e_compress.study.cells import MINUS
-from me2e_compress.study.report.curves import curves
-from me2e_compress.study.report.figures import Point, forest, front, pareto
-from me2e_compress.study.report.study_page import TIMES, findings, study_page
-from me2e_compress.study.tables import MOST_ROUTES, route_table
-from me2e_compress.study.write import write_study
+from me2e_compress.study.report.figures import Point, curves, forest, front, pareto
+from me2e_compress.study.report.page import TIMES, findings, study_page, write_study
+from me2e_compress.study.study_result import MOST_ROUTES, route_tables
 from tests.study.conftest import IDEAL, ROUTES, SLOW
 
 pytestmark = pytest.mark.xdist_group("study")
@@ -124,7 +122,7 @@ def test_a_busy_machine_is_said_above_all(found: StudyResult) -> None:
 
 
 def test_each_route_has_its_end(found: StudyResult) -> None:
-    table = route_table(found)
+    (table,) = route_tables(found)
 
     assert table is not None
     assert table.columns[:2] == ("route", "blind, ideal")
@@ -139,7 +137,7 @@ def test_many_routes_are_not_shown_one_by_one(found: StudyResult) -> None:
         for each in found.drives
     ]
 
-    assert route_table(dataclasses.replace(found, drives=tuple(many))) is None
+    assert route_tables(dataclasses.replace(found, drives=tuple(many))) == ()
 
 
 def test_figures_name_every_variant(found: StudyResult) -> None:

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from me2e_compress.errors import EvaluationError, StudyError
-from me2e_compress.evaluators.highway.results import ResultsFolder
+from me2e_compress.evaluators.results import ResultsFolder
 from me2e_compress.metrics.scores import score
 from me2e_compress.study import (
     Listener,
@@ -21,7 +21,7 @@ from me2e_compress.study import (
     load_study,
     run_study,
 )
-from me2e_compress.study.study_blocks import FramesToRecord
+from me2e_compress.study.definition import FramesToRecord
 from tests.study.conftest import BLIND, IDEAL, ROUTES, SLOW, Here, Make
 
 KILLED = """

@@ -13,10 +13,10 @@ from me2e_compress.study.cells import (
     measure_cell,
     number,
 )
-from me2e_compress.study.study_result import near_misses
-from me2e_compress.study.tables import (
+from me2e_compress.study.study_result import (
     abilities,
     differences,
+    near_misses,
     scoreboards,
 )
 from tests.study.conftest import IDEAL

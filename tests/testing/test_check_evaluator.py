@@ -6,20 +6,26 @@ from typing import ClassVar
 
 import pytest
 
+from me2e_compress.driving.policies import Driver
 from me2e_compress.errors import VerificationError
-from me2e_compress.evaluators.highway.evaluator import HighwayEvaluation
+from me2e_compress.evaluators import Drive, Evaluator
+from me2e_compress.evaluators.contract import Listener
+from me2e_compress.evaluators.highway.drivers import BlindDriver, OnnxDriver
+from me2e_compress.evaluators.highway.evaluator import Highway
 from me2e_compress.metrics.episode import Episode
 from me2e_compress.simulator.routes import save_routes
 from me2e_compress.testing import check_evaluator
-from tests.evaluators.highway.drivers import EXIT
-from tests.metrics.drives import drive, frames
+from tests.evaluators.highway.drivers import EXIT, straight_on
+from tests.evaluators.lanes import Lanes
+from tests.metrics.drives import drive as by_hand
+from tests.metrics.drives import frames
 
 RUNS = itertools.count()
 STUTTER = (*frames(2), *frames(2))
 
 
 @dataclass(frozen=True)
-class Made:
+class Made(Evaluator):
     """Yields episodes made by hand.
 
     Attributes:
@@ -29,7 +35,9 @@ class Made:
     name: ClassVar[str] = "made"
     way: str = ""
 
-    def episodes(self) -> Iterator[Episode]:
+    def episodes(
+        self, policy: Driver | None, drive: Drive, folder: Path, listener: Listener
+    ) -> Iterator[Episode]:
         run = next(RUNS)
         routes = {"none": [], "twice": ["a", "b", "a"]}.get(self.way, ["a", "b"])
         if self.way == "no name":
@@ -42,7 +50,7 @@ class Made:
             moved = float(run) if self.way == "drifts" else 100.0
             moved = 140.0 if self.way == "too far" else moved
             driven = STUTTER if self.way == "stutters" else ()
-            yield drive(route=route, completion=moved, driven=driven)
+            yield by_hand(route=route, completion=moved, driven=driven)
 
 
 def test_what_errs_in_no_way_holds() -> None:
@@ -53,7 +61,7 @@ def test_what_errs_in_no_way_holds() -> None:
 class Sized(Made):
     """Its size is a method."""
 
-    def set_size(self) -> int:
+    def set_size(self) -> int:  # type: ignore[override]
         return 2
 
 
@@ -76,15 +84,35 @@ def test_a_wrong_evaluator_is_caught(wrong: Made, message: str) -> None:
         check_evaluator(wrong)
 
 
+@dataclass(frozen=True)
+class Declares(Made):
+    """Declares more than it does."""
+
+    takes: ClassVar[frozenset[str]] = frozenset({"latency"})
+
+
+def test_a_latency_that_is_declared_must_be_charged() -> None:
+    with pytest.raises(VerificationError, match="made declares latency, and does not"):
+        check_evaluator(Declares())
+
+
+def test_what_is_declared_must_be_there(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Declares, "takes", frozenset({"render"}))
+    with pytest.raises(VerificationError, match=r"declares render, but has no render"):
+        check_evaluator(Declares())
+
+
 def test_ours_holds(tmp_path: Path) -> None:
     save_routes([EXIT], tmp_path / "routes.json")
-    first, again = (
-        HighwayEvaluation(
-            "blind", tmp_path / folder, routes=str(tmp_path / "routes.json")
-        )
-        for folder in ("first", "again")
+
+    (episode,) = check_evaluator(
+        Highway(), BlindDriver(), str(tmp_path / "routes.json")
     )
 
-    (episode,) = check_evaluator(first, again)
-
     assert episode.route == "exit"
+
+
+def test_a_third_one_holds(tmp_path: Path) -> None:
+    assert (
+        len(check_evaluator(Lanes(), OnnxDriver(straight_on(tmp_path / "m.onnx")))) == 4
+    )

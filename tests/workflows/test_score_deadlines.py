@@ -3,7 +3,7 @@
 from dataclasses import replace
 from pathlib import Path
 
-from me2e_compress.evaluators.highway.results import ResultsFolder
+from me2e_compress.evaluators.results import ResultsFolder
 from me2e_compress.metrics.episode import ConflictRecord, InferenceRecord
 from me2e_compress.simulator.routes import ROAD_VERSION, VERSION
 from me2e_compress.workflows.score import score

@@ -9,8 +9,7 @@ import pytest
 
 from me2e_compress.cli.app import app
 from me2e_compress.errors import EnergyError, EvaluationError, RecipeError
-from me2e_compress.evaluators.highway.results import ResultsFolder
-from me2e_compress.evaluators.highway.worker import Driven
+from me2e_compress.evaluators.results import ResultsFolder
 from me2e_compress.metrics.episode import (
     Episode,
     Given,
@@ -171,7 +170,7 @@ def test_the_command_prints_what_the_page_says(tmp_path: Path, cli: Cli) -> None
         made_by = {"routes": ["a", "b"], "set_size": 2, VERSION: ROAD_VERSION}
         folder = ResultsFolder.create(path, made_by)
         for each in episodes:
-            folder.save(Driven(each, 0.0, 0))
+            folder.keep(each)
     document = cli.document("score fast slow --joules fast=2 --joules slow=3")
 
     scores = document["eer"]["scores"]

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from pathlib import Path
 from typing import ClassVar
 
 import numpy as np
@@ -12,7 +13,10 @@ from me2e_compress.driving.contract import (
     RouteInfo,
     six_waypoints,
 )
-from me2e_compress.driving.policies import driver_named
+from me2e_compress.driving.latency import DecisionFacts
+from me2e_compress.driving.policies import Driver
+from me2e_compress.evaluators import Drive, Evaluator
+from me2e_compress.evaluators.contract import Listener
 from me2e_compress.metrics.episode import (
     FRAME_US,
     EgoFrame,
@@ -34,32 +38,39 @@ class Lane:
 
 
 @dataclass(frozen=True)
-class Corridor:
+class Corridor(Evaluator):
     """Drives a policy along straight corridors of 60 m.
 
     Attributes:
-        policy: a name with options, or an ONNX file.
-        routes: how many corridors.
+        count: how many corridors.
     """
 
     name: ClassVar[str] = "corridor"
-    policy: str = "cruise"
-    routes: int = 2
+    takes: ClassVar[frozenset[str]] = frozenset({"policy", "routes", "latency"})
+    count: int = 2
 
-    def episodes(self) -> Iterator[Episode]:
+    def routes(self, words: str, beside: Path = Path()) -> tuple[tuple[Lane, ...], int]:
+        """Return all corridors, or the first of them by a number."""
+        lanes = tuple(Lane(f"corridor_{n}", n) for n in range(self.count))
+        return lanes if words == "all" else lanes[: int(words)], self.count
+
+    def episodes(
+        self, policy: Driver | None, drive: Drive, folder: Path, listener: Listener
+    ) -> Iterator[Episode]:
         """Yield each corridor once, in order."""
-        for number in range(self.routes):
-            yield self._drive(Lane(f"corridor_{number}", number))
+        assert policy is not None
+        for lane in drive.routes:
+            yield self._drive(lane, policy, drive)
 
-    def _drive(self, lane: RouteInfo) -> Episode:
-        policy = driver_named(self.policy).open()
+    def _drive(self, lane: RouteInfo, driver: Driver, drive: Drive) -> Episode:
+        policy, charge = driver.open(), drive.latency.on_route(lane.id)
         policy.reset(lane)
         x, frames, decisions = 0.0, list[EgoFrame](), list[InferenceRecord]()
         while x < LENGTH_M and len(frames) * FRAME_US < LIMIT_S * 1e6:
             time_us = len(frames) * FRAME_US
             waypoints = six_waypoints(policy.plan(_seen(time_us)))
             speed_mps = float(waypoints[0, 0]) / 0.5
-            decisions.append(InferenceRecord(time_us, 0))
+            decisions.append(InferenceRecord(time_us, charge(DecisionFacts(0))))
             frames.append(_frame(time_us, x, speed_mps))
             x += speed_mps * FRAME_US / 1e6
         done = x >= LENGTH_M

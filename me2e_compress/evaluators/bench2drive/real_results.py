@@ -3,11 +3,12 @@
 import dataclasses
 import json
 from collections import Counter
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar, Literal
 
+from me2e_compress.driving.policies import Driver
 from me2e_compress.errors import EvaluationError
 from me2e_compress.evaluators.bench2drive.recordings import (
     TICK_S,
@@ -16,13 +17,14 @@ from me2e_compress.evaluators.bench2drive.recordings import (
     read_decisions,
     read_recording,
 )
-from me2e_compress.evaluators.bench2drive.records import RouteRecord
 from me2e_compress.evaluators.bench2drive.result_files import (
     DriveRecordings,
     FoundFiles,
     ResultFile,
+    RouteRecord,
     find_files,
 )
+from me2e_compress.evaluators.contract import Drive, Evaluator, Listener
 from me2e_compress.metrics.episode import Episode, InferenceRecord
 from me2e_compress.metrics.scores import FULL_SET
 from me2e_compress.registry import documents
@@ -77,7 +79,7 @@ class CollectedResults:
 
 
 @dataclass(frozen=True)
-class Bench2DriveResults:
+class Bench2DriveResults(Evaluator):
     """Read the results of real Bench2Drive or CARLA leaderboard runs.
 
     Attributes:
@@ -96,7 +98,9 @@ class Bench2DriveResults:
         """How many routes a whole benchmark has."""
         return FULL_SET
 
-    def episodes(self) -> Iterator[Episode]:
+    def episodes(
+        self, policy: Driver | None, drive: Drive, folder: Path, listener: Listener
+    ) -> Iterator[Episode]:
         """Yield each route once, in the order of the routes' numbers.
 
         Raises:
@@ -115,22 +119,25 @@ class Bench2DriveResults:
         found.recordings = _once(found.recordings)
         found.decisions = _once(found.decisions)
         if not any(file.records for file in found.results):
-            raise EvaluationError(f"{self.folder}: {_nothing(found)}")
+            why = "no results of a leaderboard below it"
+            reports = [
+                *(
+                    f"no results of a leaderboard: {path.name}: {reason}"
+                    for path, reason in found.broken.items()
+                ),
+                *(
+                    f"no whole record: {file.path.name}: record {place}: {reason}"
+                    for file in found.results
+                    for place, reason in file.broken.items()
+                ),
+                *(f"no record: {file.path.name} holds none" for file in found.results),
+            ]
+            raise EvaluationError(f"{self.folder}: {[*reports, why][0]}")
         return _Collection(found).results()
 
 
 def _once(paths: Sequence[Path]) -> list[Path]:
     return list({path.resolve(): path for path in paths}.values())
-
-
-def _nothing(found: FoundFiles) -> str:
-    for path, reason in found.broken.items():
-        return f"no results of a leaderboard: {path.name}: {reason}"
-    for file in found.results:
-        for place, reason in file.broken.items():
-            return f"no whole record: {file.path.name}: record {place}: {reason}"
-        return f"no record: {file.path.name} holds none"
-    return "no results of a leaderboard below it"
 
 
 class _Collection:
@@ -162,7 +169,8 @@ class _Collection:
             self.notes.insert(0, f"{others[0]}{more}: of no record")
         # which routes of the set are missing, and which are foreign
         numbers = [each.number for each in records]
-        route_set = _likely_set(numbers)
+        best = max(ROUTE_SETS, key=lambda name: len(ROUTE_SETS[name] & set(numbers)))
+        route_set = best if ROUTE_SETS[best] & set(numbers) else None
         whole = ROUTE_SETS[route_set] if route_set else frozenset[str]()
         return CollectedResults(
             episodes,
@@ -218,7 +226,13 @@ class _Collection:
         counted = drives or distinct
         if len(counted) > 1:
             self.contradictory.append(route)
-        return min(counted, key=_lowest_first)
+
+        def lowest_first(record: RouteRecord) -> tuple[float, bool, str]:
+            given = record.episode.given
+            composed = given.composed_percent if given else 0.0
+            return composed, record.episode.succeeded, record.content
+
+        return min(counted, key=lowest_first)
 
     def _with_frames(self, record: RouteRecord, recorded: DriveRecordings) -> Episode:
         episode, paths = record.episode, recorded.of(record)
@@ -257,18 +271,6 @@ class _Collection:
         except (documents.MalformedError, BrokenRecordingError) as error:
             self.broken[str(path)] = str(error)
         return None
-
-
-def _lowest_first(record: RouteRecord) -> tuple[float, bool, str]:
-    given = record.episode.given
-    composed = given.composed_percent if given else 0.0
-    return composed, record.episode.succeeded, record.content
-
-
-def _likely_set(numbers: Collection[str]) -> RouteSet | None:
-    """Return the set that most of the routes belong to, if any."""
-    best = max(ROUTE_SETS, key=lambda name: len(ROUTE_SETS[name] & set(numbers)))
-    return best if ROUTE_SETS[best] & set(numbers) else None
 
 
 def _by_number(number: str) -> tuple[int, str]:

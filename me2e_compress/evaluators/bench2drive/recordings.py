@@ -6,7 +6,7 @@ CARLA's left-handed world. They write no time; it is inferred from the motion.
 """
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -71,11 +71,14 @@ class RecordedRoute:
         """
         # one column per field of a frame
         moved = _lengths(np.diff(self.position_m, axis=0))
+        speeds = np.zeros(len(self.steps))
+        if len(speeds) > 1:
+            speeds = _lengths(np.gradient(self.position_m, interval_s, axis=0))
         columns = {
             "x": self.position_m[:, 0],
             "y": self.position_m[:, 1],
             "heading": self.heading_rad,
-            "speed_mps": self._speeds(interval_s),
+            "speed_mps": speeds,
             "acceleration_mps2": self.along_mps2,
             "lateral_acceleration_mps2": self.left_mps2,
             "yaw_rate_radps": self.yaw_rate_radps,
@@ -93,11 +96,6 @@ class RecordedRoute:
             for index, row in enumerate(rows)
         )
 
-    def _speeds(self, interval_s: float) -> Floats:
-        if len(self.steps) < 2:
-            return np.zeros(len(self.steps))
-        return _lengths(np.gradient(self.position_m, interval_s, axis=0))
-
     def interval_s(self, duration_s: float | None = None) -> float:
         """Return the seconds from one step to the next.
 
@@ -111,11 +109,20 @@ class RecordedRoute:
         # the best correlated pair of signals
         found = [each for each in self._correlations() if each.likeness > _LIKENESS]
         moved = max(found, key=lambda each: each.likeness, default=None)
-        lasted = None if duration_s is None else _usual(duration_s / len(self.steps))
+        # the usual interval within 10 % of the duration's, if there is one
+        lasted = None
+        if duration_s is not None:
+            mean_s = duration_s / len(self.steps)
+            nearest = _nearest(mean_s)
+            lasted = nearest if abs(np.log(nearest / mean_s)) < _EQUALS else None
         # no motion to infer from: duration, or the agent's steps
         if moved is None:
             stood = float(np.ptp(self.position_m, axis=0).max()) < _STOOD_M
-            return self._from_steps() if stood or lasted is None else lasted
+            if not stood and lasted is not None:
+                return lasted
+            between = np.diff(self.steps)
+            ticks = float(np.median(between)) if between.size else 1.0
+            return TICK_S * max(1.0, min(ticks, 20.0))
         # a weak correlation yields to a duration that agrees
         apart = abs(np.log(lasted / moved.interval_s)) if lasted else np.inf
         if lasted and moved.likeness < _SURE and apart < _AGREES:
@@ -136,11 +143,6 @@ class RecordedRoute:
             pulls = self.acceleration_mps2[part]
             yield _Correlation.of(bends.ravel(), pulls.ravel(), 0.5, _LEAST_MPS2)
         yield _Correlation.of(turns, between, 1.0, _LEAST_RADPS)
-
-    def _from_steps(self) -> float:
-        between = np.diff(self.steps)
-        ticks = float(np.median(between)) if between.size else 1.0
-        return TICK_S * max(1.0, min(ticks, 20.0))
 
 
 @dataclass(frozen=True)
@@ -170,12 +172,6 @@ def _nearest(interval_s: float) -> float:
     return min(INTERVALS_S, key=lambda each: abs(np.log(each / interval_s)))
 
 
-def _usual(interval_s: float) -> float | None:
-    """Return the usual interval within 10 % of this one, if there is one."""
-    nearest = _nearest(interval_s)
-    return nearest if abs(np.log(nearest / interval_s)) < _EQUALS else None
-
-
 def read_recording(raw: object) -> RecordedRoute:
     """Read a parsed ``metric_info.json``; its numbers may be infinite or NaN."""
     # steps are keyed by their number
@@ -185,8 +181,8 @@ def read_recording(raw: object) -> RecordedRoute:
     if steps:
         raise BrokenRecordingError(f"{steps[0][:60]!r} is not the number of a step")
     # CARLA's left-handed world becomes right-handed
-    acceleration, turning, forward, right = (_column(raw, part, 3) for part in _PARTS)
-    location = _column(raw, _LOCATION, 3)
+    acceleration, turning, forward, right = (_column(raw, part) for part in _PARTS)
+    location = _column(raw, _LOCATION)
     ahead, aside, push = forward[:, :2], right[:, :2], acceleration[:, :2]
     mirror = np.array([1.0, -1.0])  # CARLA's y points right
     return RecordedRoute(
@@ -200,20 +196,19 @@ def read_recording(raw: object) -> RecordedRoute:
     )
 
 
-def _column(raw: dict[str, object], part: str, size: int) -> Floats:
-    rows = [_vector(step, values, part, size) for step, values in raw.items()]
+def _column(raw: dict[str, object], part: str) -> Floats:
+    """Return [N, 3] a part of every step."""
+    rows = list[list[float]]()
+    for step, values in raw.items():
+        vector = values.get(part) if isinstance(values, dict) else None
+        if not isinstance(vector, list) or len(vector) < 3:
+            raise BrokenRecordingError(f"step {step}: no {part}")
+        if not all(type(each) in (int, float) for each in vector):
+            raise BrokenRecordingError(f"step {step}: {part} is not made of numbers")
+        if not all(abs(each) <= LARGEST for each in vector):  # NaN compares as false
+            raise BrokenRecordingError(f"step {step}: {part} is not finite")
+        rows.append(vector[:3])
     return np.array(rows, np.float64)
-
-
-def _vector(step: str, values: object, part: str, size: int) -> Sequence[float]:
-    vector = values.get(part) if isinstance(values, dict) else None
-    if not isinstance(vector, list) or len(vector) < size:
-        raise BrokenRecordingError(f"step {step}: no {part}")
-    if not all(type(each) in (int, float) for each in vector):
-        raise BrokenRecordingError(f"step {step}: {part} is not made of numbers")
-    if not all(abs(each) <= LARGEST for each in vector):  # NaN compares as false
-        raise BrokenRecordingError(f"step {step}: {part} is not finite")
-    return vector[:size]
 
 
 _Count = Annotated[int, Field(ge=0, le=LARGEST)]

@@ -1,25 +1,217 @@
-"""Find result files and recordings below a folder by content, not by name."""
+"""Results of a leaderboard: its records, and files found by content, not by name."""
 
 import codecs
 import math
 import os
 import re
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from types import MappingProxyType
 from typing import Annotated, Any
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
 
 from me2e_compress.errors import EvaluationError
-from me2e_compress.evaluators.bench2drive.records import (
-    BrokenRecordError,
-    RouteRecord,
-    read_record,
+from me2e_compress.metrics.episode import (
+    LARGEST,
+    Ending,
+    Episode,
+    Given,
+    Infraction,
+    InfractionKind,
 )
-from me2e_compress.metrics.episode import LARGEST
 from me2e_compress.registry import documents
+from me2e_compress.simulator.routes import SCENARIO_ABILITIES
+
+_PERCENT = re.compile(r"\b\d+\.?\d*%")
+"""The first percentage of a message, as efficiency_smoothness_benchmark.py finds it."""
+_OUTSIDE = re.compile(r"\((\d+\.?\d*)% of")
+_PLACE = re.compile(r"\(x=(-?\d+(?:\.\d+)?), y=(-?\d+(?:\.\d+)?)")
+_NUMBER = re.compile(r"_\d+$")
+"""What a scenario's name has after its type: ``ParkingCutIn_1``."""
+_ROUTE = re.compile(r"[\w.-]{1,200}")
+_OUTSIDE_LANES = InfractionKind.OUTSIDE_ROUTE_LANES
+
+_FAILED = "Failed"
+ENDINGS: Mapping[str, Ending] = MappingProxyType(
+    {
+        "Completed": Ending.COMPLETED,
+        "Perfect": Ending.COMPLETED,
+        "Failed - Agent deviated from the route": Ending.DEVIATION,
+        "Failed - Agent got blocked": Ending.BLOCKED,
+        "Failed - Agent timed out": Ending.TIMEOUT,
+        "Failed - TickRuntime": Ending.TIMEOUT,
+        "Failed - Agent crashed": Ending.POLICY_FAILED,
+        "Failed - Agent couldn't be set up": Ending.POLICY_FAILED,
+        "Failed - Agent's sensors were invalid": Ending.POLICY_FAILED,
+        "Failed - Simulation crashed": Ending.SIMULATOR_FAILED,
+        _FAILED: Ending.SIMULATOR_FAILED,
+    }
+)
+"""By status. Bench2Drive repeats a route whose status is just ``Failed``,
+as after a crash."""
+CRASHES = (Ending.POLICY_FAILED, Ending.SIMULATOR_FAILED)
+
+
+class BrokenRecordError(ValueError):
+    """A record is incomplete; the message is one line, without the file name."""
+
+
+@dataclass(frozen=True)
+class RouteRecord:
+    """One parsed record.
+
+    Attributes:
+        episode: The episode, without frames.
+        number: The route's id in its routes file, such as ``1711``.
+        recording: Name of the folder of its ``metric_info.json``, if any.
+        duration_s: Simulated seconds; None if not stated.
+        content: Result of the route, to tell a copy from another drive.
+        notes: What could not be interpreted, one line each.
+    """
+
+    episode: Episode
+    number: str
+    recording: str | None
+    duration_s: float | None
+    content: str
+    notes: tuple[str, ...] = ()
+
+    @property
+    def crashed(self) -> bool:
+        """Whether the simulator or the agent broke down."""
+        return self.episode.ending in CRASHES
+
+
+def read_record(raw: object) -> RouteRecord:
+    """Read one parsed record; its numbers may be infinite or NaN.
+
+    An unfinished route raises a `BrokenRecordError`, too.
+    """
+    try:
+        record = _Record.model_validate(raw)
+    except ValidationError as error:
+        raise BrokenRecordError(_complaint(error, "record")) from error
+    if not _ROUTE.fullmatch(record.route_id):
+        raise BrokenRecordError(f"route_id: {record.route_id[:60]!r} is no name")
+    # infractions, ending and scenario
+    infractions = _infractions(record)
+    ratios, notes = list[float](), list[str]()
+    for each in infractions:
+        speed = each.kind is InfractionKind.MIN_SPEED
+        if each.percent is not None and speed:
+            ratios.append(each.percent)
+        if each.percent is None and (speed or each.kind is _OUTSIDE_LANES):
+            words = f"no percentage in {each.detail[:60]!r}: left out"
+            notes.append(f"{each.kind.value}: {words}")
+    ending = ENDINGS.get(record.status)
+    if ending is None:
+        if not record.status.startswith(_FAILED):
+            status = record.status[:60]
+            raise BrokenRecordError(
+                f"status {status!r} is not that of a finished route"
+            )
+        ending = Ending.SIMULATOR_FAILED
+    scenario = _NUMBER.sub("", record.scenario_name or "")
+    episode = Episode(
+        route=record.route_id,
+        scenario=scenario,
+        abilities=SCENARIO_ABILITIES.get(scenario, ()),
+        route_length_m=record.meta.route_length,
+        completion_percent=record.scores.score_route,
+        ending=ending,
+        failure=record.status if ending in CRASHES else None,
+        infractions=tuple(infractions),
+        frames=(),
+        decisions=(),
+        speed_ratios_percent=tuple(ratios),
+        given=Given(
+            record.status,
+            record.scores.score_route,
+            record.scores.score_penalty,
+            record.scores.score_composed,
+        ),
+    )
+    # metadata that tells copies from other drives
+    duration_s = record.meta.duration_game
+    return RouteRecord(
+        episode,
+        number_of(record.route_id),
+        record.save_name or None,
+        duration_s if duration_s and duration_s > 0.0 else None,
+        record.model_dump_json(exclude={"save_name", "meta"}),
+        tuple(notes),
+    )
+
+
+def number_of(route_id: str) -> str:
+    """Return ``1711`` for ``RouteScenario_1711_rep0``, as Bench2Drive's tools do."""
+    parts = route_id.split("_")
+    return parts[1] if len(parts) > 1 else route_id
+
+
+_Finite = Annotated[float, Field(ge=-LARGEST, le=LARGEST)]
+
+
+class _Part(BaseModel):
+    model_config = ConfigDict(strict=True, extra="ignore", allow_inf_nan=False)
+
+
+class _Scores(_Part):
+    score_route: Annotated[float, Field(ge=0.0, le=100.0)]
+    score_penalty: _Finite
+    score_composed: _Finite
+
+
+class _Meta(_Part):
+    route_length: Annotated[float, Field(ge=0.0, le=LARGEST)] = 0.0
+    duration_game: _Finite | None = None
+
+
+class _Record(_Part):
+    route_id: str
+    scenario_name: str | None = None
+    save_name: str | None = None
+    status: str
+    infractions: dict[str, list[str]]
+    scores: _Scores
+    meta: _Meta = Field(default_factory=_Meta)
+
+
+def _complaint(error: ValidationError, whole: str) -> str:
+    first = error.errors(include_url=False)[0]
+    where = ".".join(str(part) for part in first["loc"]) or whole
+    return f"{where}: {first['msg']}"
+
+
+def _infractions(record: _Record) -> list[Infraction]:
+    """Return an infraction a message, with the share or speed that it states."""
+    infractions = list[Infraction]()
+    for key, messages in record.infractions.items():
+        if key not in set(InfractionKind):
+            if messages:
+                raise BrokenRecordError(f"infractions: nobody knows {key[:60]!r}")
+            continue
+        kind = InfractionKind(key)
+        for message in messages:
+            place = _PLACE.search(message)
+            x, y = (float(part) for part in place.groups()) if place else (None, None)
+            # the share outside the lanes, or the speed relative to the traffic's
+            share = percent = None
+            if kind is _OUTSIDE_LANES:
+                share = _OUTSIDE.search(message) or _PERCENT.search(message)
+            elif kind is InfractionKind.MIN_SPEED:
+                share = _PERCENT.search(message)
+            if share is not None:
+                percent = float(share.group(share.re.groups).rstrip("%"))
+                percent = min(percent, LARGEST)
+            y = None if y is None else -y  # CARLA's y points right
+            detail = " ".join(message.split())[:200]
+            infractions.append(Infraction(kind, None, x, y, detail, percent))
+    return infractions
+
 
 _CHECKPOINT = b'"_checkpoint"'
 _STEP = re.compile(rb'\s*\{\s*"-?\d+"\s*:\s*\{\s*"\w+"\s*:\s*\[')
@@ -120,7 +312,8 @@ def _kind(path: Path) -> bytes | None:
             if path.suffix == ".json":
                 if head.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
                     return _UTF_16
-                if _is_begun(head):
+                # it ends before its first key, as after a kill
+                if b'{"_checkpoint"'.startswith(b"".join(head.split())):
                     return _BEGUN
             if not head.lstrip().startswith(b"{"):
                 return None
@@ -137,19 +330,12 @@ def _kind(path: Path) -> bytes | None:
         return None
 
 
-def _is_begun(head: bytes) -> bool:
-    """Return whether a file ends before its first key, as after a kill."""
-    return b'{"_checkpoint"'.startswith(b"".join(head.split()))
-
-
 def _read(path: Path) -> ResultFile:
     document = documents.from_json(documents.content(path), finite=False)
     try:
         checked = _Document.model_validate(document)
     except ValidationError as error:
-        first = error.errors(include_url=False)[0]
-        where = ".".join(str(part) for part in first["loc"]) or "document"
-        raise BrokenRecordError(f"{where}: {first['msg']}") from error
+        raise BrokenRecordError(_complaint(error, "document")) from error
     records, broken = list[RouteRecord](), dict[int, str]()
     for place, raw in enumerate(checked.checkpoint.records):
         try:

@@ -1,24 +1,173 @@
-"""Engines that drive routes: processes of this machine, or a Ray cluster."""
+"""Engines that drive routes: processes of this machine, watched, or a Ray cluster."""
+
+from __future__ import annotations
 
 import queue
+import signal
 import socket
 import threading
+import time
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
-from typing import Any, Protocol
+from dataclasses import dataclass, field
+from multiprocessing.connection import Connection
+from multiprocessing.context import SpawnProcess
+from multiprocessing.sharedctypes import SynchronizedArray
+from typing import TYPE_CHECKING, Any, TypeAlias
 
-from me2e_compress.errors import EvaluationError
-from me2e_compress.evaluators.highway.worker import Driven, Job, RouteWorker
+import psutil
+
+from me2e_compress.driving.policies import Driver
+from me2e_compress.errors import EvaluationError, Me2eError
+from me2e_compress.evaluators.contract import Drive, Driven, Engine
 from me2e_compress.extras import explained
+from me2e_compress.runtime.children import end_with_parent, spawn_context
 from me2e_compress.simulator.routes import Route
 
+if TYPE_CHECKING:  # highway-env takes a second to import: only who drives needs it
+    from me2e_compress.simulator.world import World
 
-class Engine(Protocol):
-    """Drives independent routes, several at a time."""
+POLL_S = 0.05
 
-    def drive(self, job: Job, routes: Sequence[Route]) -> Iterator[Driven]:
-        """Yield each route once, as it finishes; routes begin in the order given."""
-        ...
+Heartbeat: TypeAlias = "SynchronizedArray[float]"
+"""[0] number of the policy call in progress, 0 between calls; [1] percent of
+the route passed."""
+
+
+@dataclass
+class RouteWorker:
+    """Drives one route at a time in a separate process, started when needed."""
+
+    policy: Driver
+    conditions: Drive
+    _process: SpawnProcess | None = field(default=None, init=False)
+    _heartbeat: Heartbeat | None = field(default=None, init=False)
+    _line: Connection[Route, Driven | Me2eError] | None = field(
+        default=None, init=False
+    )
+
+    def drive(self, route: Route, stop: threading.Event | None = None) -> Driven | None:
+        """Drive a route; a policy that hangs or crashes its process has failed.
+
+        Returns None if ``stop`` was set meanwhile.
+
+        Raises:
+            EvaluationError: The process ended for another reason than the policy.
+        """
+        begun = time.perf_counter()
+        process, heartbeat, line = self._started()
+        line.send(route)
+        # watch the heartbeat: one call must not take too long
+        asked, since = 0.0, begun
+        while not self._answers(line):
+            if stop is not None and stop.is_set():
+                self.close()
+                return None
+            if heartbeat[0] != asked:
+                asked, since = heartbeat[0], time.perf_counter()
+            elif asked and time.perf_counter() - since > self.conditions.frame_limit_s:
+                limit = f"{self.conditions.frame_limit_s:g} s"
+                return self._lost(route, begun, f"no plan within {limit}")
+        # a closed pipe means that the process ended
+        try:
+            answer = line.recv()
+        except (EOFError, ConnectionResetError):
+            process.join()
+            return self._lost(route, begun, self._cause(route, process))
+        if isinstance(answer, Me2eError):
+            raise answer
+        return answer
+
+    def close(self) -> None:
+        """End the process."""
+        if self._process is not None:
+            self._process.kill()
+            self._process.join()
+        if self._line is not None:
+            self._line.close()
+        self._process = self._heartbeat = self._line = None
+
+    def _started(
+        self,
+    ) -> tuple[SpawnProcess, Heartbeat, Connection[Route, Driven | Me2eError]]:
+        if self._process is None or self._heartbeat is None or self._line is None:
+            # the child keeps only its own end of the pipe
+            context = spawn_context()
+            heartbeat = context.Array("d", 2)
+            ours, theirs = context.Pipe()
+            process = context.Process(
+                target=_serve,
+                args=(theirs, heartbeat, self.policy, self.conditions),
+                daemon=True,
+            )
+            process.start()
+            theirs.close()
+            self._process, self._heartbeat, self._line = process, heartbeat, ours
+        return self._process, self._heartbeat, self._line
+
+    @staticmethod
+    def _answers(line: Connection[Route, Driven | Me2eError]) -> bool:
+        try:
+            return line.poll(POLL_S)
+        except (BrokenPipeError, ConnectionResetError):
+            return True
+
+    def _cause(self, route: Route, process: SpawnProcess) -> str:
+        code = process.exitcode
+        if code == -signal.SIGKILL or not self._heartbeat or not self._heartbeat[0]:
+            self.close()
+            killed = code == -signal.SIGKILL
+            how = "was killed (out of memory?)" if killed else f"ended with code {code}"
+            raise EvaluationError(f"route {route.id}: its process {how}")
+        return f"the policy ended its process with code {code}"
+
+    def _lost(self, route: Route, begun: float, failure: str) -> Driven:
+        from me2e_compress.evaluators.highway.episode_recorder import failed_episode
+
+        percent = self._heartbeat[1] if self._heartbeat else 0.0
+        self.close()
+        episode = failed_episode(route, percent, failure)
+        return Driven(episode, time.perf_counter() - begun, 0)
+
+
+def _serve(
+    line: Connection[Driven | Me2eError, Route],
+    heartbeat: Heartbeat,
+    driver: Driver,
+    conditions: Drive,
+) -> None:
+    """Drive the routes received until the other end of the pipe closes."""
+    end_with_parent()
+    # the heartbeat tells the parent when a call of the policy began
+    asked = 0
+
+    def on_query(world: World) -> None:
+        nonlocal asked
+        asked += 1
+        heartbeat[1] = completion_percent(world)
+        heartbeat[0] = float(asked)
+
+    def on_answer() -> None:
+        heartbeat[0] = 0.0
+
+    try:
+        from me2e_compress.evaluators.highway.episode_recorder import completion_percent
+        from me2e_compress.evaluators.highway.runner import Listeners, drive
+
+        policy, listeners = driver.open(), Listeners(on_query, on_answer)
+        while True:
+            route = line.recv()
+            begun = time.perf_counter()
+            episode = drive(route, policy, conditions, listeners)
+            on_answer()
+            memory = psutil.Process().memory_info().rss
+            line.send(Driven(episode, time.perf_counter() - begun, memory))
+    except (EOFError, BrokenPipeError, ConnectionResetError):
+        return
+    except (Me2eError, ImportError) as error:
+        explanation = explained(error)
+        if not isinstance(explanation, Me2eError):
+            raise
+        line.send(explanation)
 
 
 @dataclass(frozen=True)
@@ -27,7 +176,9 @@ class LocalEngine:
 
     workers: int = 1
 
-    def drive(self, job: Job, routes: Sequence[Route]) -> Iterator[Driven]:
+    def drive(
+        self, policy: Driver, drive: Drive, routes: Sequence[Route]
+    ) -> Iterator[Driven]:
         """Yield each route as it finishes; closing the iterator ends the processes."""
         # queues between the threads and this one
         waiting: queue.SimpleQueue[Route] = queue.SimpleQueue()
@@ -36,7 +187,10 @@ class LocalEngine:
             waiting.put(route)
         stop = threading.Event()
         threads = [
-            threading.Thread(target=_watch, args=(job, waiting, finished, stop))
+            threading.Thread(
+                target=_watch,
+                args=(RouteWorker(policy, drive), waiting, finished, stop),
+            )
             for _ in range(min(self.workers, len(routes)))
         ]
         try:
@@ -55,13 +209,12 @@ class LocalEngine:
 
 
 def _watch(
-    job: Job,
-    waiting: "queue.SimpleQueue[Route]",
-    finished: "queue.SimpleQueue[Driven | Exception]",
+    worker: RouteWorker,
+    waiting: queue.SimpleQueue[Route],
+    finished: queue.SimpleQueue[Driven | Exception],
     stop: threading.Event,
 ) -> None:
     """Drive waiting routes in one process; errors go to the main thread."""
-    worker = RouteWorker(job)
     try:
         while not stop.is_set():
             driven = worker.drive(waiting.get_nowait(), stop)
@@ -90,13 +243,20 @@ class RayEngine:
     workers: int = 1
     address: str | None = None
 
-    def drive(self, job: Job, routes: Sequence[Route]) -> Iterator[Driven]:
+    def drive(
+        self, policy: Driver, drive: Drive, routes: Sequence[Route]
+    ) -> Iterator[Driven]:
         """Yield each route as it finishes."""
-        ray = _ray()
+        try:
+            import ray
+            import ray.util
+        except ImportError as error:
+            raise explained(error) from error
         self._connect(ray)
         try:
-            remote = ray.remote(num_cpus=1)(RouteWorker)
-            actors = [remote.remote(job) for _ in range(min(self.workers, len(routes)))]
+            remote: Any = ray.remote(num_cpus=1)(RouteWorker)
+            count = min(self.workers, len(routes))
+            actors = [remote.remote(policy, drive) for _ in range(count)]
             pool: Any = ray.util.ActorPool(actors)
             yield from pool.map_unordered(
                 lambda actor, route: actor.drive.remote(route), routes
@@ -112,23 +272,23 @@ class RayEngine:
             )
             return
         try:
-            _check_reachable(self.address)
+            # fail within seconds if nothing listens: Ray itself tries for minutes
+            host, _, port = self.address.removeprefix("ray://").rpartition(":")
+            if host and port.isdecimal():
+                place = host, int(port)
+                socket.create_connection(place, timeout=CONNECT_TIMEOUT_S).close()
             ray.init(address=self.address, log_to_driver=False)
         except OSError as error:
             raise EvaluationError(f"ray: no cluster at {self.address}") from error
 
 
-def _check_reachable(address: str) -> None:
-    """Fail within seconds if nothing listens: Ray itself tries for minutes."""
-    host, _, port = address.removeprefix("ray://").rpartition(":")
-    if host and port.isdecimal():
-        socket.create_connection((host, int(port)), timeout=CONNECT_TIMEOUT_S).close()
-
-
-def _ray() -> Any:
-    try:
-        import ray
-        import ray.util
-    except ImportError as error:
-        raise explained(error) from error
-    return ray
+def engine_of(name: str, workers: int, address: str | None) -> Engine:
+    """Return the engine of a name; only ``ray`` takes an address."""
+    if name == "local" and address is None:
+        return LocalEngine(workers)
+    if name == "ray":
+        return RayEngine(workers, address)
+    raise EvaluationError(
+        f"engine {name!r} with address {address}: there are local, and ray with or "
+        "without an address"
+    )

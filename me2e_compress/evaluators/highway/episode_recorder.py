@@ -62,16 +62,43 @@ class EpisodeRecorder:
 
     def record(self, scene: Scene) -> None:
         """Record a frame if one is due."""
-        if scene.time_us >= len(self.frames) * FRAME_US:
-            self.frames.append(_frame(scene, self.world.progress_m))
-            if self.conflicts is not None:
-                self.conflicts.record(scene)
+        if scene.time_us < len(self.frames) * FRAME_US:
+            return
+        ego = scene.ego
+        near = [
+            actor.speed_mps
+            for actor in scene.actors
+            if actor.kind in VEHICLES
+            and math.hypot(actor.x - ego.x, actor.y - ego.y) <= NEAR_M
+        ]
+        frame = EgoFrame(
+            time_us=scene.time_us,
+            x=ego.x,
+            y=ego.y,
+            heading=ego.heading,
+            speed_mps=ego.speed_mps,
+            acceleration_mps2=ego.acceleration_mps2,
+            lateral_acceleration_mps2=ego.lateral_acceleration_mps2,
+            yaw_rate_radps=ego.yaw_rate_radps,
+            steering_rad=ego.steering_rad,
+            route_m=self.world.progress_m,
+            traffic_speed_mps=fmean(near) if near else None,
+        )
+        self.frames.append(frame)
+        if self.conflicts is not None:
+            self.conflicts.record(scene)
 
     def episode(self, ending: Ending, failure: str | None = None) -> Episode:
         """Return the episode of the world's route."""
         world = self.world
         route, goal_m = world.route, world.path.goal_m
         completed = ending is Ending.COMPLETED
+        # where the route would have ended if it went on after a collision
+        first = None
+        if world.first_collision is not None and ending is not Ending.COLLISION:
+            time_us, passed_m, outside_m = world.first_collision
+            outside = _outside_percent(outside_m, passed_m)
+            first = FirstCollision(time_us, _percent(passed_m, goal_m), outside)
         return Episode(
             route=route.id,
             scenario=route.scenario,
@@ -85,7 +112,7 @@ class EpisodeRecorder:
             decisions=tuple(self.decisions),
             junction_m=junction_m(world.path),
             conflicts=None if self.conflicts is None else self.conflicts.result(),
-            first_collision=_first_collision(world, ending),
+            first_collision=first,
         )
 
 
@@ -107,15 +134,6 @@ def _percent(passed_m: float, goal_m: float) -> float:
     return min(max(round(100.0 * passed_m / goal_m, 2), 0.0), 99.99)
 
 
-def _first_collision(world: World, ending: Ending) -> FirstCollision | None:
-    """Return where the route would have ended if it went on after a collision."""
-    if world.first_collision is None or ending is Ending.COLLISION:
-        return None
-    time_us, passed_m, outside_m = world.first_collision
-    outside = _outside_percent(outside_m, passed_m)
-    return FirstCollision(time_us, _percent(passed_m, world.path.goal_m), outside)
-
-
 def _outside_percent(outside_m: float, passed_m: float) -> float:
     return min(100.0, 100.0 * outside_m / max(passed_m, outside_m, 1e-9))
 
@@ -131,89 +149,48 @@ def junction_m(path: RoutePath) -> float | None:
     return None
 
 
-def _frame(scene: Scene, route_m: float) -> EgoFrame:
-    ego = scene.ego
-    near = [
-        actor.speed_mps
-        for actor in scene.actors
-        if actor.kind in VEHICLES
-        and math.hypot(actor.x - ego.x, actor.y - ego.y) <= NEAR_M
-    ]
-    return EgoFrame(
-        time_us=scene.time_us,
-        x=ego.x,
-        y=ego.y,
-        heading=ego.heading,
-        speed_mps=ego.speed_mps,
-        acceleration_mps2=ego.acceleration_mps2,
-        lateral_acceleration_mps2=ego.lateral_acceleration_mps2,
-        yaw_rate_radps=ego.yaw_rate_radps,
-        steering_rad=ego.steering_rad,
-        route_m=route_m,
-        traffic_speed_mps=fmean(near) if near else None,
-    )
-
-
 def _infractions(world: World, ending: Ending) -> tuple[Infraction, ...]:
     """Translate the world's events, and the end of the route, into infractions."""
-    found = [
-        _infraction(kind, event, world)
-        for event in world.events
-        if (kind := _kind(event)) is not None
-    ]
-    outside = _outside(world)
-    if outside is not None:
-        found.append(outside)
+    infractions = list[Infraction]()
+    for event in world.events:
+        kind = KINDS.get(event.kind)
+        if event.kind is EventKind.COLLISION:
+            kind = InfractionKind.COLLISION_VEHICLE
+            if event.actor_kind is ActorKind.PEDESTRIAN:
+                kind = InfractionKind.COLLISION_PEDESTRIAN
+            elif event.actor_kind in LAYOUT:
+                kind = InfractionKind.COLLISION_LAYOUT
+        if kind is not None:
+            infractions.append(_infraction(kind, event, world))
+    # all leaving of lanes is one infraction, placed where it began
+    left = next((e for e in world.events if e.kind is EventKind.OUTSIDE_LANES), None)
+    if left is not None:
+        outside_m = world.outside_distance_m
+        percent = _outside_percent(outside_m, world.progress_m)
+        kind, at = InfractionKind.OUTSIDE_ROUTE_LANES, (left.time_us, left.x, left.y)
+        detail = f"{outside_m:.2f} m"
+        infractions.append(Infraction(kind, *at, detail=detail, percent=percent))
     if ending in ENDINGS:
         ego = world.scene().ego
-        found.append(
-            Infraction(ENDINGS[ending], world.time_us, ego.x, ego.y, ending.value)
-        )
-    return tuple(sorted(found, key=lambda infraction: infraction.time_us or 0))
-
-
-def _kind(event: Event) -> InfractionKind | None:
-    if event.kind is not EventKind.COLLISION:
-        return KINDS.get(event.kind)
-    if event.actor_kind is ActorKind.PEDESTRIAN:
-        return InfractionKind.COLLISION_PEDESTRIAN
-    if event.actor_kind in LAYOUT:
-        return InfractionKind.COLLISION_LAYOUT
-    return InfractionKind.COLLISION_VEHICLE
+        at_end = world.time_us, ego.x, ego.y
+        infractions.append(Infraction(ENDINGS[ending], *at_end, ending.value))
+    return tuple(sorted(infractions, key=lambda each: each.time_us or 0))
 
 
 def _infraction(kind: InfractionKind, event: Event, world: World) -> Infraction:
+    """Return an infraction; of a collision with its contact, and whose fault it was."""
     partner = "" if event.actor_kind is None else f"{event.actor_kind.value} "
     number = "" if event.actor_id is None else f"{event.actor_id}"
     detail = f"{partner}{number}".strip() or event.detail
-    found = Infraction(
+    infraction = Infraction(
         *(kind, event.time_us, event.x, event.y, detail),
         ego_speed_mps=event.ego_speed_mps,
     )
-    return _judged(found, event, world) if kind in COLLISIONS else found
-
-
-def _judged(collision: Infraction, event: Event, world: World) -> Infraction:
-    """Add the type of contact, and whether the ego was at fault."""
-    scene = world.collided[event.time_us]
-    for actor in scene.actors:
-        if actor.id == event.actor_id:
-            contact = contact_of(scene.ego, actor)
-            fault = at_fault(contact, scene.ego, world.roadmap)
-            return replace(collision, contact=contact, at_fault=fault)
-    return collision
-
-
-def _outside(world: World) -> Infraction | None:
-    """Sum up all leaving of lanes in one infraction, placed where it began."""
-    first = next((e for e in world.events if e.kind is EventKind.OUTSIDE_LANES), None)
-    if first is None:
-        return None
-    outside_m = world.outside_distance_m
-    percent = _outside_percent(outside_m, world.progress_m)
-    return Infraction(
-        InfractionKind.OUTSIDE_ROUTE_LANES,
-        *(first.time_us, first.x, first.y),
-        detail=f"{outside_m:.2f} m",
-        percent=percent,
-    )
+    if kind in COLLISIONS:
+        scene = world.collided[event.time_us]
+        for actor in scene.actors:
+            if actor.id == event.actor_id:
+                contact = contact_of(scene.ego, actor)
+                fault = at_fault(contact, scene.ego, world.roadmap)
+                return replace(infraction, contact=contact, at_fault=fault)
+    return infraction

@@ -18,8 +18,8 @@ import numpy as np
 from me2e_compress.driving.contract import Policy
 from me2e_compress.driving.latency import FixedLatency
 from me2e_compress.errors import EvaluationError
+from me2e_compress.evaluators.contract import Drive
 from me2e_compress.evaluators.highway.blind import SPEEDS_MPS, Blind
-from me2e_compress.evaluators.highway.conditions import Conditions
 from me2e_compress.evaluators.highway.expert.expert_policy import Expert
 from me2e_compress.evaluators.highway.runner import Listeners, drive
 from me2e_compress.metrics.episode import Ending, InfractionKind
@@ -62,7 +62,7 @@ class DryRun:
 
 MOST_S = 80.0
 """Nobody drives for longer; two cycles of a light."""
-TEN_A_SECOND = Conditions(FixedLatency(100_000))
+TEN_A_SECOND = Drive(FixedLatency(100_000))
 MOST_BLIND = 1
 """At how many speeds a blind driver may solve a route."""
 BLIND_MPS = (SPEEDS_MPS[2], SPEEDS_MPS[1], SPEEDS_MPS[0])
@@ -71,15 +71,15 @@ FAULTS = INFRACTIONS | {EventKind.ACTOR_COLLISION}
 
 
 def dry_run(route: Route, policy: Policy) -> DryRun:
-    """Drive a route once."""
+    """Drive a route once, until the rest cannot change the verdict."""
     worlds = list[World]()
-    episode = drive(
-        route,
-        policy,
-        TEN_A_SECOND,
-        Listeners(on_query=worlds.append),
-        _decided,
-    )
+
+    def decided(world: World) -> bool:
+        faults = any(event.kind in FAULTS for event in world.events)
+        return faults or world.time_us >= MOST_S * 1e6
+
+    listeners = Listeners(on_query=worlds.append)
+    episode = drive(route, policy, TEN_A_SECOND, listeners, decided)
     kinds = [event.kind for event in worlds[-1].events]
     faults = [found.kind for found in episode.infractions]
     return DryRun(
@@ -90,12 +90,6 @@ def dry_run(route: Route, policy: Policy) -> DryRun:
         episode.frames[-1].time_us / 1e6 if episode.frames else 0.0,
         episode.failure,
     )
-
-
-def _decided(world: World) -> bool:
-    """Return whether the rest of a drive cannot change its verdict."""
-    faults = any(event.kind in FAULTS for event in world.events)
-    return faults or world.time_us >= MOST_S * 1e6
 
 
 @dataclass(frozen=True, slots=True)
@@ -127,24 +121,16 @@ class Admission:
         why = _unsolved(self.expert)
         if why is None and self.again is not None and (found := _unsolved(self.again)):
             return f"with other traffic {found}"
-        if why is None and not self._met:
+        # the event happens to the expert, or by chance to anybody
+        drives = (self.expert, self.again, *self.blind)
+        if why is None and not any(each and each.triggered for each in drives):
             return "the scenario's event never happened"
         return why
-
-    @property
-    def _met(self) -> bool:
-        """Whether the event happened: to the expert, or by chance to anybody."""
-        drives = (self.expert, self.again, *self.blind)
-        return any(each is not None and each.triggered for each in drives)
 
     @property
     def admitted(self) -> bool:
         """Whether the route may be used."""
         return self.refusal is None
-
-
-def _solves(drives: Sequence[DryRun]) -> int:
-    return sum(not drive.infractions for drive in drives)
 
 
 def _unsolved(drive: DryRun) -> str | None:
@@ -161,12 +147,13 @@ def _unsolved(drive: DryRun) -> str | None:
 
 def examine(route: Route) -> Admission:
     """Check one route; the cheap blind drives come first."""
-    drives = list[DryRun]()
+    drives, solved = list[DryRun](), 0
     for speed in BLIND_MPS:
         drives.append(dry_run(route, Blind(speed)))
-        if drives[-1].actors_crashed or _solves(drives) > MOST_BLIND:
+        solved += not drives[-1].infractions
+        if drives[-1].actors_crashed or solved > MOST_BLIND:
             return Admission(route, None, tuple(drives))
-        if len(drives) - _solves(drives) == len(SPEEDS_MPS) - MOST_BLIND:
+        if len(drives) - solved == len(SPEEDS_MPS) - MOST_BLIND:
             break
     blind = tuple(drives)
     # with its own traffic and with other

@@ -11,10 +11,10 @@ import numpy.typing as npt
 from me2e_compress.driving.contract import EgoKinematics, Observation, Policy
 from me2e_compress.driving.input_sources import can_bus_between
 from me2e_compress.errors import EvaluationError
-from me2e_compress.evaluators.highway.rectangles import rays_through
+from me2e_compress.evaluators.highway.conflict_recorder import rays_through
 from me2e_compress.simulator.camera_rig import CAMERA_HEIGHT_M, CAMERAS
 from me2e_compress.simulator.cameras import CameraRig, Cameras
-from me2e_compress.simulator.plane_geometry import Floats, RoutePath
+from me2e_compress.simulator.plane_geometry import RoutePath
 from me2e_compress.simulator.scene import Actor, ActorKind, Ego, Scene
 from me2e_compress.simulator.world import World
 
@@ -177,7 +177,12 @@ def visible(ego: Ego, actors: list[Actor]) -> npt.NDArray[np.bool_]:
     x = boxes[:, :1] + cos[:, None] * on_box[..., 0] - sin[:, None] * on_box[..., 1]
     y = boxes[:, 1:2] + sin[:, None] * on_box[..., 0] + cos[:, None] * on_box[..., 1]
     ends = np.stack([x, y], axis=-1).reshape(-1, 2)
-    eyes = _eyes(ego, ends)
+    # the camera that looks most nearly at each end
+    bearing = np.arctan2(ends[:, 1] - ego.y, ends[:, 0] - ego.x) - ego.heading
+    yaws = np.deg2rad([camera.yaw_deg for camera in CAMERAS])
+    apart = np.abs(np.angle(np.exp(1j * (bearing[:, None] - yaws))))
+    places = np.array([(camera.x_m, camera.y_m) for camera in CAMERAS])
+    eyes = ego.placed(places[np.argmin(apart, axis=1)])
     # where each ray enters and leaves each box, as parts of the ray: [R, A]
     enters, leaves = rays_through(eyes, ends, boxes[:, :5])
     crosses = (enters < leaves) & (leaves > 0.0) & (enters < 1.0)
@@ -191,15 +196,6 @@ def visible(ego: Ego, actors: list[Actor]) -> npt.NDArray[np.bool_]:
     blocked[np.arange(len(own)), own] = False
     arrive = ~blocked.any(axis=1).reshape(len(actors), len(AT))
     return np.asarray(arrive.mean(axis=1) >= LEAST)
-
-
-def _eyes(ego: Ego, points: Floats) -> Floats:
-    """Return [R, 2] where the camera is that looks most nearly at each point."""
-    bearing = np.arctan2(points[:, 1] - ego.y, points[:, 0] - ego.x) - ego.heading
-    yaws = np.deg2rad([camera.yaw_deg for camera in CAMERAS])
-    apart = np.abs(np.angle(np.exp(1j * (bearing[:, None] - yaws))))
-    places = np.array([(camera.x_m, camera.y_m) for camera in CAMERAS])
-    return ego.placed(places[np.argmin(apart, axis=1)])
 
 
 def _away(ego: Ego, x: float, y: float) -> float:

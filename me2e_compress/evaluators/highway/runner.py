@@ -21,11 +21,12 @@ from me2e_compress.driving.contract import (
 from me2e_compress.driving.latency import DecisionFacts
 from me2e_compress.driving.realtime import control_clock
 from me2e_compress.errors import EvaluationError
-from me2e_compress.evaluators.highway.conditions import Conditions
+from me2e_compress.evaluators.contract import Drive
 from me2e_compress.evaluators.highway.controller import (
     AnchoredPlan,
     control_of,
 )
+from me2e_compress.evaluators.highway.drivers import image_size_of
 from me2e_compress.evaluators.highway.episode_recorder import EpisodeRecorder
 from me2e_compress.evaluators.highway.observe import ObservationBuilder, road_users
 from me2e_compress.metrics.episode import Ending, Episode, InferenceRecord
@@ -121,14 +122,11 @@ class Listeners:
     on_moment: Callable[[Moment], None] | None = None
 
 
-NO_LISTENERS = Listeners()
-
-
 def drive(
     route: Route,
     policy: Policy,
-    conditions: Conditions,
-    listeners: Listeners = NO_LISTENERS,
+    conditions: Drive,
+    listeners: Listeners = Listeners(),
     enough: Callable[[World], bool] | None = None,
 ) -> Episode:
     """Drive a route to its end and return the record.
@@ -151,7 +149,7 @@ class _Drive:
         self,
         route: Route,
         policy: Policy,
-        conditions: Conditions,
+        conditions: Drive,
         listeners: Listeners,
         enough: Callable[[World], bool] | None,
     ) -> None:
@@ -164,11 +162,10 @@ class _Drive:
         self.recorder, self.rules = EpisodeRecorder(world), EndingRules()
         if enough is not None:
             self.recorder.conflicts = None
-        self.clock = control_clock(
-            conditions.latency_model, Control(0.0, 0.0), conditions.dt_us
-        )
+        coast, model = Control(0.0, 0.0), conditions.latency_model
+        self.clock = control_clock(model, coast, conditions.dt_us)
         self.charge = conditions.latency.on_route(route.id)
-        rig = CameraRig(*conditions.image_size)
+        rig = CameraRig(*image_size_of(policy))
         self.cameras = None
         if policy.needs_images or listeners.on_moment is not None:
             texture = paint_texture(world.roadmap, world.path.points)
@@ -214,8 +211,15 @@ class _Drive:
         took_us = (time.perf_counter_ns() - begun) // 1_000
         self.listeners.on_answer()
         # the latency source may use the measured time
-        control = self.control_by(_checked(answer), scene)
-        facts = DecisionFacts(took_us, road_users(scene), *self.host_work())
+        try:
+            valid = checked(answer)
+        except EvaluationError as error:
+            raise PolicyFailedError(str(error)) from error
+        control = self.control_by(valid, scene)
+        work = 0, 0
+        if self.hosted is not None:
+            work = self.hosted.host_iterations, self.hosted.host_cells
+        facts = DecisionFacts(took_us, road_users(scene), *work)
         latency_us = self.charge(facts)
         self.recorder.decisions.append(InferenceRecord(scene.time_us, latency_us))
         self.clock.decide(control, latency_us)
@@ -227,12 +231,6 @@ class _Drive:
         self.plan = scene.ego, np.asarray(answer.points, np.float64)
         anchored = AnchoredPlan.of(answer, scene.ego, scene.time_us)
         return anchored.control(scene.ego, scene.time_us)
-
-    def host_work(self) -> tuple[int, int]:
-        """Return iterations and cells of the policy's host stage; zeros without one."""
-        if self.hosted is None:
-            return 0, 0
-        return self.hosted.host_iterations, self.hosted.host_cells
 
     def show(self, scene: Scene) -> None:
         """Render this frame for the listener that draws pictures."""
@@ -251,12 +249,5 @@ def _ask(call: Callable[[], T]) -> T:
         return call()
     except Exception as error:
         words = " ".join(str(error).split())
-        told = f"{type(error).__name__}: {words}" if words else repr(error)
-        raise PolicyFailedError(told) from error
-
-
-def _checked(answer: object) -> Trajectory | PedalsAndWheel:
-    try:
-        return checked(answer)
-    except EvaluationError as error:
-        raise PolicyFailedError(str(error)) from error
+        reason = f"{type(error).__name__}: {words}" if words else repr(error)
+        raise PolicyFailedError(reason) from error

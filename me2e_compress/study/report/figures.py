@@ -1,25 +1,46 @@
 """The figures of a report, as SVG."""
 
-from collections.abc import Sequence
+import io
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
+from pathlib import Path
 
 from markupsafe import Markup
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.style import context
 
-from me2e_compress.metrics.measure import Estimate
+from me2e_compress.metrics.measure import Estimate, Measure
+from me2e_compress.metrics.scores import Scores
 from me2e_compress.study.condition import Condition
-from me2e_compress.study.outcome import StudyOutcome
-from me2e_compress.study.report.style import (
-    ACCENT,
-    BASELINE,
-    INK,
-    MUTED,
-    RULE,
-    bare,
-    styled,
-    svg,
-)
+from me2e_compress.study.study_result import StudyResult
+
+INK, MUTED, RULE = "#1d2127", "#6b7480", "#d9dde3"
+ACCENT, BASELINE = "#2a6fb0", "#1d2127"
+STYLE = Path(__file__).with_name("report.mplstyle")
+PAGE_FONT = "Inter, 'Segoe UI', 'Helvetica Neue', Arial, sans-serif"
+"""Text stays text: matplotlib measures one font, the page shows its own."""
+
+
+def styled() -> AbstractContextManager[None]:
+    """Return a context that ignores the user's matplotlib settings."""
+    return context(STYLE, after_reset=True)
+
+
+def svg(figure: Figure) -> Markup:
+    """Write a figure as an SVG element, reproducibly."""
+    buffer = io.StringIO()
+    figure.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None})
+    text = buffer.getvalue()
+    return Markup(text[text.index("<svg") :].replace("'DejaVu Sans'", PAGE_FONT))
+
+
+def bare(axes: Axes) -> None:
+    """Leave only a light grid along x."""
+    axes.grid(visible=True, axis="x")
+    axes.spines["left"].set_visible(False)
+
 
 CROWD = 6
 """With more variants than this, only the front and the baseline bear names and bars."""
@@ -58,19 +79,16 @@ def front(points: Sequence[Point]) -> list[Point]:
     return kept
 
 
-def pareto(outcome: StudyOutcome, condition: Condition) -> Markup | None:
+def pareto(outcome: StudyResult, condition: Condition) -> Markup | None:
     """Draw driving score against latency and against size; None below two points."""
     # panels with at least two points
-    latency = _points(outcome, condition, "latency")
-    size = _points(outcome, condition, "size")
-    panels = [
-        (points, words)
-        for points, words in (
-            (latency, "median latency, ms"),
-            (size, "size, MB"),
-        )
-        if len(points) > 1
-    ]
+    sizes = {each.name: each.size_mb for each in outcome.variants}
+    medians = {each.name: each.latency_ms[50] for each in outcome.variants}
+    drawn = (
+        (_points(outcome, condition, medians), "median latency, ms"),
+        (_points(outcome, condition, sizes), "size, MB"),
+    )
+    panels = [each for each in drawn if len(each[0]) > 1]
     if not panels:
         return None
     with styled():
@@ -87,7 +105,7 @@ def pareto(outcome: StudyOutcome, condition: Condition) -> Markup | None:
         return svg(figure)
 
 
-def forest(outcome: StudyOutcome) -> Markup | None:
+def forest(outcome: StudyResult) -> Markup | None:
     """Draw every difference to the baseline with its interval; None without one."""
     # drives that have a difference to the baseline
     rows = [each for each in outcome.drives if each.difference is not None]
@@ -113,16 +131,16 @@ def forest(outcome: StudyOutcome) -> Markup | None:
         return svg(figure)
 
 
-def _points(outcome: StudyOutcome, condition: Condition, kind: str) -> list[Point]:
-    found = list[Point]()
-    for drive in outcome.under(condition):
-        variant = outcome.variant(drive.variant)
-        measure = variant.size_mb if kind == "size" else variant.latency_ms[50]
-        if drive.scores is not None and measure.value is not None:
-            baseline = drive.variant == outcome.study.baseline
-            score = drive.scores.driving_score
-            found.append(Point(drive.variant, measure.value, score, baseline))
-    return found
+def _points(
+    outcome: StudyResult, condition: Condition, costs: Mapping[str, Measure]
+) -> list[Point]:
+    baseline = outcome.study.baseline
+    return [
+        Point(name, cost, drive.scores.driving_score, name == baseline)
+        for drive in outcome.under(condition)
+        if drive.scores is not None
+        if (cost := costs[name := drive.variant].value) is not None
+    ]
 
 
 def _named(points: Sequence[Point]) -> Sequence[Point]:
@@ -222,4 +240,70 @@ def _place_names(
             arrowprops={"arrowstyle": "-", "color": RULE} if moved else None,
             annotation_clip=False,
             bbox={"facecolor": "white", "alpha": 0.8, "linewidth": 0, "pad": 0.5},
+        )
+
+
+ENOUGH = 3
+"""Fewest conditions that make a curve; fewer are read off the tables."""
+
+Score = Callable[[Scores], Estimate]
+
+
+def curves(outcome: StudyResult) -> Markup | None:
+    """Draw driving score, room and success as SVG; None below three conditions."""
+    if len(outcome.study.conditions) < ENOUGH:
+        return None
+    # panels over the same conditions
+    panels: tuple[tuple[str, Score], ...] = (
+        ("driving score", lambda scores: scores.driving_score),
+        ("room kept, %", lambda scores: scores.safety.room_kept),
+        ("success rate, %", lambda scores: scores.success_rate),
+    )
+    names = [condition.name for condition in outcome.study.conditions]
+    with styled():
+        figure = Figure(figsize=(WIDTH_IN, 3.0), layout="constrained")
+        # one curve per variant
+        for axes, (title, pick) in zip(figure.subplots(1, 3), panels, strict=True):
+            for variant in outcome.variants:
+                estimates = [
+                    None if drive.scores is None else pick(drive.scores)
+                    for drive in outcome.drives
+                    if drive.variant == variant.name
+                ]
+                _curve(axes, variant.name, estimates, outcome)
+            axes.set_title(title, color=MUTED)
+            axes.set_xticks(range(len(names)), names)
+            axes.set_ylim(0.0, 102.0)
+            axes.grid(visible=True, axis="y")
+            axes.spines["left"].set_visible(False)
+        return svg(figure)
+
+
+def _curve(
+    axes: Axes, name: str, estimates: Sequence[Estimate | None], outcome: StudyResult
+) -> None:
+    # conditions under which the variant was driven
+    colour = BASELINE if name == outcome.study.baseline else ACCENT
+    driven = [
+        (place, each.value, each.low, each.high)
+        for place, each in enumerate(estimates)
+        if each is not None and each.value is not None
+    ]
+    # intervals are drawn under the curve
+    for place, _, low, high in driven:
+        if low is not None and high is not None:
+            axes.plot([place] * 2, [low, high], color=colour, alpha=0.3, linewidth=1.6)
+    axes.plot(
+        [place for place, *_ in driven],
+        [value for _, value, *_ in driven],
+        "o-",
+        color=colour,
+        linewidth=1.2,
+        markersize=5,
+    )
+    # the name at the end of the curve
+    if driven and len(outcome.variants) > 1:
+        place, value, *_ = driven[-1]
+        axes.annotate(
+            name, (place, value), xytext=(7, 0), textcoords="offset points", va="center"
         )

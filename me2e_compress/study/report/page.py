@@ -1,14 +1,26 @@
 """A report as one self-contained HTML page, built from a template."""
 
-from collections.abc import Sequence
+import base64
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from jinja2 import Environment, FileSystemLoader, StrictUndefined, Template
 from markupsafe import Markup
 
-from me2e_compress.display import Table
+from me2e_compress.display import Table, counted, in_markdown
+from me2e_compress.errors import StudyError
+from me2e_compress.metrics.measure import Estimate
+from me2e_compress.registry import drafts
 from me2e_compress.registry.drafts import MARK
+from me2e_compress.runtime.atomic import write_bytes, write_document
+from me2e_compress.study.cells import number
+from me2e_compress.study.drive_record import Contrast, DriveRecord
+from me2e_compress.study.outcome import VariantOutcome
+from me2e_compress.study.report.figures import curves, forest, pareto
+from me2e_compress.study.study_result import StudyResult
+from me2e_compress.study.workspace import HTML, JSON, MARKDOWN
+from me2e_compress.workflows.checks import writing
 
 
 @dataclass(frozen=True)
@@ -65,3 +77,247 @@ def template() -> Template:
         trim_blocks=True,
         lstrip_blocks=True,
     ).get_template("page.html", globals={"mark": MARK})
+
+
+TIMES = "\N{MULTIPLICATION SIGN}"
+COSTS = "What a point of driving score costs"
+APART = "Where they part"
+
+
+def study_page(
+    outcome: StudyResult,
+    command: Sequence[str] = (),
+    sections: Sequence[Section] = (),
+) -> Page:
+    """Return the page of a comparison; ``sections`` stand before how it was made."""
+    baseline = outcome.study.baseline
+    remembered = findings(outcome)
+    note = (
+        f"Against {baseline}, the same routes; in brackets the 95 % interval of the"
+        " mean difference."
+    )
+    return Page(
+        outcome.title,
+        _lede(outcome),
+        [*_sections(outcome), *sections],
+        _made(outcome, command),
+        [_recipe(each) for each in outcome.variants],
+        remembered,
+        note if remembered else "",
+        outcome.alerts(),
+    )
+
+
+def _sections(outcome: StudyResult) -> list[Section]:
+    """Return the sections that have something to show, in reading order."""
+    baseline = outcome.study.baseline
+    tables = dict(outcome.tables_by_section)
+    headings = [*tables, APART]
+    headings.insert(headings.index("Route by route"), COSTS)
+    drawings = _drawings(outcome)
+    # without a difference there is nothing to compare
+    if not drawings["Paired differences"]:
+        tables["Paired differences"] = ()
+    notes = {
+        COSTS: "The line joins the variants that no other beats on both counts. Bars:"
+        f" 95 % intervals of the driving score. Black: {baseline}. Where there are"
+        f" many, only the front and {baseline} are named.",
+        APART: f"The front cameras of both, {baseline}'s above. From above: {baseline}"
+        " and its plan in grey; the other in blue, its plan in orange, with its"
+        " traffic; the route in pale blue; crosses mark infractions. A drive that was"
+        " over by then shows its last moment.",
+    }
+    sections = (
+        Section(
+            name,
+            tables.get(name, ()),
+            drawings=drawings.get(name, ()),
+            note=notes.get(name, ""),
+        )
+        for name in headings
+    )
+    return [each for each in sections if each.tables or each.drawings]
+
+
+def _drawings(outcome: StudyResult) -> Mapping[str, tuple[Drawing, ...]]:
+    """Return the figures by the heading that they stand under."""
+    study = outcome.study
+    curve, gaps = curves(outcome), forest(outcome)
+    fronts = {each.name: pareto(outcome, each) for each in study.conditions}
+    drawn = {name: front for name, front in fronts.items() if front is not None}
+    over_conditions = "Dots are means over routes, bars their 95 % intervals."
+    to_baseline = (
+        f"Each dot is the mean difference to {study.baseline} over the routes, the bar"
+        " its 95 % interval; blue where it does not hold zero."
+    )
+    return {
+        "Scoreboard": () if curve is None else (Drawing(curve, over_conditions),),
+        "Paired differences": () if gaps is None else (Drawing(gaps, to_baseline),),
+        COSTS: tuple(
+            Drawing(front, caption=name if len(drawn) > 1 else "")
+            for name, front in drawn.items()
+        ),
+        APART: tuple(_contrast(each, study.baseline) for each in outcome.contrasts),
+    }
+
+
+def _lede(outcome: StudyResult) -> str:
+    # what was driven
+    study = outcome.study
+    driven, whole = outcome.coverage
+    share = f"{driven}" if driven == whole else f"{driven} of {whole}"
+    where = f"of {study.driven_by.label}"
+    names = ", ".join(each.name for each in study.conditions)
+    said = (
+        f"{counted(len(study.variants), 'variant')} on {share} routes {where}, "
+        f"closed loop; {counted(len(study.conditions), 'condition')}: {names}."
+    )
+    # what so many routes can show
+    found = [each.difference for each in outcome.drives if each.difference is not None]
+    if not found:
+        return said
+    least = max(each.smallest_shown for each in found)
+    return (
+        f"{said} {counted(driven, 'route')} cannot show a difference below {least:.1f}"
+        " points of driving score."
+    )
+
+
+def _contrast(contrast: Contrast, baseline: str) -> Drawing:
+    ends = []
+    for each in (contrast.route, contrast.other):
+        room = each.room_kept
+        kept = "" if room is None else f", room kept {room:.1f} %"
+        ends.append(f"driving score {each.driving_score:.1f}{kept}, {each.fate}")
+    variant, route = contrast.drive.variant, contrast.route
+    words = f"{baseline}, in grey: {ends[0]}; {variant}, in colour: {ends[1]}"
+    png = base64.b64encode(contrast.picture.read_bytes()).decode()
+    image = Markup('<img src="data:image/png;base64,{}" alt="{}">').format(png, words)
+    caption = (
+        f"{route.scenario}, {contrast.drive.condition}, "
+        f"{contrast.moment_us / 1e6:.1f} s into the route {route.route}; "
+        f"at most {contrast.apart.distance_m:.1f} m apart"
+    )
+    return Drawing(image, caption=caption, words=words)
+
+
+def _recipe(variant: VariantOutcome) -> tuple[str, str, str | None]:
+    """Return name, source and digest."""
+    prepared = variant.prepared
+    made_of = prepared.source or prepared.variant.policy
+    if prepared.pipeline:
+        made_of = f"{made_of} → {prepared.pipeline}"
+    if prepared.weights:
+        made_of = f"{made_of}; {prepared.weights}"
+    return variant.name, made_of, prepared.sha256
+
+
+def _made(outcome: StudyResult, command: Sequence[str]) -> list[tuple[str, str]]:
+    timing = outcome.study.timing
+    load = "" if outcome.load is None else f"; while it was timed, {outcome.load}"
+    timed = (
+        f"{timing.samples} inferences a model, in turn, on"
+        f" {counted(timing.threads, 'thread')}; device scale {outcome.device_scale:.3g}"
+    )
+    return [
+        ("Command", " ".join(command)),
+        ("Machine", f"{outcome.machine}{load}"),
+        ("Latency", timed if outcome.timed else ""),
+        ("Versions", ", ".join(f"{k} {text}" for k, text in outcome.versions.items())),
+        ("Seed", str(outcome.study.seed)),
+    ]
+
+
+def findings(outcome: StudyResult) -> tuple[tuple[str, str], ...]:
+    """Say of every variant but the baseline what it costs and how it drives."""
+    several = len(outcome.study.conditions) > 1
+    baseline = outcome.variant(outcome.study.baseline)
+    sentences = list[tuple[str, str]]()
+    for variant in outcome.variants:
+        if variant is baseline:
+            continue
+        compared = (
+            (variant.size_mb, baseline.size_mb, "the size"),
+            (variant.latency_ms[50], baseline.latency_ms[50], "the median latency"),
+        )
+        costs = [
+            f"{one.value / other.value:.2f} {TIMES} {what}"
+            for one, other, what in compared
+            if one.value is not None and other.value
+        ]
+        drives = [each for each in outcome.drives if each.variant == variant.name]
+        parts = [", ".join(costs), *(_road(each, several) for each in drives)]
+        words = "; ".join(filter(None, parts)) or "nothing could be compared"
+        sentences.append((variant.name, f"{words}."))
+    return tuple(sentences)
+
+
+def _road(drive: DriveRecord, several: bool) -> str:
+    where = f"{drive.condition}: " if several else ""
+    if drive.difference is None:
+        return ""
+    gap = drive.difference.driving_score
+    points = _signed(f"{where}driving score ", gap)
+    if not points:
+        value = number(gap.value or 0.0, "+.1f")
+        return f"{where}driving score {value} points on {gap.n} route"
+    limit = f"{gap.n} routes show none below {drive.difference.smallest_shown:.1f}"
+    kept = _signed("; room kept ", drive.difference.room_kept)
+    return f"{points}, {drive.difference.verdict}; {limit}{kept}"
+
+
+def _signed(what: str, gap: Estimate) -> str:
+    ends = [each for each in (gap.value, gap.low, gap.high) if each is not None]
+    if len(ends) < 3:
+        return ""
+    value, low, high = (number(each, "+.1f") for each in ends)
+    return f"{what}{value} points ({low} to {high})"
+
+
+@dataclass(frozen=True)
+class StudyFiles:
+    """Paths of the JSON record, Markdown tables and HTML report of a study."""
+
+    record: Path
+    tables: Path
+    report: Path
+
+
+def write_study(
+    outcome: StudyResult,
+    folder: str | Path,
+    command: Sequence[str] = (),
+    sections: Sequence[Section] = (),
+    *,
+    force: bool = False,
+) -> StudyFiles:
+    """Write JSON, Markdown and HTML, each atomically.
+
+    Args:
+        outcome: Results to write.
+        folder: Created if needed.
+        command: The command line that reproduces the study, word by word.
+        sections: Additional sections of the page.
+        force: Also replace files that we did not write.
+
+    Raises:
+        StudyError: The folder cannot be written.
+        GraphError: A file is there that we did not write.
+    """
+    # paths, and all tables as Markdown
+    folder = Path(folder)
+    written = StudyFiles(folder / JSON, folder / MARKDOWN, folder / HTML)
+    heading = f"{drafts.IN_MARKDOWN}# {in_markdown(outcome.title)}\n\n"
+    text = heading + "\n".join(table.markdown() for table in outcome.tables())
+    page = study_page(outcome, command, sections)
+    # all files are written, or none
+    with drafts.written(folder, StudyError):
+        folder.mkdir(parents=True, exist_ok=True)
+        with (
+            writing([written.record, written.tables, written.report], force=force),
+            drafts.all_or_none(),
+        ):
+            write_document(written.record, outcome.to_json(), indent=1)
+            write_bytes(written.tables, text.encode())
+            write_bytes(written.report, page.html().encode())
+    return written

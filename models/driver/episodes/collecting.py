@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from me2e_compress.driving.onnx_policy import OnnxPolicy
-from me2e_compress.evaluators.highway.conditions import Conditions
+from me2e_compress.evaluators import Drive
 from me2e_compress.evaluators.highway.runner import drive
 from me2e_compress.graph import sha256_of
 from me2e_compress.metrics.episode import Ending
@@ -162,7 +162,7 @@ def episode_of(
         CameraRig(*what.image_size),
     )
     route = task.route()
-    episode = drive(route, recording, Conditions())
+    episode = drive(route, recording, Drive())
     if episode.ending is Ending.POLICY_FAILED or recording.world is None:
         raise TrainingError(f"route {task.name}: {episode.failure}")
     frames, world = recording.frames, recording.world

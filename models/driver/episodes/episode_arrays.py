@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from me2e_compress.evaluators.highway.controller import beyond
 from me2e_compress.evaluators.highway.expert.expert_policy import decide
 from me2e_compress.evaluators.highway.observe import can_bus_of
-from me2e_compress.evaluators.highway.reentry import beyond
 from me2e_compress.simulator.cameras import CameraRig
 from me2e_compress.simulator.cameras.birdseye import ground_classes
 from me2e_compress.simulator.plane_geometry import Floats, RoutePath

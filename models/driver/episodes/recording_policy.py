@@ -22,9 +22,9 @@ from me2e_compress.driving.contract import (
 from me2e_compress.evaluators.highway.expert.expert_policy import (
     ExpertDecision,
     Memory,
+    ceiling,
     decide,
 )
-from me2e_compress.evaluators.highway.expert.speed_limits import ceiling
 from me2e_compress.evaluators.highway.observe import (
     ObservationBuilder,
     scene_and_world,

@@ -7,9 +7,8 @@ import numpy as np
 import pytest
 
 from me2e_compress.driving.contract import Observation, Plan
-from me2e_compress.evaluators.highway.conditions import Conditions
-from me2e_compress.evaluators.highway.expert.expert_policy import Expert
-from me2e_compress.evaluators.highway.expert.speed_limits import ceiling
+from me2e_compress.evaluators import Drive
+from me2e_compress.evaluators.highway.expert.expert_policy import Expert, ceiling
 from me2e_compress.evaluators.highway.runner import drive
 from me2e_compress.simulator.camera_rig import CLEAR
 from me2e_compress.simulator.cameras import (
@@ -74,7 +73,7 @@ def noisy() -> Arrays:
 @pytest.fixture(scope="module")
 def witness() -> Witness:
     policy = Witness()
-    drive(task(STOP).route(), policy, Conditions())
+    drive(task(STOP).route(), policy, Drive())
     return policy
 
 
@@ -238,7 +237,7 @@ class Overheard(RecordingPolicy):
 
 def test_what_is_driven_is_the_label_with_noise() -> None:
     policy, route = Overheard(seed=3), task("HighwayExit").route()
-    drive(route, policy, Conditions())
+    drive(route, policy, Drive())
     seeds = [3, zlib.crc32(route.id.encode())]
     noise = Perturbation(np.random.default_rng(seeds), 1.0)
 
@@ -260,7 +259,7 @@ def test_a_recorded_picture_shows_the_weather() -> None:
     tasks = tasks_of(replace(CALM, scenarios=("HighwayExit",), variants=12))
     dark = next(e for e in tasks if World(e.route()).weather.night > 0.5)
     policy = RecordingPolicy(seed=3)
-    drive(dark.route(), policy, Conditions(), enough=lambda w: w.time_us >= 100_000)
+    drive(dark.route(), policy, Drive(), enough=lambda w: w.time_us >= 100_000)
     assert policy.world is not None
     cameras = cameras_of(policy.world, CameraRig(*SIZE))
 

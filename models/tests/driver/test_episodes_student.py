@@ -11,7 +11,7 @@ import pytest
 
 from me2e_compress.driving.contract import Observation, Plan, RouteInfo
 from me2e_compress.driving.onnx_policy import OnnxPolicy
-from me2e_compress.evaluators.highway.conditions import Conditions
+from me2e_compress.evaluators import Drive
 from me2e_compress.evaluators.highway.runner import drive
 from me2e_compress.simulator.scene import Scene
 from me2e_compress.simulator.world import World
@@ -89,7 +89,7 @@ def test_a_student_decides_at_the_stored_samples() -> None:
     drive(
         task("HighwayExit").route(),
         policy,
-        Conditions(),
+        Drive(),
         enough=lambda w: w.time_us >= 1_000_000,
     )
 

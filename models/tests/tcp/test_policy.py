@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 from me2e_compress.driving.contract import Answer, PedalsAndWheel, checked
 from me2e_compress.driving.latency import FixedLatency
 from me2e_compress.errors import EvaluationError
-from me2e_compress.evaluators.highway.conditions import Conditions
-from me2e_compress.evaluators.highway.drivers import image_size_of
+from me2e_compress.evaluators import Drive
 from me2e_compress.evaluators.highway.runner import drive
 from models.export import export
 from models.stacks import TCP
@@ -113,7 +112,7 @@ def test_tcp_drives_a_route_at_its_published_size(
     policy = tcp_policy(
         export("tcp", tmp_path / "tcp.onnx", heads=heads), heads, fused=fused
     )
-    conditions = Conditions(FixedLatency(latency_us), image_size=image_size_of(policy))
+    conditions = Drive(FixedLatency(latency_us))
 
     episode = drive(EXIT, policy, conditions)
 

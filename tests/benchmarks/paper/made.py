@@ -8,6 +8,7 @@ import numpy.typing as npt
 from benchmarks.paper.drives import FILE, Int8Counts, KeptFacts, ModelFacts
 from me2e_compress.metrics.episode import InfractionKind
 from me2e_compress.metrics.route_summary import RouteSummary
+from me2e_compress.simulator.routes import Route
 from me2e_compress.study import Study
 from me2e_compress.study.drive_record import DriveRecord
 from me2e_compress.study.workload import held_frames
@@ -40,6 +41,7 @@ def _routes(
         random = np.random.default_rng([number, late, len(name)])
         hit = random.random() < lost / 100
         score = float(np.clip(100 - lost * random.random() * 2, 0, 100))
+        assert isinstance(route, Route)
         kind = KINDS[int(random.random() < (0.6 if "map" in name else 0.2))]
         made.append(
             RouteSummary(

@@ -16,7 +16,7 @@ from benchmarks.paper.records import RECORDS, add_facts, read_paper
 from me2e_compress.errors import StudyError
 from me2e_compress.simulator.routes import Route
 from me2e_compress.study import Condition, Study, Timing, Variant, load_study, run_study
-from me2e_compress.study.study_blocks import StudyBlock
+from me2e_compress.study.definition import StudyBlock
 from me2e_compress.workflows.result import SILENT
 from tests.benchmarks.paper.made import write_records
 from tests.command import write_frames

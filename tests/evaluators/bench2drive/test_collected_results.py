@@ -80,26 +80,17 @@ def test_the_evaluator_keeps_its_promises(tmp_path: Path) -> None:
     assert (len(first.frames), len(second.frames)) == (372, 0)
 
 
-def test_a_merged_file_beside_its_parts_counts_once(tmp_path: Path) -> None:
+def test_the_same_result_once_more_counts_once(tmp_path: Path) -> None:
+    again = {**GOOD, "save_name": "RouteScenario_1711_rep0_later"}
     write(tmp_path / "0.json", checkpoint({**GOOD, "index": 7}))
     write(tmp_path / "1.json", checkpoint(OTHER))
+    write(tmp_path / "2.json", checkpoint(again))
     write(tmp_path / "all.json", merged(GOOD, OTHER))
 
     found = collect(tmp_path)
 
     assert routes(found) == ["1711", "2082"]
     assert len(found.repeated) == 2
-    assert found.contradictory == ()
-
-
-def test_the_same_result_once_more_is_no_contradiction(tmp_path: Path) -> None:
-    again = {**GOOD, "save_name": "RouteScenario_1711_rep0_later"}
-    write(tmp_path / "first.json", checkpoint(GOOD))
-    write(tmp_path / "second.json", checkpoint(again))
-
-    found = collect(tmp_path)
-
-    assert found.repeated == ("RouteScenario_1711_rep0",)
     assert found.contradictory == ()
 
 
@@ -149,22 +140,15 @@ def test_repetitions_are_other_drives(tmp_path: Path) -> None:
     assert found.repeated == found.contradictory == ()
 
 
-def test_mixed_sets_are_named(tmp_path: Path) -> None:
-    write(tmp_path / "r.json", checkpoint(GOOD, OTHER, record(469, weather=None)))
+def test_sets_are_told_apart(tmp_path: Path) -> None:
+    write(tmp_path / "a" / "r.json", checkpoint(GOOD, OTHER, record(469, weather=None)))
+    write(tmp_path / "b" / "r.json", checkpoint(record(5)))
 
-    found = collect(tmp_path)
+    mixed, unknown = collect(tmp_path / "a"), collect(tmp_path / "b")
 
-    assert found.route_set == "0.0.3"
-    assert found.foreign == ("RouteScenario_469_rep0",)
-
-
-def test_routes_of_no_set(tmp_path: Path) -> None:
-    write(tmp_path / "r.json", checkpoint(record(5)))
-
-    found = collect(tmp_path)
-
-    assert found.route_set is None
-    assert found.missing == ()
+    assert mixed.route_set == "0.0.3"
+    assert mixed.foreign == ("RouteScenario_469_rep0",)
+    assert (unknown.route_set, unknown.missing) == (None, ())
 
 
 def test_what_is_broken_is_named_and_the_rest_read(tmp_path: Path) -> None:
@@ -205,9 +189,6 @@ def test_a_folder_of_nothing(tmp_path: Path, content: str, message: str) -> None
 
     with pytest.raises(EvaluationError, match=message):
         collect(tmp_path)
-
-
-def test_no_folder(tmp_path: Path) -> None:
     with pytest.raises(EvaluationError, match="no such folder"):
         collect(tmp_path / "nowhere")
 

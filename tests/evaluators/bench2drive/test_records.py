@@ -2,7 +2,7 @@ import math
 
 import pytest
 
-from me2e_compress.evaluators.bench2drive.records import (
+from me2e_compress.evaluators.bench2drive.result_files import (
     BrokenRecordError,
     number_of,
     read_record,

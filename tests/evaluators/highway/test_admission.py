@@ -41,24 +41,6 @@ def test_what_ships_is_admitted(route: object) -> None:
     assert len(verdict.blind) >= 2
 
 
-@pytest.mark.parametrize(
-    ("expert", "blind", "words"),
-    [
-        (FAILED, (FAILED,) * 3, "the expert commits: collisions_vehicle"),
-        (LATE, (FAILED,) * 3, "ends after 75 s: blocked"),
-        (BROKEN, (FAILED,) * 3, "ends after 1 s: ValueError: no"),
-        (replace(SOLVED, actors_crashed=True), (FAILED,) * 3, "two actors collide"),
-    ],
-)
-def test_why_a_route_is_refused(
-    expert: DryRun | None, blind: tuple[DryRun, ...], words: str
-) -> None:
-    verdict = Admission(route_of(), expert, blind)
-
-    assert not verdict.admitted
-    assert words in str(verdict.refusal)
-
-
 def test_a_route_without_its_event_is_refused() -> None:
     verdict = examine(route_of("VehicleOpensDoorTwoWays", 1, door_m=1000.0))
 
@@ -96,6 +78,10 @@ def test_every_type_and_attempt_has_a_seed_of_its_own() -> None:
 @pytest.mark.parametrize(
     ("expert", "blind", "again", "words"),
     [
+        (FAILED, (FAILED,) * 3, None, "the expert commits: collisions_vehicle"),
+        (LATE, (FAILED,) * 3, None, "ends after 75 s: blocked"),
+        (BROKEN, (FAILED,) * 3, None, "ends after 1 s: ValueError: no"),
+        (replace(SOLVED, actors_crashed=True), (FAILED,) * 3, None, "two actors coll"),
         (SOLVED, (SOLVED, FAILED, FAILED), SOLVED, None),
         (None, (SOLVED, LATE), None, "no infraction at 8 and 12 m/s"),
         (SOLVED, (FAILED,) * 3, FAILED, "with other traffic the expert commits"),
@@ -105,7 +91,7 @@ def test_every_type_and_attempt_has_a_seed_of_its_own() -> None:
         (None, (replace(FAILED, actors_crashed=True),), None, "two actors collide"),
     ],
 )
-def test_what_traffic_makes_of_a_verdict(
+def test_why_a_route_is_admitted_or_refused(
     expert: DryRun | None,
     blind: tuple[DryRun, ...],
     again: DryRun | None,

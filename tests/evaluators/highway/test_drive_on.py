@@ -5,24 +5,22 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from me2e_compress.evaluators import Drive
 from me2e_compress.evaluators.highway.blind import Blind
-from me2e_compress.evaluators.highway.conditions import ConditionOptions, Conditions
-from me2e_compress.evaluators.highway.drivers import BlindDriver
-from me2e_compress.evaluators.highway.results import fingerprint
 from me2e_compress.evaluators.highway.runner import drive
-from me2e_compress.evaluators.highway.worker import Job
 from me2e_compress.metrics.episode import COLLISIONS, Ending, Episode
 from me2e_compress.metrics.route_scores import route_score, score_to_first_collision
 from me2e_compress.simulator.routes import Route
 from me2e_compress.simulator.traffic.bodies import Contacts, EgoVehicle, depth
 from me2e_compress.simulator.traffic.network import Pose
+from tests.evaluators.highway.evaluations import made_by
 from tests.simulator.world.driving import route_of
 
-ON = Conditions(drive_on=True)
+ON = Drive(drive_on=True)
 
 
 def both(route: Route, speed_mps: float) -> tuple[Episode, Episode]:
-    ended = drive(route, Blind(speed_mps), Conditions())
+    ended = drive(route, Blind(speed_mps), Drive())
     return ended, drive(route, Blind(speed_mps), ON)
 
 
@@ -77,12 +75,10 @@ def test_it_is_written_only_of_drives_that_went_on(
 
 
 def test_the_option_is_a_condition_of_the_results() -> None:
-    route = route_of()
-    plain = fingerprint(Job(BlindDriver(), Conditions()), [route], 1)
-    went_on = fingerprint(Job(BlindDriver(), ON), [route], 1)
+    plain, went_on = made_by(drive=Drive()), made_by(drive=ON)
 
     assert {**plain, "drive_on": True} == went_on
-    assert ConditionOptions(drive_on=True).settings == ON
+    assert Drive.of_words(drive_on=True) == ON
 
 
 def ego(x: float, heading: float = 0.0) -> EgoVehicle:

@@ -1,40 +1,36 @@
 import json
+import re
 import shutil
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 
-from me2e_compress.driving.contract import Evaluator
 from me2e_compress.driving.latency import FixedLatency, MeasuredLatency
-from me2e_compress.driving.realtime import LatencyModel
 from me2e_compress.errors import EvaluationError
-from me2e_compress.evaluators.highway.conditions import Conditions
+from me2e_compress.evaluators import Drive
 from me2e_compress.evaluators.highway.drivers import BlindDriver, OnnxDriver
 from me2e_compress.evaluators.highway.engine import LocalEngine
-from me2e_compress.evaluators.highway.evaluator import (
-    DrivingProgress,
-    HighwayEvaluator,
-    longest_first,
-)
-from me2e_compress.evaluators.highway.results import ResultsFolder
-from me2e_compress.evaluators.highway.worker import Job
+from me2e_compress.evaluators.highway.evaluator import longest_first
+from me2e_compress.evaluators.results import ResultsFolder
 from me2e_compress.registry.drafts import is_marked
 from me2e_compress.simulator.routes import Route
+from me2e_compress.workflows.result import Listener
 from tests.command import contents
 from tests.evaluators.highway.drivers import CROSSING, EXIT, GREEN, PARKED, ROUTES
-from tests.evaluators.highway.evaluations import BLIND, evaluator, made_by
+from tests.evaluators.highway.evaluations import TRACED, driven, made_by
 
 TWO = (CROSSING, PARKED)
-FASTER = Job(BlindDriver(9.0), BLIND.conditions)
+FASTER = BlindDriver(9.0)
 
 
 @pytest.fixture(scope="module")
 def driven_once(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     """Two routes at 8 and at 9 m/s; take copies."""
     made = tmp_path_factory.mktemp("driven")
-    list(evaluator(made / "8", routes=TWO).episodes())
-    list(evaluator(made / "9", FASTER, TWO).episodes())
+    driven(made / "8", TWO)
+    driven(made / "9", TWO, FASTER)
     return made / "8", made / "9"
 
 
@@ -44,10 +40,10 @@ def results(driven_once: tuple[Path, Path], tmp_path: Path) -> Path:
 
 
 def test_the_bytes_do_not_depend_on_the_number_of_workers(tmp_path: Path) -> None:
-    judged: list[Evaluator] = [
-        evaluator(tmp_path / str(workers), workers=workers) for workers in (1, 2)
-    ]
-    one, two = (tuple(each.episodes()) for each in judged)
+    one, two = (
+        driven(tmp_path / str(workers), engine=LocalEngine(workers))
+        for workers in (1, 2)
+    )
 
     assert one == two
     assert [episode.route for episode in one] == [route.id for route in ROUTES]
@@ -56,7 +52,7 @@ def test_the_bytes_do_not_depend_on_the_number_of_workers(tmp_path: Path) -> Non
 
 
 def test_wall_clock_times_lie_beside_the_folder(tmp_path: Path) -> None:
-    list(evaluator(tmp_path / "results", routes=(PARKED,)).episodes())
+    driven(tmp_path / "results", (PARKED,))
 
     assert is_marked(tmp_path / "results.log")
     [line] = (tmp_path / "results.log").read_text().splitlines()
@@ -69,17 +65,17 @@ def test_wall_clock_times_lie_beside_the_folder(tmp_path: Path) -> None:
 
 
 def test_finished_routes_are_not_driven_again(results: Path) -> None:
-    reports = list[DrivingProgress]()
+    reports = list[tuple[str, int, int, str]]()
     before = contents(results)
     ages = {path: path.stat().st_mtime_ns for path in results.rglob("*.json")}
-    again = HighwayEvaluator(BLIND, TWO, results, 220, on_progress=reports.append)
+    listener = Listener(lambda *report: reports.append(report))
 
-    episodes = tuple(again.episodes())
+    episodes = driven(results, TWO, listener=listener)
 
     assert [episode.route for episode in episodes] == ["crossing", "parked"]
     assert contents(results) == before
     assert {path: path.stat().st_mtime_ns for path in ages} == ages
-    assert [(report.done, report.total) for report in reports] == [(2, 2)]
+    assert [report[:3] for report in reports] == [("evaluate", 2, 2)]
 
 
 def test_a_folder_of_something_else_is_refused(tmp_path: Path) -> None:
@@ -88,7 +84,7 @@ def test_a_folder_of_something_else_is_refused(tmp_path: Path) -> None:
     (folder / "thesis.tex").write_text("years of work")
 
     with pytest.raises(EvaluationError, match=r"/thesis: not empty, and holds no eval"):
-        ResultsFolder.create(folder, made_by(evaluator(folder)))
+        ResultsFolder.create(folder, made_by())
     assert list(contents(folder)) == ["thesis.tex"]
 
 
@@ -97,26 +93,9 @@ def test_what_a_kill_left_at_the_beginning_does_not_matter(
     tmp_path: Path, left: str
 ) -> None:
     (tmp_path / "results" / left).mkdir(parents=True)
-    folder = ResultsFolder.create(tmp_path / "results", made_by(evaluator(tmp_path)))
+    folder = ResultsFolder.create(tmp_path / "results", made_by())
 
     assert folder.episodes() == {}
-
-
-def test_a_folder_from_before_latency_models_dropped_decisions(
-    results: Path,
-) -> None:
-    manifest = results / "evaluation.json"
-    written = json.loads(manifest.read_text())
-    assert written.pop("latency_model") == "drop"
-    manifest.write_text(json.dumps(written))
-
-    made_now = made_by(evaluator(results, routes=TWO))
-    fifo = replace(BLIND.conditions, latency_model=LatencyModel.FIFO)
-    delayed = made_by(evaluator(results, Job(BlindDriver(), fifo), TWO))
-
-    assert ResultsFolder.create(results, made_now).made_by == written
-    with pytest.raises(EvaluationError, match=r'latency_model is "drop", .* "fifo"'):
-        ResultsFolder.create(results, delayed)
 
 
 def test_a_corrupt_file_is_named_and_driven_again(results: Path) -> None:
@@ -124,9 +103,8 @@ def test_a_corrupt_file_is_named_and_driven_again(results: Path) -> None:
     before = contents(results)
     spoiled = results / "routes" / "parked.json"
     spoiled.write_bytes(before["routes/parked.json"][:1000])
-    again = HighwayEvaluator(BLIND, TWO, results, 220, on_warning=warnings.append)
 
-    list(again.episodes())
+    driven(results, TWO, listener=Listener(on_warning=warnings.append))
 
     assert contents(results) == before
     assert [str(spoiled) in line for line in warnings] == [True]
@@ -138,44 +116,45 @@ def test_a_file_of_another_evaluation_is_driven_again(
     before = contents(results)
     shutil.copy(driven_once[1] / "routes" / "parked.json", results / "routes")
 
-    list(evaluator(results, routes=TWO).episodes())
+    driven(results, TWO)
 
     assert contents(results) == before
 
 
 @pytest.mark.parametrize(
-    ("job", "routes", "key"),
+    ("changed", "key"),
     [
-        (FASTER, TWO, "policy"),
-        (Job(BlindDriver(), Conditions(FixedLatency(1))), TWO, "latency"),
-        (Job(BlindDriver(), BLIND.conditions, 5.0), TWO, "frame_limit_s"),
-        (BLIND, (PARKED, EXIT), "routes"),
-        (BLIND, (Route("crossing", "HighwayExit", "Merging", 1), PARKED), "routes_sh"),
+        ({"policy": FASTER}, "policy"),
+        ({"drive": replace(TRACED, latency=FixedLatency(1))}, "latency"),
+        ({"drive": replace(TRACED, drive_on=True)}, "drive_on is false, this one's tr"),
+        ({"drive": replace(TRACED, frame_limit_s=5.0)}, "frame_limit_s"),
+        ({"routes": (PARKED, EXIT)}, "routes"),
+        (
+            {"routes": (Route("crossing", "HighwayExit", "Merging", 1), PARKED)},
+            "routes_sha256",
+        ),
     ],
 )
 def test_results_of_another_evaluation_are_not_mixed(
-    results: Path, job: Job, routes: tuple[Route, ...], key: str
+    results: Path, changed: dict[str, Any], key: str
 ) -> None:
     before = contents(results)
 
     with pytest.raises(EvaluationError, match=f"another evaluation: its {key}"):
-        list(evaluator(results, job, routes).episodes())
+        driven(results, **{"routes": TWO} | changed)
     assert contents(results) == before
 
 
 def test_measured_latency_drives_alone_and_warns(tmp_path: Path) -> None:
     warnings = list[str]()
-    job = Job(BlindDriver(), Conditions(MeasuredLatency(1000.0)))
-    measured = HighwayEvaluator(
-        job,
-        (PARKED, EXIT),
-        tmp_path / "results",
-        220,
-        LocalEngine(2),
-        on_warning=warnings.append,
-    )
 
-    episodes = tuple(measured.episodes())
+    episodes = driven(
+        tmp_path / "results",
+        (PARKED, EXIT),
+        drive=Drive(MeasuredLatency(1000.0)),
+        engine=LocalEngine(2),
+        listener=Listener(on_warning=warnings.append),
+    )
 
     assert len(warnings) == 1
     assert "one at a time" in warnings[0]
@@ -186,11 +165,7 @@ def test_measured_latency_drives_alone_and_warns(tmp_path: Path) -> None:
 
 def test_unknown_policies_are_refused_before_driving(tmp_path: Path) -> None:
     with pytest.raises(EvaluationError, match=r"policy missing.onnx: no such file"):
-        list(
-            evaluator(
-                tmp_path / "r", Job(OnnxDriver(Path("missing.onnx")), Conditions())
-            ).episodes()
-        )
+        driven(tmp_path / "r", policy=OnnxDriver(Path("missing.onnx")))
     assert not (tmp_path / "r").exists()
 
 
@@ -202,13 +177,11 @@ def test_long_types_begin_in_whatever_order_they_come() -> None:
 
 
 def test_progress_runs_with_the_scores(tmp_path: Path) -> None:
-    reports = list[DrivingProgress]()
-    one = HighwayEvaluator(
-        BLIND, (PARKED, GREEN), tmp_path / "r", 220, on_progress=reports.append
-    )
-    list(one.episodes())
+    reports = list[tuple[str, int, int, str]]()
+    listener = Listener(lambda *report: reports.append(report))
 
-    assert reports[0] == DrivingProgress(0, 2, None, None)
-    assert [report.done for report in reports] == [0, 1, 2]
-    assert reports[-1].driving_score is not None
-    assert 0.0 < reports[-1].driving_score < 100.0
+    driven(tmp_path / "r", (PARKED, GREEN), listener=listener)
+
+    assert reports[0] == ("evaluate", 0, 2, "")
+    assert [done for _, done, *_ in reports] == [0, 1, 2]
+    assert re.fullmatch(r"DS [1-9]\d\.\d  SR \d+\.\d %", reports[-1][3])

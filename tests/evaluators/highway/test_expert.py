@@ -10,9 +10,9 @@ from hypothesis import strategies as st
 from me2e_compress.evaluators.highway.expert.expert_policy import (
     ExpertDecision,
     Memory,
+    ceiling,
     decide,
 )
-from me2e_compress.evaluators.highway.expert.speed_limits import ceiling
 from me2e_compress.simulator.scene import (
     ActorKind,
     Scene,

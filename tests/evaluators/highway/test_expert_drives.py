@@ -5,8 +5,12 @@ import pytest
 
 from me2e_compress.driving.realtime import HeldControl
 from me2e_compress.evaluators.highway.controller import AnchoredPlan
-from me2e_compress.evaluators.highway.expert.expert_policy import Expert, Memory, decide
-from me2e_compress.evaluators.highway.expert.speed_limits import ceiling
+from me2e_compress.evaluators.highway.expert.expert_policy import (
+    Expert,
+    Memory,
+    ceiling,
+    decide,
+)
 from me2e_compress.evaluators.highway.generate import dry_run
 from me2e_compress.simulator.plane_geometry import Floats
 from me2e_compress.simulator.routes import SCENARIO_ABILITIES, Route

@@ -5,19 +5,22 @@ import math
 import numpy as np
 import pytest
 
+from me2e_compress.evaluators.highway.expert.expert_policy import (
+    LATERAL_MPS2,
+    ceiling,
+    must_give_way,
+)
 from me2e_compress.evaluators.highway.expert.forecast import NOW_S, Forecast, forecast
-from me2e_compress.evaluators.highway.expert.future_costs import BESIDE_M, headway_cost
-from me2e_compress.evaluators.highway.expert.futures import sample
+from me2e_compress.evaluators.highway.expert.futures import (
+    BESIDE_M,
+    headway_cost,
+    sample,
+)
 from me2e_compress.evaluators.highway.expert.lateral_targets import (
     Options,
     Place,
     blocked_stretch,
     lateral_targets,
-)
-from me2e_compress.evaluators.highway.expert.speed_limits import (
-    LATERAL_MPS2,
-    ceiling,
-    must_give_way,
 )
 from me2e_compress.simulator.plane_geometry import RoutePath
 from me2e_compress.simulator.scene import Actor, ActorKind, Scene

@@ -11,17 +11,15 @@ from pathlib import Path
 
 import pytest
 
+from me2e_compress import EvaluateOptions, evaluate
 from me2e_compress.errors import EvaluationError
-from me2e_compress.evaluators.highway.conditions import Conditions
-from me2e_compress.evaluators.highway.drivers import BlindDriver
-from me2e_compress.evaluators.highway.evaluator import HighwayEvaluator
-from me2e_compress.evaluators.highway.results import ResultsFolder
-from me2e_compress.evaluators.highway.worker import Job
+from me2e_compress.evaluators import Drive
+from me2e_compress.evaluators.results import ResultsFolder
 from me2e_compress.metrics.episode import Ending, Episode
 from me2e_compress.simulator.routes import Route, save_routes
 from tests.command import contents
 from tests.evaluators.highway.drivers import CROSSING, EXIT, PARKED, MisbehavingDriver
-from tests.evaluators.highway.evaluations import evaluator, made_by
+from tests.evaluators.highway.evaluations import driven, made_by
 
 
 def test_a_killed_run_goes_on_with_nothing_lost_or_repeated(tmp_path: Path) -> None:
@@ -29,16 +27,8 @@ def test_a_killed_run_goes_on_with_nothing_lost_or_repeated(tmp_path: Path) -> N
     routes = tuple(Route(f"exit_{k}", "HighwayExit", "Merging", k) for k in range(4))
     save_routes(routes, manifest)
     program = (
-        "import sys; from pathlib import Path;"
-        "from me2e_compress.simulator.routes import load_routes;"
-        "from me2e_compress.evaluators.highway.evaluator import HighwayEvaluator;"
-        "from me2e_compress.evaluators.highway.engine import LocalEngine;"
-        "from me2e_compress.evaluators.highway.drivers import BlindDriver;"
-        "from me2e_compress.evaluators.highway.conditions import Conditions;"
-        "from me2e_compress.evaluators.highway.worker import Job;"
-        "routes = load_routes(Path(sys.argv[1]));"
-        "job = Job(BlindDriver(5.0), Conditions());"
-        "list(HighwayEvaluator(job, routes, Path(sys.argv[2]), 4).episodes())"
+        "import sys; from me2e_compress import EvaluateOptions, evaluate;"
+        "evaluate('blind:5', sys.argv[2], EvaluateOptions(routes=sys.argv[1]))"
     )
     command = [sys.executable, "-c", program, str(manifest), str(folder)]
     with subprocess.Popen(command, start_new_session=True) as running:
@@ -50,18 +40,16 @@ def test_a_killed_run_goes_on_with_nothing_lost_or_repeated(tmp_path: Path) -> N
     finished = {path.name: path.read_bytes() for path in written.glob("*.json")}
     assert 1 <= len(finished) < len(routes)
 
-    job = Job(BlindDriver(5.0), Conditions())
-    going_on = HighwayEvaluator(job, routes, folder, 4)
-    episodes = tuple(going_on.episodes())
+    options = EvaluateOptions(routes=str(manifest))
+    evaluate("blind:5", folder, options)
     log = (tmp_path / "results.log").read_text().splitlines()
-    driven = [json.loads(line)["route"] for line in log]
+    logged = [json.loads(line)["route"] for line in log]
 
-    assert [episode.route for episode in episodes] == [route.id for route in routes]
-    assert sorted(driven) == sorted(route.id for route in routes)
+    assert sorted(logged) == sorted(route.id for route in routes)
     now = contents(folder)
     assert all(now[f"routes/{name}"] == data for name, data in finished.items())
     undisturbed = tmp_path / "undisturbed"
-    list(HighwayEvaluator(job, routes, undisturbed, 4).episodes())
+    evaluate("blind:5", undisturbed, options)
     assert contents(undisturbed) == now
 
 
@@ -69,8 +57,8 @@ def test_a_full_disk_is_one_line_and_nothing_half_written(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     folder = tmp_path / "results"
-    full = evaluator(folder, routes=(CROSSING, PARKED))
-    ResultsFolder.create(folder, made_by(full))
+    two = (CROSSING, PARKED)
+    ResultsFolder.create(folder, made_by(two), 3)
 
     def no_space(descriptor: int) -> None:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
@@ -78,16 +66,16 @@ def test_a_full_disk_is_one_line_and_nothing_half_written(
     with monkeypatch.context() as patch:
         patch.setattr("me2e_compress.runtime.atomic.os.fsync", no_space)
         with pytest.raises(EvaluationError, match="the disk is full") as caught:
-            list(full.episodes())
+            driven(folder, two)
     assert "\n" not in str(caught.value)
     assert list(contents(folder)) == ["evaluation.json"]
 
-    assert len(list(full.episodes())) == 2
+    assert len(driven(folder, two)) == 2
 
 
 def failed(folder: Path, way: str, limit_s: float = 60.0) -> tuple[Episode, ...]:
-    job = Job(MisbehavingDriver(way), Conditions(), limit_s)
-    return tuple(evaluator(folder, job, (EXIT, PARKED)).episodes())
+    drive = Drive(frame_limit_s=limit_s)
+    return driven(folder, (EXIT, PARKED), MisbehavingDriver(way), drive)
 
 
 def test_a_policy_that_hangs_fails_and_the_run_goes_on(tmp_path: Path) -> None:

@@ -6,7 +6,7 @@ import pytest
 
 from me2e_compress.driving.onnx_policy import OnnxPolicy
 from me2e_compress.errors import EvaluationError
-from me2e_compress.evaluators.highway.conditions import Conditions
+from me2e_compress.evaluators import Drive
 from me2e_compress.evaluators.highway.drivers import OnnxDriver, image_size_of
 from me2e_compress.evaluators.highway.runner import drive
 from me2e_compress.metrics.episode import Ending
@@ -20,7 +20,7 @@ IMAGE = {"me2e.image": json.dumps(NORM)}
 def test_a_model_drives(tmp_path: Path) -> None:
     policy = OnnxPolicy.open(straight_on(tmp_path / "m.onnx"))
 
-    episode = drive(PARKED, policy, Conditions())
+    episode = drive(PARKED, policy, Drive())
 
     assert not policy.needs_images
     assert episode.failure is None
@@ -179,7 +179,7 @@ def test_not_a_number_at_work_fails_the_route(tmp_path: Path) -> None:
         initializers=", float[1] one = {1.0}, float[1] limit = {9.5}",
     )
 
-    episode = drive(EXIT, OnnxPolicy.open(model), Conditions())
+    episode = drive(EXIT, OnnxPolicy.open(model), Drive())
 
     assert episode.ending is Ending.POLICY_FAILED
     assert episode.failure == "the plan is not finite"

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from me2e_compress.evaluators.highway.rectangles import (
+from me2e_compress.evaluators.highway.conflict_recorder import (
     contact_times,
     corners,
     gaps,

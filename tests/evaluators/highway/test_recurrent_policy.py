@@ -10,7 +10,7 @@ from me2e_compress.driving.adapter import Adapter
 from me2e_compress.driving.contract import Observation, Plan, RouteInfo
 from me2e_compress.driving.onnx_policy import OnnxPolicy
 from me2e_compress.errors import EvaluationError
-from me2e_compress.evaluators.highway.conditions import Conditions
+from me2e_compress.evaluators import Drive
 from me2e_compress.evaluators.highway.runner import drive
 from tests.evaluators.highway.asked import observation, planned
 from tests.evaluators.highway.drivers import EXIT, straight_on
@@ -86,7 +86,7 @@ def test_the_clock_starts_with_the_route(tmp_path: Path) -> None:
     model = straight_on(tmp_path / "m.onnx", **clock)  # type: ignore[arg-type]
     policy = Listening(OnnxPolicy.open(model))
 
-    episode = drive(EXIT, policy, Conditions())
+    episode = drive(EXIT, policy, Drive())
 
     decided = [decision.time_us / 1e6 for decision in episode.decisions]
     assert policy.heard == pytest.approx(decided)

@@ -10,8 +10,8 @@ import pytest
 from me2e_compress.driving.contract import Observation, PedalsAndWheel, RouteInfo
 from me2e_compress.driving.latency import FixedLatency, parse_latency
 from me2e_compress.errors import EvaluationError
+from me2e_compress.evaluators import Drive
 from me2e_compress.evaluators.highway.blind import Blind
-from me2e_compress.evaluators.highway.conditions import Conditions
 from me2e_compress.evaluators.highway.expert.expert_policy import Expert
 from me2e_compress.evaluators.highway.observe import can_bus_of, road_users
 from me2e_compress.evaluators.highway.runner import Listeners, drive
@@ -27,7 +27,7 @@ from tests.evaluators.highway.drivers import (
     Misbehaving,
 )
 
-IDEAL = Conditions()
+IDEAL = Drive()
 
 
 @dataclass
@@ -39,6 +39,7 @@ class Standing:
     plans: float = 0.0
     seen: list[Observation] = field(default_factory=list)
     resets: int = 0
+    image_size: tuple[int, int] = (16, 16)
 
     def reset(self, route: RouteInfo) -> None:
         self.resets += 1
@@ -87,7 +88,7 @@ def test_standing_still_is_blocked_after_a_minute() -> None:
 
 
 def test_the_same_route_drives_the_same() -> None:
-    slow = Conditions(FixedLatency(250_000))
+    slow = Drive(FixedLatency(250_000))
 
     assert drive(EXIT, Expert(), slow) == drive(EXIT, Expert(), slow)
 
@@ -105,7 +106,7 @@ def test_the_same_route_drives_the_same() -> None:
 def test_decisions_come_as_often_as_equation_4_lets_them(
     latency_us: int, dt_us: int, period_us: int
 ) -> None:
-    episode = drive(PARKED, Blind(), Conditions(FixedLatency(latency_us), dt_us))
+    episode = drive(PARKED, Blind(), Drive(FixedLatency(latency_us), dt_us))
 
     times = [decision.time_us for decision in episode.decisions]
     assert times == list(range(0, times[-1] + 1, period_us))
@@ -116,7 +117,7 @@ def test_decisions_come_as_often_as_equation_4_lets_them(
 def test_a_late_control_acts_late() -> None:
     """Equation 4 at 0.15 s: n = 2, so the first control acts in frame 3."""
     prompt, late = (
-        drive(PARKED, Standing(), Conditions(FixedLatency(latency)))
+        drive(PARKED, Standing(), Drive(FixedLatency(latency)))
         for latency in (0, 150_000)
     )
 
@@ -159,9 +160,9 @@ def test_a_policy_that_cannot_reset_has_failed() -> None:
 
 def test_a_policy_sees_what_it_may() -> None:
     plain, seeing = Standing(plans=8.0), Standing(needs_images=True, plans=8.0)
-    short = Conditions(image_size=(32, 48))
-    drive(PARKED, plain, short)
-    drive(PARKED, seeing, short)
+    seeing.image_size = (32, 48)
+    drive(PARKED, plain, IDEAL)
+    drive(PARKED, seeing, IDEAL)
 
     first = plain.seen[0]
     assert (first.images, first.scene, first.world) == (None, None, None)
@@ -175,7 +176,7 @@ def test_a_policy_sees_what_it_may() -> None:
 
 def test_the_can_bus_counts_from_decision_to_decision() -> None:
     policy = Standing(plans=8.0)
-    drive(PARKED, policy, Conditions(FixedLatency(200_000)))
+    drive(PARKED, policy, Drive(FixedLatency(200_000)))
     first, second = policy.seen[:2]
 
     assert not first.can_bus[[0, 1, 2, 17]].any()
@@ -202,7 +203,7 @@ def test_the_layout_of_the_can_bus() -> None:
 
 def test_a_step_must_divide_50_ms() -> None:
     with pytest.raises(EvaluationError, match="a step of 30 ms"):
-        Conditions(dt_us=30_000)
+        Drive(dt_us=30_000)
 
 
 @dataclass
@@ -223,7 +224,7 @@ class Pressing:
 def test_a_policy_of_controls_drives_and_shows_no_plan() -> None:
     """Full throttle is 4 m/s2; the latency holds for it as for a plan."""
     moments = list[Moment]()
-    late = Conditions(FixedLatency(150_000), image_size=(16, 16))
+    late = Drive(FixedLatency(150_000))
     policy = Pressing(PedalsAndWheel(1.0, 0.0, 0.0))
 
     episode = drive(PARKED, policy, late, Listeners(on_moment=moments.append))
@@ -239,21 +240,20 @@ def test_a_policy_of_controls_drives_and_shows_no_plan() -> None:
 
 def test_watching_changes_nothing() -> None:
     moments = list[Moment]()
-    small = Conditions(image_size=(16, 16))
-    watched = drive(PARKED, Blind(), small, Listeners(on_moment=moments.append))
+    watched = drive(PARKED, Blind(), IDEAL, Listeners(on_moment=moments.append))
 
-    assert watched == drive(PARKED, Blind(), small)
+    assert watched == drive(PARKED, Blind(), IDEAL)
     assert len(moments) == len(watched.frames)
     assert moments[-1].events
     images = moments[0].images
     assert images is not None
-    assert images.shape == (6, 16, 16, 3)
+    assert images.shape == (6, 96, 160, 3)
 
 
 def test_a_held_plan_stays_where_it_was_made() -> None:
     """Seen from an ego that has moved on, its waypoints come nearer."""
     moments = list[Moment]()
-    slow = Conditions(FixedLatency(500_000), image_size=(16, 16))
+    slow = Drive(FixedLatency(500_000))
     drive(PARKED, Standing(plans=8.0), slow, Listeners(on_moment=moments.append))
     first, later = moments[0], moments[9]
     assert first.plan is not None
@@ -267,7 +267,7 @@ def test_a_held_plan_stays_where_it_was_made() -> None:
 
 def test_a_latency_may_depend_on_who_is_in_view() -> None:
     source = parse_latency("agents{source=fps:20, per_agent_us=1, range_m=20}")
-    one, other = (drive(PARKED, Blind(), Conditions(source)) for _ in range(2))
+    one, other = (drive(PARKED, Blind(), Drive(source)) for _ in range(2))
 
     taken = {decision.latency_us for decision in one.decisions}
     assert 50_000 in taken

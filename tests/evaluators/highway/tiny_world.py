@@ -6,8 +6,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from me2e_compress.evaluators.highway.controller import AnchoredPlan
-from me2e_compress.evaluators.highway.expert.expert_policy import Memory, decide
-from me2e_compress.evaluators.highway.expert.speed_limits import ceiling
+from me2e_compress.evaluators.highway.expert.expert_policy import (
+    Memory,
+    ceiling,
+    decide,
+)
 from me2e_compress.simulator.bicycle import advance
 from me2e_compress.simulator.plane_geometry import (
     Command,

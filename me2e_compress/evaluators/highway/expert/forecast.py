@@ -84,7 +84,12 @@ def forecast(
     actors = near(scene)
     plans = [intents.get(actor.id) for actor in actors]
     # speeds and distances of all, then where these take each, [A, 3, T]
-    goal = np.array([_goal(a, p) for a, p in zip(actors, plans, strict=True)])
+    goal = np.array(
+        [
+            actor.speed_mps if plan is None else plan.target_mps
+            for actor, plan in zip(actors, plans, strict=True)
+        ]
+    )
     speed, travel = _speeds(actors, plans, goal)
     ways = [_moved(*each) for each in zip(actors, plans, travel, strict=True)]
     poses = np.array(ways).reshape(len(actors), 3, len(NOW_S))
@@ -104,10 +109,6 @@ def forecast(
         lateral_m=lateral,
         away=away,
     )
-
-
-def _goal(actor: Actor, plan: Intent | None) -> float:
-    return actor.speed_mps if plan is None else plan.target_mps
 
 
 def _speeds(
@@ -143,15 +144,12 @@ def _speeds(
 
 def _moved(actor: Actor, plan: Intent | None, travel: Floats) -> Floats:
     """Return [3, T] x, y and heading: on its way, or straight on without one."""
-    if plan is not None and len(plan.path) > 1:
-        return _along(actor, plan.path, travel)
-    x = actor.x + travel * np.cos(actor.heading)
-    y = actor.y + travel * np.sin(actor.heading)
-    return np.stack([x, y, np.full_like(x, actor.heading)])
-
-
-def _along(actor: Actor, line: Floats, travel: Floats) -> Floats:
-    """Return [3, T] x, y and heading on a line that begins at the actor."""
+    if plan is None or len(plan.path) <= 1:
+        x = actor.x + travel * np.cos(actor.heading)
+        y = actor.y + travel * np.sin(actor.heading)
+        return np.stack([x, y, np.full_like(x, actor.heading)])
+    # its way begins at the actor
+    line = plan.path
     steps = line[1:] - line[:-1]
     arc = np.concatenate([[0.0], np.cumsum(np.hypot(steps[:, 0], steps[:, 1]))])
     headings = np.arctan2(steps[:, 1], steps[:, 0])

@@ -5,9 +5,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from me2e_compress.evaluators.highway.expert.forecast import TIMES_S, Flags
-from me2e_compress.evaluators.highway.expert.lateral_targets import Options, Place
-from me2e_compress.evaluators.highway.reentry import beyond, reentry
+from me2e_compress.evaluators.highway.controller import beyond, reentry
+from me2e_compress.evaluators.highway.expert.forecast import TIMES_S, Flags, Forecast
+from me2e_compress.evaluators.highway.expert.lateral_targets import (
+    SLOW_MPS,
+    Options,
+    Place,
+)
 from me2e_compress.simulator.plane_geometry import Floats, RoutePath
 from me2e_compress.simulator.scene import Ego
 from me2e_compress.simulator.traffic.bodies import ACCELERATION_LAG_S
@@ -70,7 +74,13 @@ def sample(
     repeat, count = len(options.target_m), len(rates)
     along, speed = np.tile(along, (repeat, 1)), np.tile(speed, (repeat, 1))
     target = np.repeat(options.target_m, count)
-    lateral = _laterals(place, along - place.s_m, target)
+    # offsets on the way to a target
+    share = np.sqrt(np.abs(target - place.lateral_m) / FULL_CHANGE_M)
+    seconds = CHANGE_S * np.clip(share, 0.6, 1.2)
+    shortest = SHORTEST_CHANGE_M * np.maximum(share, 0.6)
+    length = np.maximum(place.speed_mps * seconds, shortest)
+    travel, slope = along - place.s_m, place.slope
+    lateral = reentry(travel, place.lateral_m, slope, target, length)
     x, y, heading = beyond(path, along, lateral)
     # body heading: course minus slip angle
     moved = np.diff(along, axis=1, prepend=place.s_m)
@@ -104,11 +114,215 @@ def _speeds(top: Floats, place: Place, rates: Floats) -> tuple[Floats, Floats]:
     return np.stack(alongs, axis=1), np.stack(speeds, axis=1)
 
 
-def _laterals(place: Place, travel: Floats, target: Floats) -> Floats:
-    """Return [K, T] offsets on the way to a lateral target."""
-    share = np.sqrt(np.abs(target - place.lateral_m) / FULL_CHANGE_M)
-    seconds = CHANGE_S * np.clip(share, 0.6, 1.2)
-    length = np.maximum(
-        place.speed_mps * seconds, SHORTEST_CHANGE_M * np.maximum(share, 0.6)
+COLLISION, NEAR_MISS, CUT_OFF = 200.0, 8.0, 30.0
+FADE = np.exp(-TIMES_S / 3.0)
+"""[18] weights: later times weigh less."""
+MARGIN_M, NEAR_M = 0.35, 1.3
+"""Clearances that are enforced, and that are preferred."""
+CORNER_M = 0.1
+"""Added to the discs, which miss 0.41 m at the corners of the ego; less than
+`MARGIN_M` remains."""
+SWEEP_S = 0.12
+"""Every box is this much longer at both ends, since the times are 0.25 s apart."""
+REACH_M = 12.0
+"""Half of two long vehicles and the margins; actors farther away are skipped."""
+PRIORITY_S = 1.3
+"""The way of a moving car is kept free for this time ahead of its bumper."""
+
+
+def collision_cost(
+    future: SampledFutures, seen: Forecast, ego: Ego, place: Place
+) -> Floats:
+    """Return the [K] cost of touching, nearly touching, or cutting off an actor.
+
+    The ego is four discs of its width; an actor is its rectangle, extended in front by
+    its travel in `PRIORITY_S`. Followers in the ego's own lane are ignored.
+    """
+    # actors that come near any future of the ego
+    margin = REACH_M + PRIORITY_S * seen.speed_mps[:, 1:]
+    reach = np.ones_like(margin, bool)
+    for mine, other in ((future.x, seen.x), (future.y, seen.y)):
+        reach &= other[:, 1:] + margin > np.min(mine, axis=0)
+        reach &= other[:, 1:] - margin < np.max(mine, axis=0)
+    others = ~followers(seen, ego, place) & reach.any(axis=1)
+    if not np.any(others):
+        return np.zeros(len(future.acceleration))
+    apart, cut = _clearances(future, seen, ego, others)
+    worst = COLLISION * _worst(apart, MARGIN_M)
+    worst += NEAR_MISS * _worst(apart, NEAR_M) + CUT_OFF * _worst(cut, MARGIN_M)
+    return np.asarray(np.sum(worst, axis=0))
+
+
+def followers(seen: Forecast, ego: Ego, place: Place) -> Flags:
+    """Return [A] whether an actor follows the ego in a lane that the ego is in."""
+    aligned = np.cos(seen.away[:, 0]) > 0.5
+    apart = np.abs(seen.lateral_m[:, 0] - place.lateral_m)
+    beside = apart < seen.half_breadth[:, 0] + ego.width / 2
+    behind = seen.along_m[:, 0] < place.s_m
+    return np.asarray(aligned & beside & behind & seen.yields)
+
+
+def _worst(clearance: Floats, margin: float) -> Floats:
+    """Return [A, K] the largest faded intrusion into a margin, 0 to 1."""
+    inside = np.clip((margin - clearance) / margin, 0.0, 1.0)
+    return np.asarray(np.max(inside * FADE, axis=-1))
+
+
+def _clearances(
+    future: SampledFutures, seen: Forecast, ego: Ego, others: Flags
+) -> tuple[Floats, Floats]:
+    """Return [A, K, T] metres from the ego to each actor, and to its way ahead."""
+    # sizes of the ego's discs and of the actors' boxes
+    radius = ego.width / 2 + CORNER_M
+    reach = (ego.length - ego.width) / 2 + SWEEP_S * future.speed_mps
+    x, y, heading, speed = (
+        column[others, None, 1:]
+        for column in (seen.x, seen.y, seen.heading, seen.speed_mps)
     )
-    return reentry(travel, place.lateral_m, place.slope, target, length)
+    cos, sin = np.cos(heading), np.sin(heading)
+    half_length = seen.length[others, None, None] / 2 + SWEEP_S * speed
+    half_width = seen.width[others, None, None] / 2
+    front = half_length + speed * PRIORITY_S * seen.moves[others, None, None]
+    # squared distances from each disc, the smallest counts
+    shift = reach * np.stack([np.cos(future.heading), np.sin(future.heading)])
+    apart = np.full((len(x), *future.x.shape), np.inf)
+    cut = apart.copy()
+    for disc in (-1.0, -1 / 3, 1 / 3, 1.0):
+        dx = (future.x + disc * shift[0])[None] - x
+        dy = (future.y + disc * shift[1])[None] - y
+        ahead, side = cos * dx, cos * dy
+        ahead += sin * dy
+        side -= sin * dx
+        side = _squared_beyond(np.abs(side, out=side), half_width)
+        # in place: these arrays are most of what a decision takes
+        way = np.maximum(ahead - front, -half_length - ahead)
+        way = _squared_beyond(way, 0.0)
+        end = _squared_beyond(np.abs(ahead, out=ahead), half_length)
+        end += side
+        way += side
+        np.minimum(apart, end, out=apart)
+        np.minimum(cut, way, out=cut)
+    return np.sqrt(apart) - radius, np.sqrt(cut) - radius
+
+
+def _squared_beyond(away: Floats, half: Floats | float) -> Floats:
+    """Return the squares of what exceeds a half extent, in place."""
+    away -= half
+    np.maximum(away, 0.0, out=away)
+    away *= away
+    return away
+
+
+OFF_ROAD, RUN_LINE, WRONG_SIDE, HEADWAY = 120.0, 500.0, 1.5, 24.0
+PROGRESS_PER_M, SPEED_PER_MPS = 0.40, 0.8
+OFFSET_PER_M, NUDGE_PER_M, SWITCH = 0.6, 0.3, 3.0
+BRAKE_HARD, EFFORT, JERK = 3.0, 0.4, 0.15
+LANE_CHANGE_M = 1.6
+"""Targets farther apart than this are different lanes."""
+STANDOFF_M, GAP_S = 2.0, 0.8
+"""Distance kept to a leader: standing, and seconds of travel."""
+SWING_OUT_M = 8.0
+"""Standing distance to an obstacle that has to be driven around."""
+BESIDE_M = 0.3
+"""An actor that is passed with less room than this is a leader."""
+EMERGENCY, EMERGENCY_PER_MPS, EMERGENCY_SHARE, EMERGENCY_M = 60.0, 4.0, 0.35, 60.0
+"""Staying in the way of an emergency vehicle that is this near behind, or driving
+faster than this share of its speed."""
+
+
+def rule_cost(
+    future: SampledFutures,
+    path: RoutePath,
+    ego: Ego,
+    place: Place,
+    stop_m: float | None,
+) -> Floats:
+    """Return the [K] cost of leaving the road, the wrong side, and stop lines.
+
+    An ego that is already off the road pays only for going farther.
+    """
+    # edges of the road along each future
+    half = ego.width / 2 - 0.05
+    metre = np.clip(np.rint(future.along_m).astype(np.int64), 0, len(path.left_m) - 1)
+    left, both, right = path.left_m[metre], path.oncoming_m[metre], path.right_m[metre]
+    edge = np.where(future.oncoming[:, None], both, left)
+    over = np.maximum(future.lateral_m + half - both, -right - future.lateral_m + half)
+    # how far off the road the ego already is
+    already = max(
+        place.lateral_m + half - float(path.value(path.oncoming_m, place.s_m)),
+        half - place.lateral_m - float(path.value(path.right_m, place.s_m)),
+        0.0,
+    )
+    wrong = np.clip(future.lateral_m + half - edge, 0.0, 1.0)
+    # road edge, oncoming lane, stop line
+    cost = OFF_ROAD * np.max(np.clip(over - already, 0.0, 1.0) * FADE, axis=1)
+    cost += WRONG_SIDE * np.sum(wrong * FADE, axis=1)
+    if stop_m is not None:
+        cost += RUN_LINE * (np.max(future.along_m, axis=1) > stop_m + 0.25)
+    return np.asarray(cost)
+
+
+def headway_cost(
+    future: SampledFutures, seen: Forecast, ego: Ego, place: Place, passable: bool
+) -> Floats:
+    """Return the [K] cost of driving too close to a leader or an obstacle.
+
+    On a passable road a slow leader is followed with room to swing out.
+    """
+    # leaders: actors ahead in the ego's way, among those that can be
+    room = seen.half_breadth[:, 1:] + ego.width / 2 + BESIDE_M
+    sideways = seen.lateral_m[:, 1:]
+    inside = sideways + room > np.min(future.lateral_m)
+    inside &= sideways - room < np.max(future.lateral_m)
+    inside &= seen.along_m[:, 1:] > np.min(future.along_m)
+    may = inside.any(axis=1) & ~followers(seen, ego, place)
+    along, lateral = (part[may, None, 1:] for part in (seen.along_m, seen.lateral_m))
+    ahead = along - future.along_m[None]
+    leads = np.abs(lateral - future.lateral_m[None]) < room[may, None]
+    leads &= ahead > 0
+    gap = ahead - seen.half_span[may, None, 1:] - ego.length / 2
+    # the gap that is missing, of the worst leader
+    slow = (np.max(seen.speed_mps[may], axis=1) < SLOW_MPS)[:, None, None]
+    standing = np.where(slow & passable, SWING_OUT_M, STANDOFF_M)
+    wanted = standing + GAP_S * future.speed_mps[None]
+    short = np.where(leads, np.clip((wanted - gap) / wanted, 0.0, 1.2), 0.0)
+    closest = np.max(short, axis=0, initial=0.0)
+    return np.asarray(HEADWAY * np.mean(closest, axis=1))
+
+
+def emergency_cost(
+    future: SampledFutures, seen: Forecast, ego: Ego, place: Place
+) -> Floats:
+    """Return the [K] cost of holding up an emergency vehicle from behind.
+
+    The ego first leaves its lane, then slows down.
+    """
+    # emergency vehicles close behind
+    behind = place.s_m - seen.along_m[:, 0]
+    urgent = seen.emergency & (behind > -ego.length) & (behind < EMERGENCY_M)
+    urgent &= (np.cos(seen.away[:, 0]) > 0.5) & (seen.speed_mps[:, 0] > SLOW_MPS)
+    if not np.any(urgent):
+        return np.zeros(len(future.acceleration))
+    # cost of blocking their lane, and of not slowing down
+    lateral, speed = seen.lateral_m[urgent][:, -1], np.min(seen.speed_mps[urgent])
+    room = ego.width / 2 + seen.width[urgent] / 2 + BESIDE_M
+    blocked = np.abs(future.lateral_m[:, -1, None] - lateral) < room
+    hasty = np.maximum(future.speed_mps[:, -1] - EMERGENCY_SHARE * speed, 0.0)
+    return np.asarray(EMERGENCY * np.any(blocked, axis=1) + EMERGENCY_PER_MPS * hasty)
+
+
+def drive_cost(future: SampledFutures, ego: Ego, place: Place, kept_m: float) -> Floats:
+    """Return the [K] cost of little progress, effort, and changes of target."""
+    rate = future.acceleration
+    begun = (future.speed_mps[:, 1] - place.speed_mps) / 0.5
+    # progress and speed are gains
+    cost = -PROGRESS_PER_M * (future.along_m[:, -1] - place.s_m)
+    cost -= SPEED_PER_MPS * future.speed_mps[:, -1]
+    # effort and jerk
+    cost += EFFORT * np.abs(rate) + BRAKE_HARD * (rate < -3.5)
+    cost += JERK * np.abs(begun - ego.acceleration_mps2)
+    # offsets and changes of the lateral target
+    cost += OFFSET_PER_M * np.abs(future.target_m)
+    moved = np.abs(future.target_m - kept_m)
+    cost += np.where(moved > LANE_CHANGE_M, SWITCH, NUDGE_PER_M * moved)
+    return np.asarray(cost)

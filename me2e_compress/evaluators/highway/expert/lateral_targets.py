@@ -82,31 +82,22 @@ def lateral_targets(path: RoutePath, place: Place, ego: Ego, seen: Forecast) -> 
     # the oncoming lane
     facing = left + lane / 2
     around = both > facing + room
-    if around and left < 1.4 * lane and _may_face(path, place, ego, seen, left, lane):
+    may_face = around and left < 1.4 * lane
+    if may_face and place.lateral_m + ego.width / 2 <= left + 0.3:
+        # it is entered where the own lane is blocked, off junctions, with a gap
+        block = blocked_stretch(place, ego, seen)
+        if block is None or block.start_m > max(30.0, 3.0 * place.speed_mps):
+            may_face = False
+        else:
+            low, high = int(max(place.s_m, 0.0)), int(place.s_m + block.end_m + 6.0)
+            junction = np.isin(path.commands[low:high], JUNCTION).any()
+            gap = place, ego, seen, block, left, lane
+            may_face = not junction and gap_for_passing(*gap)
+    if may_face:
         extra = [facing + n for n in (0.0, ASIDE_M) if facing + n + room <= both]
         offsets, oncoming = offsets + extra, oncoming + [True] * len(extra)
     passable = around or max(left, right) > 1.4 * lane
     return Options(np.array([0.0, *offsets]), np.array(oncoming), passable)
-
-
-def _may_face(
-    path: RoutePath,
-    place: Place,
-    ego: Ego,
-    seen: Forecast,
-    left_m: float,
-    lane_m: float,
-) -> bool:
-    """Return whether the oncoming lane may be used."""
-    if place.lateral_m + ego.width / 2 > left_m + 0.3:
-        return True
-    block = blocked_stretch(place, ego, seen)
-    if block is None or block.start_m > max(30.0, 3.0 * place.speed_mps):
-        return False
-    low, high = int(max(place.s_m, 0.0)), int(place.s_m + block.end_m + 6.0)
-    if np.isin(path.commands[low:high], JUNCTION).any():
-        return False
-    return gap_for_passing(place, ego, seen, block, left_m, lane_m)
 
 
 def gap_for_passing(

@@ -1,59 +1,38 @@
-"""A results folder: one JSON file per route, and a manifest."""
+"""A results folder: one JSON file per route, and a manifest; and what fills it."""
 
 import errno
 import hashlib
 import json
 import os
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Self
 
+from me2e_compress.driving.policies import Driver
 from me2e_compress.errors import EvaluationError
-from me2e_compress.evaluators.highway.worker import Driven, Job
+from me2e_compress.evaluators.contract import (
+    Drive,
+    Driven,
+    Evaluator,
+    Listener,
+)
 from me2e_compress.metrics.episode import Episode
+from me2e_compress.metrics.route_scores import route_score
 from me2e_compress.registry import documents
 from me2e_compress.registry.drafts import IN_JSON
 from me2e_compress.runtime.atomic import write_json
-from me2e_compress.simulator.routes import (
-    ROAD_VERSION,
-    VERSION,
-    Route,
-    check_version,
-    digest_of,
-    is_route_id,
-)
-from me2e_compress.version import __version__
+from me2e_compress.simulator.routes import VERSION, check_version, is_route_id
 
 MANIFEST = "evaluation.json"
 ROUTES = "routes"
-BEFORE = {"latency_model": "drop", "drive_on": False}
-"""Defaults for folders whose manifest lacks the key."""
+DEFAULTS = {"drive_on": False}
+"""What holds where a manifest lacks the key."""
 MEASURED = "latency_samples"
 """Key of a manifest: number of samples that latencies were drawn from. It is
 derived data, and not compared."""
 LARGEST_SET = 1_000_000
 """Most routes of a set that a manifest may claim."""
-
-
-def fingerprint(job: Job, routes: Sequence[Route], set_size: int) -> dict[str, Any]:
-    """Return everything that decides the bytes of the results."""
-    more: dict[str, Any] = {"drive_on": True} if job.conditions.drive_on else {}
-    return {
-        **more,
-        VERSION: ROAD_VERSION,
-        "version": __version__,
-        "policy": job.driver.fingerprint(),
-        "latency": job.conditions.latency.to_json(),
-        "latency_model": job.conditions.latency_model.value,
-        "dt_us": job.conditions.dt_us,
-        "image_size": list(job.conditions.image_size),
-        "weather": json.loads(json.dumps(asdict(job.conditions.weather))),
-        "frame_limit_s": job.frame_limit_s,
-        "set_size": set_size,
-        "routes_sha256": digest_of(routes),
-        "routes": [route.id for route in routes],
-    }
 
 
 @dataclass
@@ -91,7 +70,7 @@ class ResultsFolder:
         # all that decides the results must agree
         both = folder.made_by, made_by
         for key in sorted({*made_by, *folder.made_by} - {MEASURED}):
-            old, new = (each.get(key, BEFORE.get(key)) for each in both)
+            old, new = (each.get(key, DEFAULTS.get(key)) for each in both)
             if old != new:
                 raise EvaluationError(
                     f"{path}: holds the results of another evaluation: its {key} is "
@@ -126,33 +105,10 @@ class ResultsFolder:
         found = self.made_by.get(MEASURED)
         return found if type(found) is int and found > 0 else None
 
-    @property
-    def log(self) -> Path:
-        """Log of wall-clock times, beside the folder, which must not hold any."""
-        return log_beside(self.path)
-
     def episodes(self) -> dict[str, Episode]:
         """Read every driven route, in the order of the evaluation."""
         found = {route: self._read(route) for route in self.made_by["routes"]}
         return {route: one for route, one in found.items() if one is not None}
-
-    def save(self, driven: Driven) -> None:
-        """Write one route, and log its cost."""
-        episode = driven.episode
-        cost = {
-            "route": episode.route,
-            "frames": len(episode.frames),
-            "decisions": len(episode.decisions),
-            "seconds": round(driven.seconds, 3),
-            "memory_mb": round(driven.memory_bytes / 1e6, 1),
-        }
-        self.keep(episode)
-        try:
-            with self.log.open("a", encoding="utf-8") as log:
-                mark = {} if log.tell() else IN_JSON
-                log.write(f"{json.dumps(cost | mark)}\n")
-        except OSError as error:
-            raise _unwritable(self.log, error) from error
 
     def keep(self, episode: Episode) -> None:
         """Write one route."""
@@ -191,9 +147,27 @@ class ResultsFolder:
 
 
 def log_beside(folder: Path) -> Path:
-    """Return the path of the log of a results folder."""
+    """Return the log of wall-clock times of a folder, which must not hold any."""
     resolved = Path(os.path.realpath(folder))
     return resolved.with_name(f"{resolved.name}.log")
+
+
+def log_cost(folder: Path, driven: Driven) -> None:
+    """Add a line on what a route cost to the log beside a folder."""
+    episode, log = driven.episode, log_beside(folder)
+    cost = {
+        "route": episode.route,
+        "frames": len(episode.frames),
+        "decisions": len(episode.decisions),
+        "seconds": round(driven.seconds, 3),
+        "memory_mb": round(driven.memory_bytes / 1e6, 1),
+    }
+    try:
+        with log.open("a", encoding="utf-8") as lines:
+            mark = {} if lines.tell() else IN_JSON
+            lines.write(f"{json.dumps(cost | mark)}\n")
+    except OSError as error:
+        raise _unwritable(log, error) from error
 
 
 def _check_manifest(path: Path, made_by: object) -> None:
@@ -239,3 +213,104 @@ def _unwritable(path: Path, error: OSError) -> EvaluationError:
 def _short(value: object) -> str:
     text = json.dumps(value)
     return text if len(text) <= 60 else f"{text[:57]}..."
+
+
+def drive_routes(
+    evaluator: Evaluator,
+    policy: Driver | None,
+    drive: Drive,
+    folder: Path,
+    listener: Listener,
+    stage: str = "evaluate",
+) -> tuple[Episode, ...]:
+    """Drive what a folder lacks, keep it there, and return all routes in their order.
+
+    The files do not depend on the number of workers, the engine or the clock, unless
+    latency is measured during the run. What an evaluator reads without a policy is read
+    again: its files may have changed.
+
+    Raises:
+        EvaluationError: The policy cannot be opened, the folder belongs to another
+            evaluation or cannot be written, or the evaluator yields what it must not.
+    """
+    # fail early on a policy or folder that cannot be used
+    made_by = evaluator.made_by(policy, drive)
+    routes, measured = [each.id for each in drive.routes], drive.latency.measured
+    results, done = None, dict[str, Episode]()
+    if routes:
+        made_by |= {"set_size": drive.set_size, "routes": routes}
+        results = ResultsFolder.create(folder, made_by, measured)
+        done = results.episodes()
+        for path, reason in results.corrupt.items():
+            listener.on_warning(f"{path}: {reason}: driven again")
+    elif policy is not None and (kept := _whole(folder, made_by)):
+        return kept
+    # keep and report each route as soon as it is driven
+    missing = replace(drive, routes=[e for e in drive.routes if e.id not in done])
+    total = len(routes) or evaluator.set_size
+    _report(listener, stage, done, total)
+    if missing.routes or not routes:
+        for episode in evaluator.episodes(policy, missing, folder, listener):
+            _check_episode(evaluator, episode, done, routes)
+            done[episode.route] = episode
+            if results is not None:
+                results.keep(episode)
+            _report(listener, stage, done, max(total, len(done)))
+    # routes that the evaluator alone knows are kept once all are there
+    if lost := [route for route in routes if route not in done]:
+        raise EvaluationError(f"{evaluator.name} did not drive route {lost[0]}")
+    if not done:
+        raise EvaluationError(f"{evaluator.name} yields no episode")
+    if results is None:
+        size = max(evaluator.set_size, len(done))
+        made_by |= {"set_size": size, "routes": list(done)}
+        results = ResultsFolder.create(folder, made_by, measured)
+        for episode in done.values():
+            results.keep(episode)
+    return tuple(done[route] for route in routes or done)
+
+
+def _whole(folder: Path, made_by: Mapping[str, Any]) -> tuple[Episode, ...]:
+    """Return all episodes of a folder of the same evaluation, or none."""
+    if not (folder / MANIFEST).is_file():
+        return ()
+    results = ResultsFolder.open(folder)
+    if any(results.made_by.get(key) != value for key, value in made_by.items()):
+        return ()
+    episodes = results.episodes()
+    whole = len(episodes) == len(results.made_by["routes"])
+    return tuple(episodes.values()) if whole else ()
+
+
+def _check_episode(
+    evaluator: Evaluator,
+    episode: Episode,
+    done: Mapping[str, Episode],
+    routes: Sequence[str],
+) -> None:
+    """Refuse a route that is no file name, comes twice, or is not one of the drive."""
+    route = episode.route
+    if not is_route_id(route):
+        raise EvaluationError(
+            f"{evaluator.name} yields route {route[:60]!r}: a name is made of letters, "
+            "digits, '_' and '-'"
+        )
+    if route in done:
+        raise EvaluationError(f"{evaluator.name} yields route {route} twice")
+    if routes and route not in routes:
+        raise EvaluationError(
+            f"{evaluator.name} yields route {route}, not of its drive"
+        )
+
+
+def _report(
+    listener: Listener, stage: str, done: Mapping[str, Episode], total: int
+) -> None:
+    """Report progress with the mean scores so far."""
+    words = ""
+    if done:
+        episodes = done.values()
+        score = sum(route_score(one).composed for one in episodes) / len(done)
+        success = 100.0 * sum(one.succeeded for one in episodes) / len(done)
+        words = f"DS {score:.1f}  SR {success:.1f} %"
+    listener.on_progress(stage, len(done), total, words)

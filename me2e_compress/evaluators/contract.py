@@ -1,0 +1,330 @@
+"""What is driven, and by whom: a `Drive`, and the interface of evaluators.
+
+Neither imports highway-env.
+"""
+
+import abc
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any, ClassVar, Protocol, Self
+
+from pydantic import TypeAdapter, ValidationError
+
+from me2e_compress.driving.contract import RouteInfo
+from me2e_compress.driving.latency import FixedLatency, LatencySource
+from me2e_compress.driving.policies import Driver, opened
+from me2e_compress.driving.realtime import DT_US, LatencyModel
+from me2e_compress.errors import EvaluationError
+from me2e_compress.metrics.episode import FRAME_US, Episode
+from me2e_compress.registry import Registry
+from me2e_compress.simulator.camera_rig import CLEAR, Weather
+from me2e_compress.simulator.routes import Route
+from me2e_compress.version import __version__
+
+FRAME_LIMIT_S = 60.0
+
+
+class Listener(Protocol):
+    """Hears how far a long step is; see `me2e_compress.workflows.listener`."""
+
+    @property
+    def on_progress(self) -> Callable[[str, int, int, str], None]:
+        """Gets the stage, things done, things in all, and words."""
+        ...
+
+    @property
+    def on_warning(self) -> Callable[[str], None]:
+        """Gets one line per surprise."""
+        ...
+
+
+@dataclass(frozen=True)
+class Driven:
+    """An episode, the wall-clock seconds and the resident memory that it took."""
+
+    episode: Episode
+    seconds: float
+    memory_bytes: int
+
+
+class Engine(Protocol):
+    """Drives independent routes of highway-env, several at a time."""
+
+    def drive(
+        self, policy: Driver, drive: "Drive", routes: Sequence[Route]
+    ) -> Iterator[Driven]:
+        """Yield each route once, as it finishes; routes begin in the order given."""
+        ...
+
+
+@dataclass(frozen=True)
+class Drive:
+    """Which routes are driven, and under which conditions.
+
+    Args:
+        latency: What each decision costs; its seed is that of its draws.
+        dt_us: Step of the world, a divisor of 50 ms; `realtime.skipped_decisions` tells
+            what a finer one changes. Frames are recorded every 50 ms regardless.
+        weather: Clear is what each route says.
+        latency_model: Whether a latency drops decisions or delays every control.
+        drive_on: Whether a route goes on after a collision, as in Bench2Drive.
+        routes: In the order of the results; none where the evaluator alone knows them.
+        set_size: Number of routes of the whole set; 0 where the evaluator knows it.
+        engine: Where routes are driven; None for one at a time on this machine.
+        frame_limit_s: A decision that takes longer makes the policy count as hung.
+
+    Raises:
+        EvaluationError: The latency lacks its trace, or the step divides no frame.
+    """
+
+    latency: LatencySource = field(default_factory=FixedLatency)
+    dt_us: int = DT_US
+    weather: Weather = CLEAR
+    latency_model: LatencyModel = LatencyModel.DROP
+    drive_on: bool = False
+    routes: Sequence[RouteInfo] = ()
+    set_size: int = 0
+    engine: Engine | None = None
+    frame_limit_s: float = FRAME_LIMIT_S
+
+    def __post_init__(self) -> None:
+        if self.latency.lacks_trace:
+            raise EvaluationError(
+                f"latency {self.latency}: its trace names no file (trace:FILE), and "
+                "only a study knows each model's own latencies"
+            )
+        if self.dt_us <= 0 or FRAME_US % self.dt_us:
+            raise EvaluationError(
+                f"a step of {self.dt_us / 1e3:g} ms: it must divide "
+                f"{FRAME_US // 1000} ms"
+            )
+
+    @classmethod
+    def of_words(
+        cls,
+        latency_model: str = "drop",
+        dt_ms: float = 50.0,
+        weather: str = "",
+        drive_on: bool = False,
+    ) -> Self:
+        """Read what the command, a study's file and Python say alike of conditions.
+
+        The weather is ``fog_m=80,night=0.5,dropped=BACK+FRONT``.
+
+        Raises:
+            EvaluationError: An option is invalid.
+        """
+        if latency_model not in list(LatencyModel):
+            there = ", ".join(LatencyModel)
+            raise EvaluationError(
+                f"no latency model {latency_model!r}; there are {there}"
+            )
+        if not 0 < dt_ms <= FRAME_US / 1000:  # a product of inf is no integer
+            raise EvaluationError(
+                f"a step of {dt_ms:g} ms: it must divide {FRAME_US // 1000} ms"
+            )
+        return cls(
+            dt_us=round(dt_ms * 1000),
+            weather=_weather_of(weather),
+            latency_model=LatencyModel(latency_model),
+            drive_on=drive_on,
+        )
+
+    def conditions(self) -> dict[str, Any]:
+        """Return everything but routes that decides episodes, as JSON."""
+        more: dict[str, Any] = {"drive_on": True} if self.drive_on else {}
+        weather = asdict(self.weather)
+        return more | {
+            "latency": self.latency.to_json(),
+            "latency_model": self.latency_model.value,
+            "dt_us": self.dt_us,
+            "weather": weather | {"dropped": list(weather["dropped"])},
+        }
+
+
+def _weather_of(text: str) -> Weather:
+    """Read ``option=value`` pairs; dropped cameras are joined by ``+``."""
+    options: dict[str, object] = {}
+    for pair in filter(None, text.split(",")):
+        name, _, value = pair.partition("=")
+        options[name.strip()] = value.split("+") if name == "dropped" else value
+    unknown = [name for name in options if name not in Weather.__dataclass_fields__]
+    if unknown:
+        raise EvaluationError(
+            f"weather option {unknown[0]!r}: there are "
+            f"{', '.join(Weather.__dataclass_fields__)}"
+        )
+    try:
+        return TypeAdapter(Weather).validate_python(options)
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        raise EvaluationError(
+            f"weather option {first['loc'][0]}: {first['msg']}"
+        ) from error
+
+
+ABILITIES = (
+    *("policy", "adapter", "module_map", "provider", "routes", "latency"),
+    *("latency_model", "dt_ms", "weather", "drive_on", "engine", "render"),
+)
+"""What an evaluator may declare that it takes: options of the command or of a study."""
+METHODS = {"routes": ("routes",), "render": ("render", "overlay", "routes")}
+"""What who declares an ability must define."""
+
+
+@dataclass(frozen=True)
+class Evaluator(abc.ABC):
+    """Drives a policy, or reads how one drove; it scores nothing.
+
+    Derive a frozen dataclass: its fields are options of its own. ``takes`` names those
+    of `ABILITIES` that it understands; commands and studies refuse all others.
+    """
+
+    name: ClassVar[str]
+    takes: ClassVar[frozenset[str]] = frozenset()
+
+    @abc.abstractmethod
+    def episodes(
+        self, policy: Driver | None, drive: Drive, folder: Path, listener: Listener
+    ) -> Iterator[Episode]:
+        """Yield one episode a route of the drive as it ends, in any order.
+
+        Without routes in the drive, all of its own, in a fixed order. The same options
+        give the same episodes, but where latency is measured. Episodes are kept by who
+        asks; ``folder`` is there for anything else, e.g. a log beside it.
+
+        Raises:
+            EvaluationError: It cannot go on; the message is one line.
+        """
+
+    def routes(
+        self, words: str, beside: Path = Path()
+    ) -> tuple[Sequence[RouteInfo], int]:
+        """Return the routes that words name, and the size of the set they are from.
+
+        Files are looked up in the folder ``beside``.
+
+        Raises:
+            EvaluationError: There is no such route, or no file of routes.
+        """
+        raise NotImplementedError
+
+    @property
+    def label(self) -> str:
+        """The name in reports."""
+        return EVALUATORS.text(self)
+
+    @property
+    def set_size(self) -> int:
+        """The number of routes of the whole set, where a drive names none; 0: those."""
+        return 0
+
+    def check_policy(self, policy: Driver) -> None:
+        """Check that a policy can drive here, before anything is written.
+
+        Raises:
+            EvaluationError: It cannot be opened, or lacks a member.
+        """
+        opened(policy)
+
+    def made_by(self, policy: Driver | None, drive: Drive) -> dict[str, Any]:
+        """Return what decides the bytes of the results, but for the routes.
+
+        Raises:
+            EvaluationError: See `check_policy`.
+        """
+        if policy is not None:
+            self.check_policy(policy)
+        made = {
+            "version": __version__,
+            "evaluator": EVALUATORS.text(self),
+            "policy": "" if policy is None else policy.fingerprint(),
+        }
+        usual, asked = Drive().conditions(), drive.conditions()
+        return made | {key: asked[key] for key in asked if asked[key] != usual.get(key)}
+
+    def expected_s(self, route: RouteInfo) -> float:
+        """Return about how many simulated seconds a route takes."""
+        return 30.0
+
+    def render(
+        self, policy: Driver, drive: Drive, route: RouteInfo, folder: Path
+    ) -> tuple[Path, ...]:
+        """Drive a route again, draw it, and return the pictures' files."""
+        raise NotImplementedError
+
+    def overlay(
+        self,
+        labelled: Sequence[tuple[str, Driver, Drive]],
+        route: RouteInfo,
+        time_us: int,
+        path: Path,
+    ) -> None:
+        """Write a PNG of two drives of a route at a moment, the second in grey.
+
+        It is part of ``render``.
+        """
+        raise NotImplementedError
+
+    def check_takes(self, options: Iterable[str], whose: str = "") -> None:
+        """Refuse options that it does not take: each an ability, or an option's flag.
+
+        Raises:
+            EvaluationError: The first of them, by name.
+        """
+        for option in options:
+            if option not in self.takes:
+                takes = ", ".join(each for each in ABILITIES if each in self.takes)
+                raise EvaluationError(
+                    f"{whose}{self.name} takes no {option.replace('_', '-')}; it takes"
+                    f" {takes or 'none'}, and options of its own: name{{option=value}}"
+                )
+
+
+_HERE = "me2e_compress.evaluators"
+
+EVALUATORS: Registry[Evaluator] = Registry(
+    "evaluator",
+    _HERE,
+    EvaluationError,
+    {
+        "highway": f"{_HERE}.highway.evaluator:Highway",
+        "bench2drive": f"{_HERE}.bench2drive.real_results:Bench2DriveResults",
+    },
+)
+
+
+def evaluator_named(text: str) -> Evaluator:
+    """Build an evaluator from ``name`` or ``name{option=value}``.
+
+    Raises:
+        EvaluationError: There is none, or it declares what it does not have.
+    """
+    return with_abilities(EVALUATORS.parse(text))
+
+
+def with_abilities(evaluator: Evaluator) -> Evaluator:
+    """Return an evaluator that has what it declares.
+
+    Raises:
+        EvaluationError: It declares what it does not have.
+    """
+    name, cls = evaluator.name, type(evaluator)
+    if not isinstance(evaluator, Evaluator):
+        raise EvaluationError(
+            f"evaluator {name!r} is a {cls.__name__}, which is no Evaluator: derive it "
+            f"from {_HERE}.Evaluator"
+        )
+    for ability in sorted(evaluator.takes):
+        if ability not in ABILITIES:
+            raise EvaluationError(
+                f"{name} declares {ability!r}, which nobody asks for; there are"
+                f" {', '.join(ABILITIES)}"
+            )
+        for method in METHODS.get(ability, ()):
+            if getattr(cls, method) is getattr(Evaluator, method):
+                raise EvaluationError(
+                    f"{name} declares {ability}, but has no {method}()"
+                )
+    return evaluator
