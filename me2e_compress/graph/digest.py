@@ -23,8 +23,9 @@ def digest(model: ir.Model) -> str:
     hasher.update(repr(sorted(model.metadata_props.items())).encode())
     _graph(hasher, model.graph)
     for key in sorted(model.functions, key=str):
-        hasher.update(repr(key).encode())
-        _nodes(hasher, model.functions[key])
+        function = model.functions[key]
+        hasher.update(repr((key, sorted(function.opset_imports.items()))).encode())
+        _nodes(hasher, function)
     return hasher.hexdigest()
 
 

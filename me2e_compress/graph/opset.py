@@ -97,7 +97,7 @@ def newer(model: ir.Model, opset: int) -> str | None:
     changed = [
         (node, before)
         for node in model.graph.all_nodes()
-        if _since(node, before) != _since(node, opset)
+        if changed_since(node, before, opset)
     ]
     if failure := _write_in(model, changed, opset):
         node, _, reason = failure
@@ -122,9 +122,9 @@ def _rewrite(node: ir.Node, opset: int, wanted: int) -> str | None:
     if has_subgraph(node):
         return "it holds a graph"
     try:
-        older = onnx.version_converter.convert_version(_alone(node, opset), wanted)
+        older = onnx.version_converter.convert_version(alone(node, opset), wanted)
     except (onnx.version_converter.ConvertError, RuntimeError) as error:
-        return " ".join(str(error).split()).rpartition("failed: ")[2]
+        return why_not(error)
     written = older.graph.node
     if len(written) != 1 or written[0].op_type != node.op_type:
         return "it takes several operators"
@@ -141,7 +141,17 @@ def _rewrite(node: ir.Node, opset: int, wanted: int) -> str | None:
     return None
 
 
-def _alone(node: ir.Node, opset: int) -> onnx.ModelProto:
+def changed_since(node: ir.Node, before: int, opset: int) -> bool:
+    """Return whether a standard operator is another one in a newer opset."""
+    return _since(node, before) != _since(node, opset)
+
+
+def why_not(error: Exception) -> str:
+    """Return the reason in an error of ONNX's version converter."""
+    return " ".join(str(error).split()).rpartition("failed: ")[2]
+
+
+def alone(node: ir.Node, opset: int) -> onnx.ModelProto:
     """Build a model of one node; values of unknown type are taken for float32."""
 
     def info(value: ir.Value) -> onnx.ValueInfoProto:

@@ -10,8 +10,9 @@ import onnx_ir as ir
 from me2e_compress.display import counted
 from me2e_compress.graph import graphs_of, provenance
 from me2e_compress.graph.modules import assign
-from me2e_compress.graph.nodes import is_plugin, nodes_in, nodes_of
+from me2e_compress.graph.nodes import is_plugin, nodes_in, nodes_of, opset_of
 from me2e_compress.graph.rewrite import lift_constants
+from me2e_compress.graph.rewrite.raise_opset import raise_opset
 from me2e_compress.graph.validity import ORIGINAL_DOMAIN, PLUGIN_DOMAIN
 from me2e_compress.passes.base import Context, Pass, PassResult
 
@@ -162,6 +163,8 @@ def _values(model: ir.Model) -> Iterator[ir.Value]:
         yield from node.outputs
 
 
+LEAST_OPSET = 13
+"""The first opset with scales by channel, and axes as inputs, which bodies have."""
 _FUNCTIONS_SINCE_IR = 8
 """The first ONNX IR version whose models may hold functions (onnx/docs/IR.md)."""
 
@@ -174,9 +177,10 @@ class ImportNormalize(Pass):
     2. Every node gets its module and its origin before anything renames it.
     3. Plugin nodes of the default domain move to ``me2e.plugin``; their metadata keep
        the old domain for the way back to TensorRT.
-    4. float64 that leaked into a float32 graph becomes float32.
-    5. Constant nodes become initializers.
-    6. A model with functions declares at least IR version 8, and all used domains are
+    4. A graph older than opset 13 is written in that, operator by operator.
+    5. float64 that leaked into a float32 graph becomes float32.
+    6. Constant nodes become initializers.
+    7. A model with functions declares at least IR version 8, and all used domains are
        imported.
 
     Subgraphs and function bodies are included. Unknown operators are left alone.
@@ -201,8 +205,9 @@ class ImportNormalize(Pass):
                     provenance.stamp(node, past)
                     changes += 1
         changes += _isolate_plugins(model, self.name)
+        raised, raise_note = _raise(model, self.name)
         demoted, note = demote(model, self.name)
-        changes += demoted + lift_constants(model)
+        changes += raised + demoted + lift_constants(model)
         # Versions and domains that are used are declared
         if model.functions and model.ir_version < _FUNCTIONS_SINCE_IR:
             model.ir_version = _FUNCTIONS_SINCE_IR
@@ -212,7 +217,7 @@ class ImportNormalize(Pass):
                 if node.domain not in body.opset_imports:
                     body.opset_imports[node.domain] = 1
                     changes += 1
-        return PassResult(model, changes, (note,) if note else ())
+        return PassResult(model, changes, tuple(filter(None, (raise_note, note))))
 
 
 def needs_import(model: ir.Model) -> bool:
@@ -234,6 +239,15 @@ def with_own_domains(model: ir.Model) -> ir.Model:
         if all(node.domain != PLUGIN_DOMAIN for node in nodes_in(body)):
             body.opset_imports.pop(PLUGIN_DOMAIN, None)
     return copy
+
+
+def _raise(model: ir.Model, by: str) -> tuple[int, str]:
+    opset = opset_of(model)
+    if not 0 < opset < LEAST_OPSET:
+        return 0, ""
+    changes, reason = raise_opset(model, LEAST_OPSET, by)
+    became = f"opset {opset} became {LEAST_OPSET}"
+    return changes, f"opset {opset} stays: {reason}" if reason else became
 
 
 def _bodies(model: ir.Model) -> Iterator[ir.Graph | ir.Function]:
