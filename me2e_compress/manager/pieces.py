@@ -38,7 +38,7 @@ STEPS = frozenset(
     {
         "ArgMax", "ArgMin", "Ceil", "DynamicQuantizeLinear", "Equal", "Floor",
         "Greater", "GreaterOrEqual", "Hardmax", "Less", "LessOrEqual", "Mod",
-        "NonMaxSuppression", "QuantizeLinear", "Round", "Sign", "TopK",
+        "NonMaxSuppression", "QuantizeLinear", "Round", "Sigmoid", "Sign", "TopK",
     }
 )  # fmt: skip
 """Operators of ONNX whose answer jumps where what they read moves; a Cast to whole
