@@ -26,8 +26,8 @@ class FixShapes(Pass):
              with dims={batch=1}
 
     Attributes:
-        dims: size by the name of the dimension, or by input and axis where it has no
-            name: ``{batch=1, "image:2"=224}``.
+        dims: size by the name of the dimension, or by input and axis, as it must be
+            where it has no name (``?``): ``{batch=1, "image:2"=224}``.
 
     Raises:
         RecipeError: a size is below 1, or none is given.
@@ -53,7 +53,8 @@ class FixShapes(Pass):
         with contextlib.suppress(json.JSONDecodeError):
             kept = json.loads(model.metadata_props.get(FIXED, "{}"))
             known = kept if isinstance(kept, dict) else {}
-        wanted = {k: size for k, size in self.dims.items() if known.get(k) != size}
+        dims = _by_symbol(model, self.dims)
+        wanted = {k: size for k, size in dims.items() if known.get(k) != size}
         if not wanted:
             return PassResult(model, 0)
         there = open_dimensions(model)
@@ -99,6 +100,29 @@ def open_dimensions(model: ir.Model) -> dict[str, int]:
     return names
 
 
+def _by_symbol(model: ir.Model, sizes: Mapping[str, int]) -> dict[str, int]:
+    """Return sizes by symbol; a place stands for the symbol that is written there.
+
+    Raises:
+        PreconditionError: two places of one symbol have two sizes.
+    """
+    symbols = {
+        f"{value.name}:{axis}": dim.value
+        for value in model.graph.inputs
+        for axis, dim in enumerate(value.shape or ())
+        if isinstance(dim, ir.SymbolicDim) and _symbols(dim) == (dim.value,)
+    }
+    found = dict[str, int]()
+    for place, size in sizes.items():
+        name = symbols.get(place, place)
+        if found.setdefault(name, size) != size:
+            raise PreconditionError(
+                f"fix-shapes: {place}={size}: it is dimension {name!r}, which is"
+                f" {found[name]} already"
+            )
+    return found
+
+
 def sized_inputs(model: ir.Model, sizes: Mapping[str, int]) -> ir.Model:
     """Return a graph of only the inputs of another, with open dimensions sized."""
     inputs = [
@@ -117,8 +141,8 @@ def with_sizes(passes: Sequence[Pass], dims: Mapping[str, int]) -> tuple[Pass, .
 
 
 def _symbols(dim: ir.SymbolicDim) -> tuple[str, ...]:
-    """Return the symbols of a dimension: ``s0`` for ``2*s0 + 1``."""
-    if dim.value is None:
+    """Return the symbols of a dimension: ``s0`` for ``2*s0 + 1``, none for ``?``."""
+    if dim.value is None or not any(map(str.isalnum, dim.value)):
         return ()
     try:
         return tuple(sorted(dim.free_symbols()))
@@ -135,7 +159,7 @@ def _sized(
     dims: list[int | ir.SymbolicDim] = []
     for axis, dim in enumerate(shape):
         size: object = dim
-        if isinstance(dim, ir.SymbolicDim) and dim.value is None:
+        if isinstance(dim, ir.SymbolicDim) and not _symbols(dim):
             size = sizes.get(f"{owner}:{axis}", dim)
         elif isinstance(dim, ir.SymbolicDim) and dim.value in sizes:
             size = sizes[str(dim.value)]

@@ -66,6 +66,22 @@ def test_a_dimension_without_a_name_is_input_and_axis() -> None:
     assert str(model.graph.outputs[0].shape) == "[5,3]"
 
 
+def test_a_question_mark_is_no_name_and_each_place_has_its_size() -> None:
+    text = """<ir_version: 9, opset_import: ["" : 17]>
+        g (float[1,"?","?"] x) => (float[1,"?","?"] y) { y = Relu(x) }"""
+    model = fixed({"x:1": 3, "x:2": 5}, text).model
+    assert [str(value.shape) for value in model.graph.outputs] == ["[1,3,5]"]
+    with pytest.raises(PreconditionError, match=r"called '\?'; there is x:1, x:2"):
+        fixed({"?": 3}, text)
+
+
+def test_a_place_stands_for_the_name_that_is_written_there() -> None:
+    model = fixed({"image:0": 2, "image:3": 4}).model
+    assert str(model.graph.outputs[0].shape) == "[2,48]"
+    with pytest.raises(PreconditionError, match="'side', which is 4 already"):
+        fixed({"image:2": 4, "image:3": 5})
+
+
 REFUSES = """<ir_version: 9, opset_import: ["" : 17]>
 m (float[n,3] x, float[4,5] w) => (float[3,5] y) { t = Transpose(x) y = MatMul(t, w) }
 """

@@ -119,4 +119,3 @@ def _replace(
 
 def _named(values: Sequence[ir.Value]) -> list[ir.Value]:
     return [value for value in values if value.name]
-
