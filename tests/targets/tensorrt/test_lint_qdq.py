@@ -144,12 +144,12 @@ PAIR = "<float s = {0.5}, float t = {0.25}, int8 z = {0}, uint8 u = {0}, int32 i
         (
             "m (float[2] x) => (float[2] y) " + PAIR + "{ q = QuantizeLinear(x, s, u)"
             " d = DequantizeLinear(q, s, u) y = Relu(d) }",
-            ("error", "quantized-type", "uint8, must be int8"),
+            ("error", "quantized-type", "uint8, must be int8 or float8e4m3fn"),
         ),
         (
             "m (float[2] x) => (float[2] y) <float s = {0.5}>"
             " { q = QuantizeLinear(x, s) d = DequantizeLinear(q, s) y = Relu(d) }",
-            ("error", "quantized-type", "uint8, must be int8"),
+            ("error", "quantized-type", "uint8, must be int8 or float8e4m3fn"),
         ),
         (
             "m (float[2] x) => (float[2] y) " + PAIR + "{ q = QuantizeLinear(x, s, z)"

@@ -64,24 +64,43 @@ def scales(node: ir.Node) -> str | None:
     return f"scale {float(numbers.min()):g}, must be finite and above 0"
 
 
+_ACTIVATIONS = (ir.DataType.INT8, ir.DataType.FLOAT8E4M3FN)
+_WEIGHTS = (*_ACTIVATIONS, ir.DataType.INT4)
+"""Quantized types of TensorRT 10 ("Working with Quantized Types"): int4 is for weights
+alone, with scales by block."""
+
+
 def zero_points(model: ir.Model) -> Iterator[LintFinding]:
-    """Check that quantization is symmetric: zero points are 0, of type int8."""
+    """Check that quantization is symmetric: zero points are 0, of a type it takes."""
     for node in pairs_of(model):
-        value, source = graph.input_at(node, 2), node.inputs[0]
-        # The integer type is that of the tensor, else the zero point's, else uint8.
-        kind = None if value is None else value.dtype
-        stored_as = None if source is None else source.dtype
-        if node.op_type == DEQUANTIZE and stored_as is not None:
-            kind = stored_as
-        if kind != ir.DataType.INT8:
-            name = "uint8" if kind is None else kind.name.lower()
-            yield error("quantized-type", node, f"{name}, must be int8")
+        value, kind = graph.input_at(node, 2), _stored_type(node)
+        if kind not in (_WEIGHTS if _is_weight(node) else _ACTIVATIONS):
+            wanted = "int8 or float8e4m3fn"
+            if kind == ir.DataType.INT4:
+                wanted += ": int4 is for weights"
+            name = kind.name.lower()
+            yield error("quantized-type", node, f"{name}, must be {wanted}")
         zero = graph.array_of(value)
         if value is not None and zero is None:
             yield error("zero-point", node, "the zero point is computed")
-        elif zero is not None and zero.any():
-            found = int(zero.reshape(-1)[np.flatnonzero(zero)[0]])
-            yield error("zero-point", node, f"zero point {found}, must be 0")
+        elif zero is not None and zero.astype(np.float32).any():
+            found = float(zero.reshape(-1)[np.flatnonzero(zero)[0]])
+            yield error("zero-point", node, f"zero point {found:g}, must be 0")
+
+
+def _stored_type(node: ir.Node) -> ir.DataType:
+    """Return the quantized type: the tensor's, else the zero point's, else uint8."""
+    source, zero = node.inputs[0], graph.input_at(node, 2)
+    kind = None if zero is None else zero.dtype
+    if node.op_type == DEQUANTIZE and source is not None:
+        kind = source.dtype or kind
+    return kind or ir.DataType.UINT8
+
+
+def _is_weight(node: ir.Node) -> bool:
+    """Return whether a pair quantizes a constant."""
+    value = node.inputs[0]
+    return stored(value) or (is_quantized(value) and _only_stored(value))
 
 
 @_rule("bias-pair", error, nodes_of)
@@ -152,22 +171,27 @@ def integers(node: ir.Node) -> str | None:
 def channel_scales(model: ir.Model) -> Iterator[LintFinding]:
     """Check that activations have one scale, and weights one or one per channel."""
     for node in pairs_of(model):
-        scale, value = graph.static_shape(node.inputs[1]), node.inputs[0]
+        scale = graph.static_shape(node.inputs[1])
         # One scale is always allowed.
         if not scale or scale == (1,):
             continue
-        of_weight = stored(value) or (is_quantized(value) and _only_stored(value))
         if len(scale) > 1:
-            yield error(
-                "channel-scale", node, f"scales of shape {list(scale)}: by block"
-            )
-        elif not of_weight:
+            if not _is_by_block(node):
+                where = f"scales of shape {list(scale)}: by block"
+                yield error("channel-scale", node, where)
+        elif not _is_weight(node):
             yield error("channel-scale", node, "an activation has one scale a channel")
         elif "axis" not in node.attributes:
             yield error("weight-axis", node, "no axis: ONNX takes 1, TensorRT takes 0")
         elif node.op_type == DEQUANTIZE:
             for message in _wrong_axes(node, scale):
                 yield error("weight-axis", node, message)
+
+
+def _is_by_block(node: ir.Node) -> bool:
+    """Return whether a pair is that of an int4 weight, whose scales are by block."""
+    blocks = node.attributes.get_int("block_size", 0)
+    return _stored_type(node) == ir.DataType.INT4 and blocks > 0 and _is_weight(node)
 
 
 def _wrong_axes(node: ir.Node, scale: tuple[int, ...]) -> Iterator[str]:
@@ -242,6 +266,10 @@ def half_quantized(node: ir.Node) -> str | None:
         return None
     if not _only_stored(node.inputs[1]):
         return "only one operand is int8"
+    # int4 is for the weight alone, and pays where reading that takes the time
+    pair = graph.producer_of(node.inputs[1])
+    if pair is not None and _is_by_block(pair):
+        return None
     product = node.op_type in ("Gemm", "MatMul")
     if product and extent(node, weight=True).is_vector:
         return None
