@@ -120,19 +120,21 @@ class RealRun:
         for path, file in self.collected.stated.items():
             episodes = [each.episode for each in file.records]
             again = leaderboard_scores(episodes)
-            rate = again.success_rate.over_set.value
-            found = {
-                "driving score": again.given_score.over_set.value,
-                "success rate": None if rate is None else rate / 100.0,
-                "eval num": float(len(episodes)),
+            score, rate = again.given_score, again.success_rate
+            # of the whole set, or of the routes that were driven (Dev10)
+            means = {
+                "driving score": (score.over_set.value, score.over_driven.value),
+                "success rate": tuple(
+                    None if mean is None else mean / 100.0
+                    for mean in (rate.over_set.value, rate.over_driven.value)
+                ),
+                "eval num": (float(len(episodes)),),
             }
             for key, said in file.stated.items():
-                value = found[key]
-                if value is None or not math.isclose(said, value, abs_tol=_TOLERANCE):
-                    yield (
-                        f"{path}: it says {key} {said:g}, its records say "
-                        f"{number(value, 'g')}"
-                    )
+                known = [mean for mean in means[key] if mean is not None]
+                if not any(math.isclose(said, m, abs_tol=_TOLERANCE) for m in known):
+                    values = " or ".join(number(mean, "g") for mean in means[key])
+                    yield f"{path}: it says {key} {said:g}, its records say {values}"
 
     def _counts(self, name: str) -> Table:
         found = self.collected

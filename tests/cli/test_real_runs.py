@@ -75,6 +75,20 @@ def test_what_is_wrong_with_a_real_run_is_said(cli: Cli, run: Path) -> None:
     assert "1 of 2, RouteScenario_1711_rep0 at 2 Hz" in shown
 
 
+@pytest.mark.parametrize(
+    ("mean", "believed"), [(74.0, True), (148 / 220, True), (73.0, False)]
+)
+def test_a_stated_mean_is_of_the_set_or_of_what_was_driven(
+    cli: Cli, run: Path, mean: float, believed: bool
+) -> None:
+    (run / "eval.json").unlink()
+    write(run / "m.json", merged(GOOD, FAILED, said={"driving score": mean}))
+
+    shown = cli.done("score run").out
+
+    assert ("its records say 0.672727 or 74" in shown) is not believed
+
+
 @pytest.mark.usefixtures("run")
 def test_a_folder_of_recordings_that_is_none_is_one_line(cli: Cli) -> None:
     said = cli.refused("score run --metrics nowhere")
