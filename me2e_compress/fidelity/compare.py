@@ -32,6 +32,11 @@ class OutputFidelity:
         discrete: whole numbers or booleans; their SQNR says little.
         least_db: SQNR of the worst frame; None like `most_db`, if that is the only one.
         most_db: SQNR of the best frame.
+        stray: share of the values that are a number in one model alone; above 0 the
+            SQNR is -infinity. What is NaN in both, or the same infinity, is left out.
+        small: channels ``SMALLER`` times smaller than the largest, as ``[:, 4:84]``
+            (scores beside boxes), which the SQNR of all says nothing of; else empty.
+        small_db: SQNR of those.
     """
 
     name: str
@@ -40,6 +45,9 @@ class OutputFidelity:
     discrete: bool = False
     least_db: float | None = None
     most_db: float | None = None
+    stray: float = 0.0
+    small: str = ""
+    small_db: float | None = None
 
     @property
     def by_frame(self) -> str:
@@ -78,6 +86,15 @@ class Fidelity:
     frames: int
     plan_output: str = ""
     same_choice: float | None = None
+
+    @property
+    def strays(self) -> tuple[str, ...]:
+        """A sentence for each output that is a number in one model alone."""
+        return tuple(
+            f"{each.name}: {each.stray:.2g} of it is a number in one graph alone"
+            for each in self.outputs
+            if each.stray
+        )
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -126,8 +143,8 @@ def compare(
     outputs of both on every frame, states included.
 
     Raises:
-        EvaluationError: no common output, no frame, or an output that changes its shape
-            or is not finite.
+        EvaluationError: no common output, no frame, or an output that changes its
+            shape.
         FramesError: a frame does not fit one of the models.
     """
     shared = [name for name in a.outputs if name in b.outputs]
@@ -141,18 +158,19 @@ def compare(
     moved, chosen = list[Float64](), list[bool]()
     count = 0
     # frame by frame, with one frame in memory
-    here, there, along = itertools.tee(frames, 3)
+    here, shown, along = itertools.tee(frames, 3)
     if answers is None:
         answers = replay(a, here)
     del here  # what nobody reads must not be kept
     wanted = list(dict.fromkeys([*shared, *b.recurrent.values()]))
-    runs = zip(answers, replay(b, there, wanted), along, strict=True)
+    runs = zip(answers, replay(b, shown, wanted), along, strict=True)
     for left, right, frame in runs:
         for name, tally in tallies.items():
             tally.add(left[name], right[name], count)
         if adapter is not None:
-            gap = adapter.plan(left, frame.arrays) - adapter.plan(right, frame.arrays)
-            moved.append(np.linalg.norm(gap, axis=1))
+            here, there = (adapter.plan(each, frame.arrays) for each in (left, right))
+            gap = np.where(np.isnan(here) & np.isnan(there), 0.0, here - there)
+            moved.append(np.nan_to_num(np.linalg.norm(gap, axis=1), nan=math.inf))
             if adapter.scores is not None:
                 chosen.append(adapter.choice(left) == adapter.choice(right))
         if watch is not None:
@@ -194,6 +212,14 @@ MODES_RANK = 4
 """Rank of a plan with modes: [1, modes, n, 2]."""
 
 
+SMALLER = 30.0
+"""Channels so many times smaller than others are judged apart: where both share the
+127 steps of int8's scale, four are left to them."""
+
+_CHANNELS = 128
+"""An axis of at most so many is one of channels."""
+
+
 class Tally:
     """Sums over frames of one output: float64."""
 
@@ -202,48 +228,103 @@ class Tally:
         self.signal = self.noise = self.gap = self.reach = 0.0
         self.frames_db = list[float]()
         self.discrete = False
+        self.count = self.strays = 0
+        self._axis: int | None = None
+        self._channels = np.zeros((3, 0))  # signal, noise and largest value of each
 
     def add(self, a: Array, b: Array, frame: int) -> None:
-        """Add a frame; EvaluationError if shapes differ, or a number is not finite."""
+        """Add a frame; EvaluationError if shapes differ."""
         if a.shape != b.shape:
             raise EvaluationError(
                 f"output {self.name} is {list(a.shape)} in the first model,"
-                f" {list(b.shape)} in the second"
+                f" {list(b.shape)} in the second at frame {frame}"
             )
-        x, y = self._wide(a, "first", frame), self._wide(b, "second", frame)
+        x, y = np.asarray(a, np.float64), np.asarray(b, np.float64)
         self.discrete = a.dtype.kind not in "fc"
         if not x.size:
             return
+        # what is no number in both is no difference, in one alone noise without end
+        numbers = np.isfinite(x) & np.isfinite(y)
+        strays = np.count_nonzero(~(numbers | (np.isnan(x) & np.isnan(y)) | (x == y)))
+        if not numbers.all():
+            x, y = np.where(numbers, x, 0.0), np.where(numbers, y, 0.0)
+        self.count, self.strays = self.count + x.size, self.strays + strays
         # sums for the SQNR, largest values for the error
         gap = np.abs(x - y)
-        signal, noise = float(np.vdot(x, x)), float(np.vdot(gap, gap))
+        signal = float(np.vdot(x, x))
+        noise = math.inf if strays else float(np.vdot(gap, gap))
         self.frames_db.append(decibels(signal, noise))
         self.signal += signal
         self.noise += noise
         self.reach = max(self.reach, float(np.abs(x).max()))
-        self.gap = max(self.gap, float(gap.max()))
+        self.gap = math.inf if strays else max(self.gap, float(gap.max()))
+        self._add_channels(x, gap)
+
+    def _add_channels(self, x: Float64, gap: Float64) -> None:
+        axis = channel_axis(x.shape)
+        if axis is None or self.discrete:
+            return
+        others = tuple(each for each in range(x.ndim) if each != axis)
+        if axis != self._axis or x.shape[axis] != self._channels.shape[1]:
+            self._axis, self._channels = axis, np.zeros((3, x.shape[axis]))
+        self._channels[0] += np.square(x).sum(axis=others)
+        self._channels[1] += np.square(gap).sum(axis=others)
+        largest = np.abs(x).max(axis=others)
+        self._channels[2] = np.maximum(self._channels[2], largest)
 
     def result(self) -> OutputFidelity:
         """Return the output's fidelity over the frames so far."""
         error = self.gap / self.reach if self.reach else math.inf if self.gap else 0.0
         sqnr, by_frame = decibels(self.signal, self.noise), self.frames_db
         spread = (min(by_frame), max(by_frame)) if len(by_frame) > 1 else (None, None)
-        return OutputFidelity(self.name, sqnr, error, self.discrete, *spread)
+        stray = self.strays / self.count if self.count else 0.0
+        more = (*spread, stray, *self._small())
+        return OutputFidelity(self.name, sqnr, error, self.discrete, *more)
 
-    def _wide(self, value: Array, which: str, frame: int) -> Float64:
-        wide = np.asarray(value, np.float64)
-        if not np.isfinite(wide).all():
-            kind = "NaN" if np.isnan(wide).any() else "infinite"
-            raise EvaluationError(
-                f"output {self.name} of the {which} model is {kind} at frame {frame}"
-            )
-        return wide
+    def _small(self) -> tuple[str, float | None]:
+        """Return the channels below the first gap of sizes, and their SQNR."""
+        signal, noise, largest = self._channels
+        order = np.argsort(-largest)
+        sizes = largest[order]
+        (gaps,) = np.nonzero(sizes[:-1] > SMALLER * sizes[1:])
+        if not gaps.size or not sizes[gaps[0] + 1]:
+            return "", None
+        small = np.sort(order[gaps[0] + 1 :])
+        places = _ranges(small.tolist())
+        lead = ":, " * (self._axis or 0)
+        return f"[{lead}{places}]", decibels(signal[small].sum(), noise[small].sum())
+
+
+def channel_axis(shape: tuple[int, ...]) -> int | None:
+    """Return the axis of an output's channels; None of one, or of pictures.
+
+    The last of ``[batch, n]`` and of ``[layers, 1, n, channels]``, the shorter of the
+    last two of ``[batch, n, channels]``, which some heads transpose.
+    """
+    rank = len(shape)
+    if rank == 3:
+        axis = 1 if shape[1] < shape[2] else 2
+    elif rank == 2 or (rank > 3 and 1 in shape[1:-1]):
+        axis = rank - 1
+    else:
+        return None
+    return axis if 1 < shape[axis] <= _CHANNELS else None
+
+
+def _ranges(places: list[int]) -> str:
+    """Write sorted places as ``0, 4:84``."""
+    starts = [each for each in places if each - 1 not in places]
+    ends = [each + 1 for each in places if each + 1 not in places]
+    pairs = zip(starts, ends, strict=True)
+    return ", ".join(f"{a}:{b}" if b > a + 1 else f"{a}" for a, b in pairs)
 
 
 def decibels(signal: float, noise: float) -> float:
     """Return the ratio of two powers in dB; infinite without noise."""
     if noise == 0:
         return math.inf
+    if math.isinf(noise):
+        return -math.inf
     return 10 * math.log10(signal / noise) if signal else -math.inf
 
 

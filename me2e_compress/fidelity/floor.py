@@ -35,15 +35,17 @@ class Shortfall:
     Attributes:
         value: in dB; of the plan the mean displacement in metres.
         excess: noise amplitude over the largest allowed, above 1.
+        part: the channels that it is of, as ``[:, 4:84]``; empty if it is of all.
     """
 
     output: str
     value: float
     unit: str
     excess: float
+    part: str = ""
 
     def __str__(self) -> str:
-        return f"{self.output} {shown(self.value, self.unit)}"
+        return f"{self.output}{self.part} {shown(self.value, self.unit)}"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -66,14 +68,17 @@ class Floor:
         below = []
         for each in found.outputs:
             # The noise over what is allowed: above 1 is too much.
+            part = ""
             if found.plan is not None and each.name == found.plan_output:
                 value, unit = found.plan.mean_m, "m"
                 excess = value / self.plan_m
             else:
                 value, unit = each.sqnr_db, "dB"
+                if each.small_db is not None and each.small_db < value:
+                    value, part = each.small_db, each.small
                 excess = min(float(10 ** ((self.sqnr_db - value) / 20)), MOST_EXCESS)
             if excess > 1 and not each.discrete and each.name not in unsteady:
-                below.append(Shortfall(each.name, value, unit, excess))
+                below.append(Shortfall(each.name, value, unit, excess, part))
         return tuple(sorted(below, key=lambda each: -each.excess))
 
     def __str__(self) -> str:

@@ -112,7 +112,7 @@ class Deviation:
 
     def add(self, value: Array) -> None:
         """Take another frame."""
-        wide = np.asarray(value, np.float64)
+        wide = np.nan_to_num(np.asarray(value, np.float64), posinf=0.0, neginf=0.0)
         self.frames += 1
         if self.frames == 1:
             self.discrete = value.dtype.kind not in "fc"

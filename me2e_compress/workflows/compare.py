@@ -81,7 +81,7 @@ class CompareResult(Result):
                 *(() if self.runtime is None else self.runtime.lines()),
                 *(f"{name}: {why}" for name, why in self.slow_here.items()),
             ),
-            faults,
+            (*fidelity.strays, *faults),
             EvaluationError(f"{self.candidate}: {dead}") if dead else None,
         )
 

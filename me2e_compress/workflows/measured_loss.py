@@ -129,6 +129,8 @@ class MeasuredLoss:
                 f"this verdict rests on {counted(self.fidelity.frames, 'frame')}:"
                 f" record {4 * FEW} or more, a quarter of which is measured on"
             )
+        if self.fidelity is not None:
+            yield from self.fidelity.strays
         if self.shortfalls:
             low, guilty = ", ".join(map(str, self.shortfalls)), ", ".join(self.guilty)
             yield f"below the floor ({self.floor}): {low}; lost in {guilty}"
@@ -246,10 +248,7 @@ class RuntimeTally:
         answers = next(self._answers)
         for name in (each for each in nodes if each in reference):
             tally = self._tallies.setdefault(name, Tally(name))
-            try:
-                tally.add(reference[name], answers[name], frame.index)
-            except EvaluationError:  # no number: noise without end
-                tally.noise = float("inf")
+            tally.add(reference[name], answers[name], frame.index)
             if self._frame is None:
                 self._first[name] = relative(nodes[name], answers[name])
         self._frame = self._frame or frame
@@ -261,7 +260,7 @@ class RuntimeTally:
         apart = [
             name
             for name, sqnr in runs.items()
-            if sqnr < QUIET_DB and sqnr <= nodes[name] - APART_DB
+            if sqnr < QUIET_DB and sqnr < nodes[name] and sqnr <= nodes[name] - APART_DB
         ]
         if not apart:
             return RuntimeLoss({}, {})

@@ -7,7 +7,14 @@ import pytest
 
 from me2e_compress import graph
 from me2e_compress.errors import EvaluationError, GraphError
-from me2e_compress.fidelity.compare import Displacement, compare
+from me2e_compress.fidelity.compare import (
+    Displacement,
+    Fidelity,
+    OutputFidelity,
+    Tally,
+    compare,
+)
+from me2e_compress.fidelity.floor import Floor
 from me2e_compress.runtime.frames import Frame
 from me2e_compress.runtime.plan_adapter import PlanAdapter
 from me2e_compress.runtime.session import Session
@@ -146,11 +153,46 @@ def test_an_output_called_plan_is_the_plan() -> None:
     assert PlanAdapter.of({}, ["bev"]) is None
 
 
-def test_a_number_that_is_none_is_an_error_by_name() -> None:
-    bad = Frame(0, True, {"x": np.array([[1, np.nan]], np.float32)})
+def of_one_output(a: object, b: object) -> OutputFidelity:
+    tally = Tally("y")
+    tally.add(np.asarray(a, np.float32), np.asarray(b, np.float32), 0)
+    return tally.result()
 
-    with pytest.raises(EvaluationError, match="output y of the first model is NaN at"):
-        compare(scaled(1.0), scaled(1.0), [bad])
+
+def test_what_is_no_number_in_both_is_left_out() -> None:
+    nan, inf = math.nan, math.inf
+    found = of_one_output([[nan, inf, 3, 4]], [[nan, inf, 3, 4.5]])
+    assert found.sqnr_db == pytest.approx(10 * math.log10(25 / 0.25))
+    assert found.stray == 0
+
+
+@pytest.mark.parametrize("other", [math.nan, math.inf, -math.inf])
+@pytest.mark.parametrize("first", [True, False])
+def test_what_is_no_number_in_one_is_noise_without_end(
+    other: float, first: bool
+) -> None:
+    pair = [[1, other, 3, 4]], [[1, 2, 3, 4]]
+    found = of_one_output(*(pair if first else pair[::-1]))
+    assert (found.sqnr_db, found.error, found.stray) == (-math.inf, math.inf, 0.25)
+    assert of_one_output([[-math.inf]], [[math.inf]]).stray == 1
+    (below,) = Floor().shortfalls(Fidelity((found,), (), None, "", 1))
+    assert str(below) == "y -inf dB"
+
+
+def test_small_channels_beside_large_ones_are_judged_apart() -> None:
+    random = np.random.default_rng(0)
+    boxes, scores = random.uniform(-600, 600, (1, 50, 4)), random.random((1, 50, 6))
+    truth = np.concatenate([boxes, scores], 2)
+    noise = random.normal(size=truth.shape) * 0.5
+    found = of_one_output(truth, truth + noise)
+    turned = of_one_output(*(np.swapaxes(a, 1, 2) for a in (truth, truth + noise)))
+
+    assert found.sqnr_db > 50
+    assert (found.small, turned.small) == ("[:, :, 4:10]", "[:, 4:10]")
+    assert found.small_db == pytest.approx(turned.small_db)
+    (below,) = Floor().shortfalls(Fidelity((found,), (), None, "", 1))
+    assert str(below) == f"y[:, :, 4:10] {found.small_db:.1f} dB"
+    assert of_one_output(boxes, boxes + 0.5).small == ""
 
 
 def test_models_with_nothing_in_common_are_not_compared() -> None:
