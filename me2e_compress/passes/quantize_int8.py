@@ -24,7 +24,7 @@ from me2e_compress.quantization.rules import DEFAULT_RULES, RULE_SETS, RuleSet
 from me2e_compress.quantization.scheme import QuantScheme
 from me2e_compress.registry.registry import WRITTEN
 from me2e_compress.targets import DEFAULT_TARGET, TARGETS, Target
-from me2e_compress.targets.quantized import describe_quantized
+from me2e_compress.targets.quantized import QUANTIZE, describe_quantized, pairs_of
 
 _SHOWN = 5
 """Number of items of a kind that a note lists."""
@@ -89,10 +89,12 @@ class QuantizeInt8(Pass):
             FramesError: neither frames nor ranges, or they are of another graph.
         """
         if found := describe_quantized(model):
+            # what is quantized while it runs has no ranges that could be written down
+            pairs = any(node.op_type == QUANTIZE for node in pairs_of(model))
+            rewrite = ", or let lower-int8 rewrite this one for onnxruntime"
             raise PreconditionError(
                 f"the graph is quantized already: {found}; int8 is not put on int8,"
-                " give the float graph that it was made of, or let lower-int8 rewrite"
-                " this one for onnxruntime"
+                f" give the float graph that it was made of{rewrite if pairs else ''}"
             )
         # Plan, and stop if there is nothing to do
         target, plan = self._runtime, self.plan(model, context)

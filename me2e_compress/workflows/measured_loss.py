@@ -23,6 +23,7 @@ from me2e_compress.manager.verification_inputs import VerificationInputs, relati
 from me2e_compress.passes import Pass
 from me2e_compress.passes.lower_int8 import LowerInt8
 from me2e_compress.passes.quantize_int8 import QuantizeInt8
+from me2e_compress.quantization.plan import plan_of
 from me2e_compress.runtime.frames import Array, Frame, Frames
 from me2e_compress.runtime.latency_trace import cpu_seconds
 from me2e_compress.runtime.providers import CPU, Provider
@@ -84,6 +85,7 @@ class MeasuredLoss:
             largest input alone is rounded; None if nothing is below.
         shortfalls: outputs below the floor, the worst first.
         guilty: the lossy passes, which cause the shortfalls between them.
+        int8_nodes: the nodes that are int8, where they are three at most.
         advice: the command that measures int8 module by module; empty where nothing is
             below the floor, or nothing is int8.
         liveness: which outputs still move; None if not asked.
@@ -100,6 +102,7 @@ class MeasuredLoss:
     runtime: RuntimeLoss | None = None
     shortfalls: tuple[Shortfall, ...] = ()
     guilty: tuple[str, ...] = ()
+    int8_nodes: tuple[str, ...] = ()
     advice: str = ""
     seconds: float = 0.0
     incomparable: bool = False
@@ -133,7 +136,8 @@ class MeasuredLoss:
             yield from self.fidelity.strays
         if self.shortfalls:
             low, guilty = ", ".join(map(str, self.shortfalls)), ", ".join(self.guilty)
-            yield f"below the floor ({self.floor}): {low}; lost in {guilty}"
+            nodes = f" ({', '.join(self.int8_nodes)})" if self.int8_nodes else ""
+            yield f"below the floor ({self.floor}): {low}; lost in {guilty}{nodes}"
         if self.advice:
             yield f"{self.advice} measures which modules lose it"
 
@@ -429,11 +433,14 @@ def _compared(
     unsteady = {name: rounding.values[name] for name in rounding.choices}
     below = loss.floor.shortfalls(fidelity, unsteady)
     int8 = any(isinstance(each, QuantizeInt8) for each in passes)
+    plan = plan_of(after) if below and int8 else None
+    placed = () if plan is None else plan.placed
     return dataclasses.replace(
         loss,
         unsteady=unsteady,
         rounding=rounding,
         shortfalls=below,
         guilty=tuple(each.name for each in passes) if below else (),
+        int8_nodes=tuple(e.node for e in placed) if len(placed) <= FEW else (),
         advice=ADVICE if below and int8 else "",
     )

@@ -95,6 +95,18 @@ def test_without_frames_there_is_no_calibration() -> None:
         QuantizeInt8(rules="paper").run(conv_attention(), Context(MODULES))
 
 
+def test_what_is_quantized_while_it_runs_is_not_lowered(context: Context) -> None:
+    model = ir.from_onnx_text(
+        """<ir_version: 9, opset_import: ["" : 17]>
+        g (float[2,4] x) => (int32[2,3] y) <int8[4,3] w = {1,2,3,4,5,6,7,8,9,1,2,3}> {
+            q, s, z = DynamicQuantizeLinear(x)
+            y = MatMulInteger(q, w, z)
+        }"""
+    )
+    with pytest.raises(PreconditionError, match=r"graph that it was made of$"):
+        QuantizeInt8().run(model, context)
+
+
 def test_a_quantized_graph_is_not_quantized_again(context: Context) -> None:
     once = (
         QuantizeInt8(rules="paper", target="tensorrt")

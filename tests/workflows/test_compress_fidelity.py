@@ -95,7 +95,8 @@ def test_lost_quality_is_named_with_the_command_that_finds_where(
 
     said = capsys.readouterr().out
     assert "below the floor (20 dB, 0.5 m of plan): bev" in said
-    assert "; lost in quantize-int8\n" in said
+    nodes = "/backbone/first, /backbone/second, /bev_encoder/project"
+    assert f"; lost in quantize-int8 ({nodes})\n" in said
     assert f"\n{ADVICE} measures which modules lose it\n" in said
 
     how = ("--rules", "paper", "--map", "map.toml", "-o", "r.toml")
