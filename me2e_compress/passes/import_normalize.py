@@ -15,6 +15,7 @@ from me2e_compress.graph.rewrite import lift_constants
 from me2e_compress.graph.rewrite.raise_opset import raise_opset
 from me2e_compress.graph.validity import ORIGINAL_DOMAIN, PLUGIN_DOMAIN
 from me2e_compress.passes.base import Context, Pass, PassResult
+from me2e_compress.passes.einsum_products import write_products
 
 __all__ = [
     "ORIGINAL_DOMAIN",
@@ -182,6 +183,8 @@ class ImportNormalize(Pass):
     6. Constant nodes become initializers.
     7. A model with functions declares at least IR version 8, and all used domains are
        imported.
+    8. An Einsum that is a product becomes a MatMul, and a weight in front of its
+       columns a Conv of one tap: layers, which become int8.
 
     Subgraphs and function bodies are included. Unknown operators are left alone.
 
@@ -217,6 +220,7 @@ class ImportNormalize(Pass):
                 if node.domain not in body.opset_imports:
                     body.opset_imports[node.domain] = 1
                     changes += 1
+        changes += write_products(model, self.name)
         return PassResult(model, changes, tuple(filter(None, (raise_note, note))))
 
 

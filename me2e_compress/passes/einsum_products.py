@@ -1,0 +1,175 @@
+"""Products that are written as Einsum, or with the weight in front, as layers."""
+
+import dataclasses
+import math
+import re
+from collections.abc import Sequence
+
+import numpy as np
+import onnx_ir as ir
+
+from me2e_compress.graph import array_of, is_standard, provenance, static_shape
+from me2e_compress.graph.nodes import FLOATS
+from me2e_compress.graph.rewrite import (
+    add_constant,
+    fresh_name,
+    graphs_of,
+    put,
+    value_names,
+)
+
+_TWO_OPERANDS = re.compile(r"([A-Za-z]+),([A-Za-z]+)->([A-Za-z]+)")
+
+
+def write_products(model: ir.Model, by: str) -> int:
+    """Rewrite Einsums of two operands, and weights in front of a product; count them.
+
+    Given:   y = Einsum<"bnd,ed->bne">(x, w)  ;  z = MatMul(w, x [batch, k, n])
+
+    Result:  y = MatMul(x, Transpose(w))      ;  z = Conv(x, w [m, k, 1])
+    """
+    count = 0
+    names = value_names(model.graph)
+    for body in graphs_of(model.graph):
+        for node in list(body):
+            if not is_standard(node) or node.outputs[0].dtype not in FLOATS:
+                continue
+            if node.op_type == "Einsum":
+                count += _write_einsum(node, names, by)
+            elif node.op_type == "MatMul":
+                count += _write_convolution(node, body, names, by)
+    return count
+
+
+@dataclasses.dataclass(frozen=True)
+class _Product:
+    """The labels of an Einsum: shared and kept, kept of either, and summed over."""
+
+    left: str
+    right: str
+    out: str
+    batch: str
+    rows: str
+    columns: str
+    summed: str
+
+    @classmethod
+    def of(cls, equation: str) -> "_Product | None":
+        """Read an equation; None where it is no product of two matrices."""
+        found = _TWO_OPERANDS.fullmatch(equation.replace(" ", ""))
+        if found is None:
+            return None
+        left, right, out = found.groups()
+        if any(len(set(labels)) < len(labels) for labels in (left, right, out)):
+            return None
+        batch = "".join(x for x in out if x in left and x in right)
+        rows = "".join(x for x in out if x in left and x not in right)
+        columns = "".join(x for x in out if x in right and x not in left)
+        summed = "".join(x for x in left if x in right and x not in out)
+        labels = {*batch, *rows, *columns, *summed}
+        if not rows or not columns or not summed or labels != {*left, *right, *out}:
+            return None
+        return cls(left, right, out, batch, rows, columns, summed)
+
+
+def _write_einsum(node: ir.Node, names: set[str], by: str) -> int:
+    product = _Product.of(node.attributes.get_string("equation", ""))
+    if product is None or None in node.inputs:
+        return 0
+    sizes = _sizes(node, product)
+    # rows may be several axes, if nothing is shared: MatMul broadcasts them
+    groups = [product.columns, product.summed]
+    groups += [product.rows] if product.batch else []
+    flat = any(len(labels) > 1 for labels in groups)
+    if flat and sizes is None:
+        return 0
+    write = _Writer(node, names, by)
+    batch, rows, columns = product.batch, product.rows, product.columns
+    left = write.turned(node.inputs[0], product.left, batch + rows + product.summed)
+    right = write.turned(
+        node.inputs[1], product.right, batch + product.summed + columns
+    )
+    if flat and sizes is not None:
+        size = {labels: math.prod(sizes[x] for x in labels) for labels in groups}
+        size[rows] = math.prod(sizes[x] for x in rows)
+        lead = [sizes[x] for x in batch]
+        left = write.shaped(left, [*lead, size[rows], size[product.summed]])
+        right = write.shaped(right, [*lead, size[product.summed], size[columns]])
+    result = write.node("MatMul", [left, right])
+    if flat and sizes is not None:
+        result = write.shaped(result, [sizes[x] for x in batch + rows + columns])
+    write.finish(result, batch + rows + columns, product.out)
+    return 1
+
+
+def _sizes(node: ir.Node, product: _Product) -> dict[str, int] | None:
+    """Return the size of every label; None where one is open."""
+    shapes = [static_shape(value) for value in node.inputs]
+    if shapes[0] is None or shapes[1] is None:
+        return None
+    return dict(zip(product.left + product.right, shapes[0] + shapes[1], strict=True))
+
+
+class _Writer:
+    """Writes nodes in front of one that goes."""
+
+    def __init__(self, old: ir.Node, names: set[str], by: str) -> None:
+        self.old, self.names, self.by = old, names, by
+
+    def node(
+        self, op: str, inputs: Sequence[ir.Value | None], perm: list[int] | None = None
+    ) -> ir.Value:
+        """Add a node of a standard operator, and return its output."""
+        name = fresh_name(f"{self.old.name}_{op}", self.names)
+        attributes = {} if perm is None else {"perm": perm}
+        new = ir.node(op, inputs, attributes, name=name)
+        new.outputs[0].name, new.outputs[0].type = name, self.old.outputs[0].type
+        provenance.inherit(new, [self.old], by=self.by)
+        graph = self.old.graph
+        assert isinstance(graph, ir.Graph)
+        graph.insert_before(self.old, new)
+        return new.outputs[0]
+
+    def turned(self, value: ir.Value | None, have: str, want: str) -> ir.Value | None:
+        """Transpose a value whose axes have labels, where their order is another."""
+        if have == want:
+            return value
+        return self.node("Transpose", [value], [have.index(label) for label in want])
+
+    def shaped(self, value: ir.Value | None, sizes: Sequence[int]) -> ir.Value:
+        """Reshape a value."""
+        graph = self.old.graph
+        assert isinstance(graph, ir.Graph)
+        shape = np.array(sizes, np.int64)
+        name = f"{self.old.name}_shape"
+        return self.node(
+            "Reshape", [value, add_constant(graph, shape, name, self.names)]
+        )
+
+    def finish(self, result: ir.Value, have: str, want: str) -> None:
+        """Let the last node take the place of the old one."""
+        last = result.producer()
+        assert last is not None
+        if have == want:
+            inputs, op, attributes = list(last.inputs), last.op_type, {}
+            graph = self.old.graph
+            assert isinstance(graph, ir.Graph)
+            graph.remove(last, safe=True)
+        else:
+            inputs, op = [result], "Transpose"
+            attributes = {"perm": [have.index(label) for label in want]}
+        put(self.old, op, inputs, by=self.by, attributes=attributes)
+
+
+def _write_convolution(node: ir.Node, graph: ir.Graph, names: set[str], by: str) -> int:
+    """Write the product of a weight with columns as a convolution of one tap."""
+    weight, columns = node.inputs
+    array, shape = array_of(weight), None if columns is None else columns.shape
+    if array is None or weight is None or array.ndim != 2 or shape is None:
+        return 0
+    if len(shape) != 3 or array_of(columns) is not None:
+        return 0
+    taps = add_constant(graph, array[:, :, None], f"{weight.name}_taps", names)
+    attributes = {"kernel_shape": [1]}
+    put(node, "Conv", [columns, taps], by=by, attributes=attributes)
+    return 1

@@ -1,0 +1,80 @@
+"""Einsums and weights in front become layers that answer the same."""
+
+import numpy as np
+import onnx_ir as ir
+import pytest
+
+from me2e_compress.passes.einsum_products import write_products
+from me2e_compress.runtime.session import run_once
+
+SIZES = dict(zip("abcdehnm", (2, 3, 4, 5, 6, 2, 7, 8), strict=True))
+
+
+def einsum(equation: str, *, open_batch: bool = False) -> ir.Model:
+    left, right, out = equation.replace("->", ",").replace(" ", "").split(",")
+    shapes = [
+        ",".join("?" if open_batch and x == "b" else str(SIZES[x]) for x in labels)
+        for labels in (left, right, out)
+    ]
+    return ir.from_onnx_text(
+        f"""<ir_version: 9, opset_import: ["" : 17]>
+        g (float[{shapes[0]}] x, float[{shapes[1]}] w) => (float[{shapes[2]}] y) {{
+            ["sum"] y = Einsum <equation: string = "{equation}"> (x, w)
+        }}"""
+    )
+
+
+def compare(model: ir.Model, *shapes: tuple[int, ...]) -> None:
+    random = np.random.default_rng(5)
+    feeds = {
+        str(port.name): random.normal(size=shape).astype(np.float32)
+        for port, shape in zip(model.graph.inputs, shapes, strict=True)
+    }
+    before = run_once(model, feeds)["y"]
+    assert write_products(model, "test") == 1
+    np.testing.assert_allclose(run_once(model, feeds)["y"], before, rtol=0, atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    "equation",
+    [
+        "bnc,cd->bnd", "bnd,ed->bne", "bnd,bmd->bnm", "bnm,bmd->bnd", "bhnd,bhmd->bhnm",
+        "bcnm,cd->bdnm", "bnhd,hde->bne", "nd , bmd->bnm", "bnd,bmd->mbn", "ncd,de->enc",
+        "nbd,bde->nbe", "bnhd,bmhd->bhnm",
+    ],
+)  # fmt: skip
+def test_a_product_of_two_operands_is_a_matmul(equation: str) -> None:
+    model = einsum(equation)
+    left, right = equation.replace(" ", "").partition("->")[0].split(",")
+    shapes = (tuple(SIZES[x] for x in labels) for labels in (left, right))
+    compare(model, *shapes)
+    assert "Einsum" not in {node.op_type for node in model.graph}
+
+
+@pytest.mark.parametrize(
+    "equation",
+    ["bnd,bnd->bn", "bn,cm->bncm", "bnd,md->bn", "bbd,de->be", "bnd,de->bd"],
+)
+def test_what_is_no_product_stays(equation: str) -> None:
+    model = einsum(equation)
+    assert write_products(model, "test") == 0
+
+
+def test_an_open_axis_is_no_obstacle_where_nothing_is_reshaped() -> None:
+    compare(einsum("bnc,cd->bnd", open_batch=True), (3, 7, 4), (4, 5))
+    assert write_products(einsum("bnhd,hde->bne", open_batch=True), "test") == 0
+
+
+@pytest.mark.parametrize("rank", [2, 3])
+def test_a_weight_in_front_of_columns_is_a_convolution(rank: int) -> None:
+    shape = (2, 4, 7)[3 - rank :]
+    model = ir.from_onnx_text(
+        f"""<ir_version: 9, opset_import: ["" : 17]>
+        g (float[{",".join(map(str, shape))}] x) => (float y)
+        <float[3,4] w = {{1,2,3,4,5,6,7,8,9,1,2,3}}> {{ ["p"] y = MatMul(w, x) }}"""
+    )
+    if rank == 2:
+        assert write_products(model, "test") == 0
+        return
+    compare(model, shape)
+    assert [node.op_type for node in model.graph] == ["Conv"]
