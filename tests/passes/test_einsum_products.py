@@ -39,8 +39,8 @@ def compare(model: ir.Model, *shapes: tuple[int, ...]) -> None:
     "equation",
     [
         "bnc,cd->bnd", "bnd,ed->bne", "bnd,bmd->bnm", "bnm,bmd->bnd", "bhnd,bhmd->bhnm",
-        "bcnm,cd->bdnm", "bnhd,hde->bne", "nd , bmd->bnm", "bnd,bmd->mbn", "ncd,de->enc",
-        "nbd,bde->nbe", "bnhd,bmhd->bhnm",
+        "bcnm,cd->bdnm", "bnhd,hde->bne", "nd , bmd->bnm", "bnd,bmd->mbn",
+        "nbd,bde->nbe", "bnhd,bmhd->bhnm", "ncd,de->enc",
     ],
 )  # fmt: skip
 def test_a_product_of_two_operands_is_a_matmul(equation: str) -> None:
