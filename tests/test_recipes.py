@@ -100,6 +100,7 @@ def test_bad_text_names_the_culprit(text: str, message: str) -> None:
         ("pass = 1\n", "has no .*pass"),
         ('[[pass]]\nname = "nobody"\n', "no pass 'nobody'"),
         ('[[pass]]\ndrop = ["occ"]\n', "no pass ''"),
+        ('scheme = "full"\n[[pass]]\nname = "sample"\n', "'scheme' stands beside"),
     ],
 )
 def test_a_bad_file_names_the_culprit(tmp_path: Path, text: str, message: str) -> None:

@@ -60,6 +60,11 @@ def load(name: str | Path) -> tuple[Pass, ...]:
     listed = entries if isinstance(entries, list) else []
     if not listed or not all(isinstance(entry, dict) for entry in listed):
         raise RecipeError(f"{name} has no [[pass]]")
+    if beside_them := [key for key in content if key != "pass"]:
+        raise RecipeError(
+            f"{name}: {beside_them[0]!r} stands beside [[pass]], where nothing is read;"
+            " options stand below the [[pass]] that they are of"
+        )
     built: list[Pass] = []
     for entry in listed:
         options = dict(entry)

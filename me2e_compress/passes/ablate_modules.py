@@ -106,6 +106,11 @@ class AblateModules(Pass):
             )
         for pattern in self.keep:
             result_of(model, Part(pattern))
+        if self.keep and not any(map(self._goes, model.graph)):
+            raise PreconditionError(
+                f"{self.name}: keep={list(self.keep)} keeps all of"
+                f" {', '.join(self.drop)}: nothing is left to remove"
+            )
         before, seeing = graph.node_count(model), _seeing(model, context.modules)
         # Separate the dropped modules from everything that stays
         _hand_over(model, self._goes)
