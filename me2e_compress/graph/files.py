@@ -17,7 +17,7 @@ from google.protobuf.message import DecodeError, Message
 from me2e_compress.display import reason
 from me2e_compress.errors import GraphError
 from me2e_compress.graph import structure
-from me2e_compress.graph.nodes import nodes_of
+from me2e_compress.graph.nodes import STANDARD, nodes_of
 from me2e_compress.graph.opset import lower
 from me2e_compress.graph.summary import weight_bytes
 from me2e_compress.graph.validity import PLAIN_INITIALIZERS_SINCE_IR
@@ -65,6 +65,7 @@ def load(path: str | Path) -> ir.Model:
     except GraphError as error:
         raise GraphError(f"{path}: {error}") from error
     ir.external_data.set_base_dir(model.graph, path.parent)
+    _name_standard(model)
     settle(model, path)
     lower(model, path)
     common.RemoveInitializersFromInputsPass()(model)
@@ -87,6 +88,16 @@ def _built(proto: onnx.ModelProto, in_order: bool) -> ir.Model:
             cause = cause.__cause__
         raise GraphError(f"not a valid ONNX graph ({reason(cause)})") from error
     return model
+
+
+def _name_standard(model: ir.Model) -> None:
+    """Write the standard domain, which may be called ``ai.onnx``, as the empty name."""
+    for body in (model.graph, *model.functions.values()):
+        for domain in STANDARD[1:]:
+            if domain in body.opset_imports:
+                body.opset_imports.setdefault("", body.opset_imports.pop(domain))
+        for node in body.all_nodes():
+            node.domain = "" if node.domain in STANDARD else node.domain
 
 
 def save(model: ir.Model, path: str | Path, *, external: bool | None = None) -> None:
