@@ -138,6 +138,8 @@ def compare(
 ) -> Fidelity:
     """Run two models over the same frames, each with its own recurrent state.
 
+    Outputs that are sequences or optional are left out.
+
     All arithmetic is float64. One frame is in memory at a time. ``a`` is the reference,
     and ``answers`` what it answered if it has run already; ``watch`` is shown the
     outputs of both on every frame, states included.
@@ -148,9 +150,10 @@ def compare(
         FramesError: a frame does not fit one of the models.
     """
     shared = [name for name in a.outputs if name in b.outputs]
+    shared = [name for name in shared if a.outputs[name].type.startswith("tensor(")]
     if not shared:
         raise EvaluationError(
-            f"no output in common: {', '.join(a.outputs)} and {', '.join(b.outputs)}"
+            f"no tensor in common: {', '.join(a.outputs)} and {', '.join(b.outputs)}"
         )
     # what can be compared: single outputs, and the plan
     tallies = {name: Tally(name) for name in shared}

@@ -170,7 +170,11 @@ class LivenessTally:
     """Watches how the outputs of two graphs move over frames."""
 
     def __init__(self, a: Session, b: Session) -> None:
-        names = [name for name in a.outputs if name in b.outputs]
+        names = [
+            name
+            for name, port in a.outputs.items()
+            if name in b.outputs and port.type.startswith("tensor(")
+        ]
         self._tallies = {name: OutputTally(name) for name in names}
         held = [name for name in a.recurrent if name in b.inputs]
         self._not_fed = tuple(name for name in held if name not in b.recurrent)

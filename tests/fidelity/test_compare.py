@@ -196,8 +196,18 @@ def test_small_channels_beside_large_ones_are_judged_apart() -> None:
 
 
 def test_models_with_nothing_in_common_are_not_compared() -> None:
-    with pytest.raises(EvaluationError, match=r"no output in common: y, .*modes"):
+    with pytest.raises(EvaluationError, match=r"no tensor in common: y, .*modes"):
         compare(scaled(1.0), planner(0), [ones(0, True)])
+
+
+def test_a_sequence_is_not_compared() -> None:
+    text = """<ir_version: 9, opset_import: ["" : 17]>
+    g (float[1,2] x) => (seq(float[1,2]) s%s) { r = Relu(x) s = SequenceConstruct(r) }"""
+    alone, beside = (ir.from_onnx_text(text % more) for more in ("", ", float[1,2] r"))
+    with pytest.raises(EvaluationError, match="no tensor in common: s and s"):
+        compare(Session(alone), Session(alone), [ones(0, True)])
+    found = compare(Session(beside), Session(beside), [ones(0, True)])
+    assert [each.name for each in found.outputs] == ["r"]
 
 
 def test_no_frames_is_an_error() -> None:
