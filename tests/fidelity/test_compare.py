@@ -202,7 +202,8 @@ def test_models_with_nothing_in_common_are_not_compared() -> None:
 
 def test_a_sequence_is_not_compared() -> None:
     text = """<ir_version: 9, opset_import: ["" : 17]>
-    g (float[1,2] x) => (seq(float[1,2]) s%s) { r = Relu(x) s = SequenceConstruct(r) }"""
+    g (float[1,2] x) => (seq(float[1,2]) s%s)
+    { r = Relu(x) s = SequenceConstruct(r) }"""
     alone, beside = (ir.from_onnx_text(text % more) for more in ("", ", float[1,2] r"))
     with pytest.raises(EvaluationError, match="no tensor in common: s and s"):
         compare(Session(alone), Session(alone), [ones(0, True)])
