@@ -171,8 +171,8 @@ def compare(
         for name, tally in tallies.items():
             tally.add(left[name], right[name], count)
         if adapter is not None:
-            here, there = (adapter.plan(each, frame.arrays) for each in (left, right))
-            gap = np.where(np.isnan(here) & np.isnan(there), 0.0, here - there)
+            plans = [adapter.plan(each, frame.arrays) for each in (left, right)]
+            gap = np.where(np.isnan(plans).all(axis=0), 0.0, plans[0] - plans[1])
             moved.append(np.nan_to_num(np.linalg.norm(gap, axis=1), nan=math.inf))
             if adapter.scores is not None:
                 chosen.append(adapter.choice(left) == adapter.choice(right))
@@ -248,7 +248,8 @@ class Tally:
             return
         # what is no number in both is no difference, in one alone noise without end
         numbers = np.isfinite(x) & np.isfinite(y)
-        strays = np.count_nonzero(~(numbers | (np.isnan(x) & np.isnan(y)) | (x == y)))
+        same = numbers | (np.isnan(x) & np.isnan(y)) | (x == y)
+        strays = int(np.count_nonzero(~same))
         if not numbers.all():
             x, y = np.where(numbers, x, 0.0), np.where(numbers, y, 0.0)
         self.count, self.strays = self.count + x.size, self.strays + strays

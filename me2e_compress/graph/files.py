@@ -92,7 +92,8 @@ def _built(proto: onnx.ModelProto, in_order: bool) -> ir.Model:
 
 def _name_standard(model: ir.Model) -> None:
     """Write the standard domain, which may be called ``ai.onnx``, as the empty name."""
-    for body in (model.graph, *model.functions.values()):
+    bodies: list[ir.Graph | ir.Function] = [model.graph, *model.functions.values()]
+    for body in bodies:
         for domain in STANDARD[1:]:
             if domain in body.opset_imports:
                 body.opset_imports.setdefault("", body.opset_imports.pop(domain))

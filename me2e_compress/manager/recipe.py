@@ -54,13 +54,14 @@ def load(name: str | Path) -> tuple[Pass, ...]:
             raise RecipeError(
                 f"no recipe {name}: no such file; we ship {', '.join(shipped())}"
             )
-        entries = documents.from_toml(content).get("pass")
+        tables = documents.from_toml(content)
     except documents.MalformedError as error:
         raise RecipeError(f"{name} is not TOML: {error}") from error
+    entries = tables.get("pass")
     listed = entries if isinstance(entries, list) else []
     if not listed or not all(isinstance(entry, dict) for entry in listed):
         raise RecipeError(f"{name} has no [[pass]]")
-    if beside_them := [key for key in content if key != "pass"]:
+    if beside_them := [key for key in tables if key != "pass"]:
         raise RecipeError(
             f"{name}: {beside_them[0]!r} stands beside [[pass]], where nothing is read;"
             " options stand below the [[pass]] that they are of"

@@ -107,7 +107,7 @@ def _by_symbol(model: ir.Model, sizes: Mapping[str, int]) -> dict[str, int]:
         PreconditionError: two places of one symbol have two sizes.
     """
     symbols = {
-        f"{value.name}:{axis}": dim.value
+        f"{value.name}:{axis}": str(dim.value)
         for value in model.graph.inputs
         for axis, dim in enumerate(value.shape or ())
         if isinstance(dim, ir.SymbolicDim) and _symbols(dim) == (dim.value,)

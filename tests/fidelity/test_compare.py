@@ -204,7 +204,7 @@ def test_a_sequence_is_not_compared() -> None:
     text = """<ir_version: 9, opset_import: ["" : 17]>
     g (float[1,2] x) => (seq(float[1,2]) s%s)
     { r = Relu(x) s = SequenceConstruct(r) }"""
-    alone, beside = (ir.from_onnx_text(text % more) for more in ("", ", float[1,2] r"))
+    alone, beside = (parsed(text % more) for more in ("", ", float[1,2] r"))
     with pytest.raises(EvaluationError, match="no tensor in common: s and s"):
         compare(Session(alone), Session(alone), [ones(0, True)])
     found = compare(Session(beside), Session(beside), [ones(0, True)])

@@ -69,15 +69,15 @@ def _not_converted(node: ir.Node, before: int) -> str:
         return "onnx converts it without its axis"
     if node.op_type != "Resize" or before >= _RESIZE_AS_IS:
         return ""
-    scales = array_of(node.inputs[1])
-    if scales is None or ((scales > 1).any() and (scales < 1).any()):
+    scales = _scales(node)
+    if not scales or (max(scales) > 1 and min(scales) < 1):
         return "it enlarges and shrinks"
     return ""
 
 
-def _shrinks(node: ir.Node) -> bool:
-    scales = array_of(node.inputs[1]) if len(node.inputs) > 1 else None
-    return scales is not None and bool((scales < 1).any())
+def _scales(node: ir.Node) -> list[float]:
+    array = array_of(node.inputs[1]) if len(node.inputs) > 1 else None
+    return [] if array is None else [float(each) for each in array]
 
 
 def _replace(
@@ -102,7 +102,7 @@ def _replace(
         if before < _RESIZE_AS_IS and new.op_type == "Resize":
             mode = "coordinate_transformation_mode"
             new.attributes[mode] = ir.AttrString(mode, "asymmetric")
-            nearest = "ceil" if _shrinks(node) else "floor"
+            nearest = "ceil" if min(_scales(node), default=1.0) < 1 else "floor"
             new.attributes["nearest_mode"] = ir.AttrString("nearest_mode", nearest)
         last = new.op_type == nodes[-1].op_type and place == len(nodes) - 1
         new.name = node.name if last else f"{node.name}_{new.op_type}_{place}"

@@ -27,7 +27,7 @@ def rules_of(
 
 def test_fp8_pairs_of_activation_and_weight_are_taken() -> None:
     w = helper.make_tensor("w", FP8, [32, 32], bytes(range(64)) * 16, raw=True)
-    scale = numpy_helper.from_array(np.float32(0.01), "s")
+    scale = numpy_helper.from_array(np.array(0.01, np.float32), "s")
     nodes = [
         helper.make_node("QuantizeLinear", ["x", "s", "z"], ["q"], name="q"),
         helper.make_node("DequantizeLinear", ["q", "s", "z"], ["d"], name="d"),
@@ -45,16 +45,17 @@ def test_int4_weights_alone_have_scales_by_block(kind: int, rules: set[str]) -> 
     values = [place % 15 - 7 for place in range(1024)]
     w = helper.make_tensor("w", kind, [32, 32], values)
     scale = numpy_helper.from_array(np.full((2, 32), 0.01, np.float32), "s")
-    attributes = {"axis": 0, "block_size": 16, "name": "wd"}
     nodes = [
-        helper.make_node("DequantizeLinear", ["w", "s"], ["wd"], **attributes),
+        helper.make_node(
+            "DequantizeLinear", ["w", "s"], ["wd"], name="wd", axis=0, block_size=16
+        ),
         helper.make_node("MatMul", ["x", "wd"], ["y"], name="product"),
     ]
     assert rules_of(nodes, [w, scale]) == rules
 
 
 def test_an_activation_in_int4_is_refused() -> None:
-    scale = numpy_helper.from_array(np.float32(0.01), "s")
+    scale = numpy_helper.from_array(np.array(0.01, np.float32), "s")
     zero = helper.make_tensor("z", INT4, [], [0])
     nodes = [
         helper.make_node("QuantizeLinear", ["x", "s", "z"], ["q"], name="q"),
