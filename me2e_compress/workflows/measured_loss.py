@@ -36,6 +36,9 @@ from me2e_compress.workflows.result import Listener
 
 NOT_ASKED = "--measure-frames 0"
 
+FEW_NODES = 3
+"""So many int8 nodes are named where the loss is."""
+
 FEW = 3
 """Fewer frames say little: four of one drive lay 12 to 15 dB from four others."""
 
@@ -441,6 +444,6 @@ def _compared(
         rounding=rounding,
         shortfalls=below,
         guilty=tuple(each.name for each in passes) if below else (),
-        int8_nodes=tuple(e.node for e in placed) if len(placed) <= FEW else (),
+        int8_nodes=tuple(e.node for e in placed) if len(placed) <= FEW_NODES else (),
         advice=ADVICE if below and int8 else "",
     )
