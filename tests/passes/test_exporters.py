@@ -4,12 +4,14 @@ from pathlib import Path
 
 import onnx
 import onnx_ir as ir
+import pytest
 from onnx import TensorProto, helper
 
 from me2e_compress import graph
 from me2e_compress.graph.modules import ModuleMap
 from me2e_compress.manager import PassManager, Report, recipe
 from me2e_compress.passes import Context
+from tests.nets import parsed
 
 STANDARD, OWN = helper.make_opsetid("", 17), helper.make_opsetid("my", 1)
 PORTS = [
@@ -20,6 +22,74 @@ PORTS = [
 def exact(model: ir.Model) -> Report:
     """Run the recipe; the manager proves that the outputs are the same."""
     return PassManager(recipe.load("exact")).run(model, Context(ModuleMap.whole()))
+
+
+def settled(text: str) -> list[str]:
+    """Run `exact`, which must leave nothing to do; list what is left."""
+    report = exact(parsed(text))
+    again = exact(report.model)
+    assert not any(step.changes for step in again.steps)
+    return [node.op_type for node in again.model.graph]
+
+
+def test_a_constant_in_the_type_of_a_value_is_folded() -> None:
+    assert settled(
+        """g (float[1,1,8,8] x) => (float[1,2,8,8] y)
+        <float[2,1,1,1] w = {1,2}, float[2] s = {1,2}, float[2] m = {0,1}> {
+            zero = Constant <value_float = 0.0> ()
+            like = CastLike (zero, x)
+            two = Constant <value_ints = [2]> ()
+            b = Expand (like, two)
+            c = Conv <kernel_shape = [1,1]> (x, w, b)
+            y = BatchNormalization (c, s, m, m, s)
+        }"""
+    ) == ["Conv"]
+
+
+TILE = """g (float[1,3] x, bool c) => (float[2,3] y) {
+    repeats = Constant <value_ints = [2,1]> () zero = Constant <value_int = 0> ()
+    shape = Shape (x) rank = Size (shape) two = Constant <value_int = 2> ()
+    d = Sub (two, rank) known = Greater (d, zero)
+    r = If (%s) <
+        then_branch = t () => (int64[3] s) {
+            one = Constant <value_ints = [1]> () n = Reshape (d, one)
+            e = Expand (one, n) s = Concat <axis = 0> (e, repeats)
+        },
+        else_branch = f () => (int64[2] q) { q = Identity (repeats) }
+    >
+    y = Tile (x, r)
+}"""
+
+
+@pytest.mark.parametrize(("condition", "left"), [("known", "Tile"), ("c", "If")])
+def test_branches_may_declare_shapes_that_differ(condition: str, left: str) -> None:
+    assert settled(TILE % condition)[0] == left
+
+
+def test_a_branch_behind_a_branch_is_taken_too() -> None:
+    """`if x.size(1) == 1: x = x.squeeze(1)`, and back, three times."""
+    lines, source = [], "x"
+    for n in range(6):
+        axes, op = ("[1]", "Squeeze") if n % 2 == 0 else ("[1]", "Unsqueeze")
+        rank = 3 if op == "Squeeze" else 2
+        lines.append(
+            f"""s{n} = Shape ({source}) n{n} = Size (s{n})
+            k{n} = Constant <value_int = {rank}> () e{n} = Equal (n{n}, k{n})
+            a{n} = Constant <value_ints = {axes}> ()
+            v{n} = If (e{n}) <then_branch = t () => (float t{n}) {{
+                t{n} = {op} ({source}, a{n}) }}, else_branch = f () => (float f{n}) {{
+                f{n} = Identity ({source}) }}>"""
+        )
+        source = f"v{n}"
+    for node in (
+        model := parsed(f"""g (float[4,1,3] x) => (float[4,1,3] y) {{
+        {" ".join(lines)} y = Relu ({source}) }}""")
+    ).graph:
+        if node.op_type == "If":
+            node.outputs[0].shape = None
+            for name in ("then_branch", "else_branch"):
+                node.attributes[name].as_graph().outputs[0].shape = None
+    assert "If" not in [node.op_type for node in exact(model).model.graph]
 
 
 def test_a_function_may_import_its_own_domain() -> None:

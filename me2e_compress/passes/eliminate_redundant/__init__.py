@@ -8,20 +8,17 @@ from typing import ClassVar
 import onnx_ir as ir
 import onnx_ir.passes.common as common
 
-from me2e_compress.graph import array_of, infer_shapes, opset_of, provenance
+from me2e_compress.graph import infer_shapes, opset_of, provenance
 from me2e_compress.graph.nodes import DRAWS, attribute_values
 from me2e_compress.graph.rewrite import (
     bypass,
     can_replace,
-    fresh_name,
     graphs_of,
     has_subgraph,
     is_read,
     is_standard,
     remove_dead,
     remove_node,
-    replace_value,
-    value_names,
 )
 from me2e_compress.passes.base import Context, Pass, PassResult
 from me2e_compress.passes.eliminate_redundant.rules import (
@@ -29,7 +26,6 @@ from me2e_compress.passes.eliminate_redundant.rules import (
     identity_of,
     merge,
 )
-from me2e_compress.passes.fold_constants.knowledge import branch_fits
 
 COMMUTATIVE = frozenset({"Add", "And", "Equal", "Mul", "Or", "Xor"})
 
@@ -176,10 +172,6 @@ class EliminateRedundant(Pass):
             remove_node(node)
             tally["unread"] += 1
             return makers
-        inlined = _inline_branch(node, site.opset, self.name)
-        if inlined is not None:
-            tally["branches"] += 1
-            return inlined
         # A node that repeats its input is bypassed
         same = identity_of(node, site.opset)
         if same is not None and bypass(node.outputs[0], same):
@@ -196,59 +188,3 @@ class EliminateRedundant(Pass):
 def _count_declared(model: ir.Model) -> int:
     inner = sum(len(body.opset_imports) for body in model.functions.values())
     return len(model.functions) + len(model.opset_imports) + inner
-
-
-def _inline_branch(node: ir.Node, opset: int, by: str) -> list[ir.Node] | None:
-    """Replace an If whose condition is known by the nodes of its branch.
-
-    It stays (None) where its branch passes an outer value on as a graph output, or
-    where a reader would refuse the branch's shape, which the If had hidden from it.
-    """
-    graph = node.graph
-    chosen = array_of(node.inputs[0]) if node.inputs else None
-    if node.op_type != "If" or chosen is None or not isinstance(graph, ir.Graph):
-        return None
-    # Choose the branch and check that it can take the place
-    branch = node.attributes[
-        "then_branch" if chosen.reshape(-1)[0] else "else_branch"
-    ].as_graph()
-    results = list(branch.outputs)
-    if len(set(results)) < len(results):
-        return None
-    for old, new in zip(node.outputs, results, strict=True):
-        if old.is_graph_output() and new.producer() is None:
-            return None
-        outside = new.producer() is not None and new.graph is not branch
-        if outside and not can_replace(old, new):
-            return None
-    if not branch_fits(node, branch, opset):
-        return None
-    # Move the nodes out and rewire their readers
-    nodes = list(branch)
-    _move(branch, node, graph, by)
-    for old, new in zip(node.outputs, results, strict=True):
-        replace_value(old, new)
-    remove_node(node)
-    return nodes
-
-
-def _move(branch: ir.Graph, node: ir.Node, graph: ir.Graph, by: str) -> None:
-    names = value_names(graph)
-    weights = list(branch.initializers.values())
-    nodes = list(branch)
-    # Detach everything before it enters the outer graph
-    branch.outputs.clear()
-    branch.initializers.clear()
-    branch.remove(nodes)
-    # Names must be unique in the whole model
-    for value in weights:
-        value.name = fresh_name(value.name or "weight", names)
-        if value.const_value is not None:
-            value.const_value.name = value.name
-        graph.register_initializer(value)
-    for inner in nodes:
-        for value in inner.outputs:
-            if value.name:
-                value.name = fresh_name(value.name, names)
-        provenance.inherit(inner, (inner, node), by=by)
-    graph.insert_before(node, nodes)

@@ -38,6 +38,7 @@ from me2e_compress.graph.rewrite import (
 from me2e_compress.graph.summary import value_bytes
 from me2e_compress.passes.base import Context, Pass, PassResult
 from me2e_compress.passes.fold_constants import knowledge
+from me2e_compress.passes.fold_constants.branches import inline_branches
 from me2e_compress.passes.fold_constants.knowledge import (
     Expression,
     Knowledge,
@@ -186,6 +187,7 @@ class _Tally:
     reshaped: int = 0
     dead: int = 0
     folded: int = 0
+    inlined: int = 0
     stored: int = 0
     kept: int = 0
     growth_bytes: int = 0
@@ -193,7 +195,7 @@ class _Tally:
 
     @property
     def changes(self) -> int:
-        return self.lifted + self.reshaped + self.dead + self.folded
+        return self.lifted + self.reshaped + self.dead + self.folded + self.inlined
 
 
 @dataclasses.dataclass(frozen=True)
@@ -225,23 +227,37 @@ class FoldConstants(Pass):
         declared = [value.shape for value in model.graph.outputs]
         opset = graphs.opset_of(model)
         for body in graphs_of(model.graph):
+            tally.reshaped += _write_casts(body, self.name)
             tally.reshaped += _reshape_bounds(body, opset, self.name)
-        # Fold until nothing changes
-        before = -1
+        # Fold until nothing changes; a branch that is not taken is never looked into
+        before, fresh = -1, set[ir.Value]()
         while tally.changes > before:
             before = tally.changes
             tally.dead += remove_dead(model.graph)
             tally.kept = 0
-            for body in list(graphs_of(model.graph)):
-                self._fold(body, opset, tally, trust=body is model.graph)
+            self._fold(model.graph, opset, tally, fresh, trust=True)
+            taken = inline_branches(model.graph, opset, self.name)
+            fresh = {value for node in taken or () for value in node.inputs if value}
+            if taken is not None:
+                tally.inlined += 1
+                continue
+            for body in list(graphs_of(model.graph))[1:]:
+                self._fold(body, opset, tally, set(), trust=False)
         # Shapes of graph outputs may have become known
         found = [value.shape for value in model.graph.outputs]
         refined = sum(a is not b for a, b in zip(declared, found, strict=True))
         return PassResult(model, tally.changes + refined, _notes(tally))
 
-    def _fold(self, body: ir.Graph, opset: int, tally: _Tally, *, trust: bool) -> None:
+    def _fold(
+        self,
+        body: ir.Graph,
+        opset: int,
+        tally: _Tally,
+        fresh: set[ir.Value],
+        *,
+        trust: bool,
+    ) -> None:
         refused: set[ir.Node] = set()
-        fresh: set[ir.Value] = set()
         while True:
             # Collect constant expressions and choose what to store
             known = Sweep(
@@ -290,6 +306,8 @@ def _notes(tally: _Tally) -> tuple[str, ...]:
             f" {counted(tally.stored, 'initializer')}"
             f" ({tally.growth_bytes:+,} bytes)"
         )
+    if tally.inlined:
+        notes.append("branches took the places of Ifs whose conditions are known")
     if tally.kept:
         kept = counted(tally.kept, "node")
         notes.append(f"{kept} left to compute constants: smaller than their values")
@@ -345,6 +363,9 @@ def _commit(
 def _keep_output(
     graph: ir.Graph, node: ir.Node, value: ir.Value, weight: ir.Value, name: str
 ) -> None:
+    # A branch may declare another shape than its result has
+    if graphs.static_shape(value) is not None:
+        value.shape = weight.shape
     if len(node.outputs) == 1:
         put(node, "Identity", [weight], by=name)
         return
@@ -355,6 +376,23 @@ def _keep_output(
     new = identity.outputs[0]
     new.name, new.type, new.shape = value.name, value.type, value.shape
     replace_value(value, new)
+
+
+def _write_casts(graph: ir.Graph, by: str) -> int:
+    """Write CastLike as the Cast that it is, where the type is known, and count them.
+
+    Its second input is a value of the frame, so that nothing could be folded.
+    """
+    count = 0
+    for node in list(graph):
+        like = node.inputs[1] if node.op_type == "CastLike" else None
+        if like is None or like.dtype is None or node.domain != "":
+            continue
+        attributes = {name: each.value for name, each in node.attributes.items()}
+        to = {"to": int(like.dtype)}
+        put(node, "Cast", node.inputs[:1], by=by, attributes={**attributes, **to})
+        count += 1
+    return count
 
 
 def _reshape_bounds(graph: ir.Graph, opset: int, by: str) -> int:
