@@ -8,7 +8,7 @@ from typing import ClassVar
 import onnx_ir as ir
 import onnx_ir.passes.common as common
 
-from me2e_compress.graph import infer_shapes, opset_of, provenance
+from me2e_compress.graph import infer_shapes, opset_of, provenance, static_shape
 from me2e_compress.graph.nodes import DRAWS, attribute_values
 from me2e_compress.graph.rewrite import (
     bypass,
@@ -132,15 +132,16 @@ class EliminateRedundant(Pass):
         tally["unread"] += remove_dead(model.graph)
         # Repeat: each round enables rules for the next
         for _ in range(ROUNDS):
-            before, branches = tally.total(), tally["branches"]
-            outputs = list(model.graph.outputs)
+            before = tally.total()
             for body in graphs_of(model.graph):
                 self._round(body, opset_of(model), tally)
-            if tally["branches"] > branches or outputs != list(model.graph.outputs):
-                infer_shapes(model)  # in a branch less is known; of an output, more
             tally["unread"] += remove_dead(model.graph)
             if tally.total() == before:
                 break
+            # what read a removed node may know its shape now, and another rule apply
+            values = (value for node in model.graph for value in node.outputs)
+            if any(static_shape(value) is None for value in values):
+                infer_shapes(model)
         # Remove functions and opsets that are no longer used
         declared = _count_declared(model)
         functions = common.RemoveUnusedFunctionsPass()  # type: ignore[no-untyped-call]
