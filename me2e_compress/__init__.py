@@ -155,15 +155,7 @@ __all__ = [
     "write_study",
 ]
 
-_MODULES = (
-    "errors",
-    "evaluators",
-    "graph",
-    "passes",
-    "registry",
-    "targets",
-    "testing",
-)
+_MODULES = ("errors", "evaluators", "graph", "passes", "registry", "targets", "testing")
 """Packages and modules whose names are public; they load when they are asked for."""
 
 _ROOMS = {

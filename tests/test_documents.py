@@ -57,8 +57,7 @@ def test_a_pipe_is_no_text_file(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "load",
-    [ModuleMap.load, load_plan, Overrides.load, Ranges.load, recipe.load],
+    "load", [ModuleMap.load, load_plan, Overrides.load, Ranges.load, recipe.load]
 )
 def test_every_document_of_the_user_is_bounded(
     tmp_path: Path, load: Callable[[Path], object]

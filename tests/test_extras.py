@@ -208,8 +208,7 @@ def test_a_missing_extra_is_asked_for_before_work_starts(
 ) -> None:
     first = MODULES[extra][0]
     monkeypatch.setattr(
-        "importlib.util.find_spec",
-        lambda name: None if name == first else object(),
+        "importlib.util.find_spec", lambda name: None if name == first else object()
     )
     with pytest.raises(MissingExtraError) as caught:
         need_extra(extra, "this")
@@ -247,9 +246,7 @@ def test_a_module_that_a_package_lacks_is_told_as_that_package(
     assert told.args == ("onnxslim", "bench", "No module named 'not_to_be_had'")
 
 
-def test_a_defect_of_ours_keeps_its_traceback(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_defect_of_ours_keeps_its_traceback(monkeypatch: pytest.MonkeyPatch) -> None:
     def broken(standalone_mode: bool, prog_name: str) -> None:
         raise ModuleNotFoundError("No module named 'x'", name="me2e_compress.nothing")
 

@@ -11,12 +11,7 @@ from typing import Any, Self
 
 from me2e_compress.driving.policies import Driver
 from me2e_compress.errors import EvaluationError
-from me2e_compress.evaluators.contract import (
-    Drive,
-    Driven,
-    Evaluator,
-    Listener,
-)
+from me2e_compress.evaluators.contract import Drive, Driven, Evaluator, Listener
 from me2e_compress.metrics.episode import Episode
 from me2e_compress.metrics.route_scores import route_score
 from me2e_compress.registry import documents

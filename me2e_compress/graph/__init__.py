@@ -5,13 +5,7 @@ package says about it, besides walking nodes and values.
 """
 
 from me2e_compress.graph.digest import digest
-from me2e_compress.graph.files import (
-    data_names,
-    file_bytes,
-    load,
-    save,
-    sha256_of,
-)
+from me2e_compress.graph.files import data_names, file_bytes, load, save, sha256_of
 from me2e_compress.graph.nodes import (
     array_of,
     graphs_of,

@@ -58,10 +58,7 @@ def carry(model: ir.Model, grown: ir.Value, old: ir.Value, what: str) -> None:
 
 
 def _reshape(
-    where: ir.Graph,
-    node: ir.Node,
-    was: dict[ir.Value, tuple[int, ...]],
-    what: str,
+    where: ir.Graph, node: ir.Node, was: dict[ir.Value, tuple[int, ...]], what: str
 ) -> None:
     """Update a constant shape; the grown axis must be neither split nor merged."""
     # The shapes before and after must be known

@@ -238,10 +238,7 @@ class Substitution:
 
 
 def means_of(
-    model: ir.Model,
-    values: Sequence[ir.Value],
-    context: Context,
-    file: Path | None,
+    model: ir.Model, values: Sequence[ir.Value], context: Context, file: Path | None
 ) -> tuple[dict[str, Array], str]:
     """Read means by value name from a file, or measure them; also name their source.
 

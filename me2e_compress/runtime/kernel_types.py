@@ -10,9 +10,7 @@ from typing import Any, TypeAlias
 
 import onnx
 import onnx_ir as ir
-from onnxruntime.capi import (
-    onnxruntime_pybind11_state as _native,  # pyright: ignore[reportAttributeAccessIssue]
-)
+from onnxruntime.capi import onnxruntime_pybind11_state as _native  # pyright: ignore[reportAttributeAccessIssue]
 
 from me2e_compress.graph import opset_of
 from me2e_compress.graph.nodes import is_read, is_standard, nodes_in

@@ -9,9 +9,7 @@ from pathlib import Path
 from typing import ClassVar, Literal, TypeAlias
 
 import onnxruntime as ort
-from onnxruntime.capi import (
-    onnxruntime_pybind11_state as _native,  # pyright: ignore[reportAttributeAccessIssue]
-)
+from onnxruntime.capi import onnxruntime_pybind11_state as _native  # pyright: ignore[reportAttributeAccessIssue]
 from pydantic import GetCoreSchemaHandler
 from pydantic_core import CoreSchema
 

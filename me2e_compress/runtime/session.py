@@ -13,9 +13,7 @@ from typing import Literal, TypeAlias, cast
 import numpy as np
 import onnx_ir as ir
 import onnxruntime as ort
-from onnxruntime.capi import (
-    onnxruntime_pybind11_state as _native,  # pyright: ignore[reportAttributeAccessIssue]
-)
+from onnxruntime.capi import onnxruntime_pybind11_state as _native  # pyright: ignore[reportAttributeAccessIssue]
 
 from me2e_compress import graph
 from me2e_compress.errors import FramesError, GraphError

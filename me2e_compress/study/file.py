@@ -89,9 +89,7 @@ def load_study(
         )
     plugins = (*study.provider.plugins, *study.plugins)
     study = dataclasses.replace(
-        study,
-        provider=dataclasses.replace(study.provider, plugins=plugins),
-        plugins=(),
+        study, provider=dataclasses.replace(study.provider, plugins=plugins), plugins=()
     )
     study.provider.check()
     # routes are the evaluator's, which may take none

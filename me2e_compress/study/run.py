@@ -15,12 +15,7 @@ from me2e_compress.metrics.route_summary import difference
 from me2e_compress.metrics.scores import score
 from me2e_compress.study.condition import Condition
 from me2e_compress.study.definition import Study
-from me2e_compress.study.drive_record import (
-    Contrast,
-    DriveRecord,
-    apart,
-    chosen_pairs,
-)
+from me2e_compress.study.drive_record import Contrast, DriveRecord, apart, chosen_pairs
 from me2e_compress.study.file import load_study
 from me2e_compress.study.outcome import VariantOutcome, judge, this_machine
 from me2e_compress.study.prepared import PreparedVariant, prepare_all

@@ -230,10 +230,7 @@ def named_weights(metadata: Mapping[str, str]) -> str:
 _SHAPES = "import-normalize,fold-constants{through_compute=false}"
 
 
-def inspect(
-    model: str | Path,
-    options: InspectOptions | None = None,
-) -> InspectResult:
+def inspect(model: str | Path, options: InspectOptions | None = None) -> InspectResult:
     """Read a graph, and weigh its modules.
 
     Raises:

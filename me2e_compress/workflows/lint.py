@@ -147,9 +147,7 @@ class LintResult(Result):
 
 
 def lint(
-    model: str | Path,
-    options: LintOptions | None = None,
-    listener: Listener = SILENT,
+    model: str | Path, options: LintOptions | None = None, listener: Listener = SILENT
 ) -> LintResult:
     """Check a graph for the runtime that will run it.
 

@@ -242,9 +242,7 @@ def _read(path: Path) -> QuantPlan | ir.Model:
 
 
 def _check_options(
-    options: PlanOptions,
-    files: Sequence[Path],
-    read: Sequence[QuantPlan | ir.Model],
+    options: PlanOptions, files: Sequence[Path], read: Sequence[QuantPlan | ir.Model]
 ) -> None:
     """Refuse options that would change nothing, because all plans are made already."""
     names = ("scheme", "rules", "target", "overrides")

@@ -219,9 +219,7 @@ class ExaminationResult(Result):
 
 
 def examine_routes(
-    manifest: str | Path,
-    pick: str = "all",
-    listener: Listener = SILENT,
+    manifest: str | Path, pick: str = "all", listener: Listener = SILENT
 ) -> ExaminationResult:
     """Examine a set of routes again; `pick` is ``all``, a number or ``ID,ID``."""
     need_extra("highway", "examining routes")

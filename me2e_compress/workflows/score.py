@@ -27,11 +27,7 @@ from me2e_compress.metrics.scores import (
 )
 from me2e_compress.workflows.options import EerOptions, check_budget
 from me2e_compress.workflows.result import SILENT, Listener, Result, Shown
-from me2e_compress.workflows.score_eer import (
-    EerScores,
-    estimate_cells,
-    score_eer,
-)
+from me2e_compress.workflows.score_eer import EerScores, estimate_cells, score_eer
 
 STANDING = "the ego stood most of the time, which is comfortable: see comfort in motion"
 _NAMED = 5

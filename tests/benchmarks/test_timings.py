@@ -26,12 +26,7 @@ from benchmarks.runtime_files import REFERENCE
 from benchmarks.subject import Subject
 from me2e_compress.runtime.energy.energy_counter import EnergySchedule
 from me2e_compress.runtime.energy.energy_result import Absent
-from me2e_compress.runtime.providers import (
-    CPU,
-    CpuProvider,
-    Provider,
-    TensorRtProvider,
-)
+from me2e_compress.runtime.providers import CPU, CpuProvider, Provider, TensorRtProvider
 from models.stacks import UNIAD_TINY
 from models.tests.vad.sizes import SIZES
 from models.vad.stack import VadTiny

@@ -123,10 +123,7 @@ def test_what_would_be_refused_is_listed_and_fails(cli: Cli, tmp_path: Path) -> 
             " --target-version 8.6.1.2",
             "m.onnx for tensorrt 8.6.1.2: 1 error, 0 warnings",
         ),
-        (
-            " --target-version 10.12",
-            "m.onnx for tensorrt 10.12: 0 errors, 0 warnings",
-        ),
+        (" --target-version 10.12", "m.onnx for tensorrt 10.12: 0 errors, 0 warnings"),
     ],
 )
 def test_a_version_refuses_what_came_later(

@@ -84,8 +84,7 @@ def test_the_lint_names_it_although_a_pool_is_wrong_too(
     cli: Cli, tmp_path: Path
 ) -> None:
     text = SAMPLED.replace(
-        "y = MatMul(o, w)",
-        "p = Pad(o, pads) y = MaxPool<kernel_shape=[3,3]>(p)",
+        "y = MatMul(o, w)", "p = Pad(o, pads) y = MaxPool<kernel_shape=[3,3]>(p)"
     ).replace("<double h", "<int64[8] pads = {0,0,1,1,0,0,1,1}, double h")
     write(tmp_path, text)
 

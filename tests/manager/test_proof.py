@@ -163,8 +163,7 @@ REDUCED = """m (float[1,1,16] x, custom) => (float[1,1,1] y) <int64[1] axes = {2
 
 
 @pytest.mark.parametrize(
-    ("axis", "reason"),
-    [(3, "axis must be in"), (0, r"y is \[1,1,16\], not \[1,1,1\]")],
+    ("axis", "reason"), [(3, "axis must be in"), (0, r"y is \[1,1,16\], not \[1,1,1\]")]
 )
 def test_a_wrong_axis_is_caught_without_a_run(
     axis: int, reason: str, context: Context

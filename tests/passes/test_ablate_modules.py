@@ -238,11 +238,7 @@ def test_means_from_a_file_go_before_frames(
     ],
 )
 def test_means_of_another_graph(
-    tmp_path: Path,
-    name: str,
-    array: np.ndarray,
-    error: type[Exception],
-    words: str,
+    tmp_path: Path, name: str, array: np.ndarray, error: type[Exception], words: str
 ) -> None:
     file = tmp_path / "means.npz"
     np.savez(file, **{name: array})  # type: ignore[arg-type]

@@ -105,9 +105,7 @@ def test_what_the_options_keep(step: ConvertFloat16) -> None:
 def test_no_such_module() -> None:
     with pytest.raises(ModuleMapError):
         check_pass(
-            ConvertFloat16(keep_modules=("wheels",)),
-            conv_attention(),
-            Context(MODULES),
+            ConvertFloat16(keep_modules=("wheels",)), conv_attention(), Context(MODULES)
         )
 
 

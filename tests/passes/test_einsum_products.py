@@ -53,8 +53,7 @@ def test_a_product_of_two_operands_is_a_matmul(equation: str) -> None:
 
 
 @pytest.mark.parametrize(
-    "equation",
-    ["bnd,bnd->bn", "bn,cm->bncm", "bnd,md->bn", "bbd,de->be", "bnd,de->bd"],
+    "equation", ["bnd,bnd->bn", "bn,cm->bncm", "bnd,md->bn", "bbd,de->be", "bnd,de->bd"]
 )
 def test_what_is_no_product_stays(equation: str) -> None:
     model = einsum(equation)

@@ -123,8 +123,7 @@ def test_the_standard_domain_may_have_its_name(tmp_path: Path) -> None:
     held = helper.make_graph(nodes, "g", PORTS[:1], PORTS[1:])
     opsets = [helper.make_opsetid("ai.onnx", 17)]
     onnx.save(
-        helper.make_model(held, opset_imports=opsets, ir_version=8),
-        tmp_path / "m.onnx",
+        helper.make_model(held, opset_imports=opsets, ir_version=8), tmp_path / "m.onnx"
     )
 
     result = exact(graph.load(tmp_path / "m.onnx"))

@@ -14,11 +14,7 @@ from me2e_compress.graph.modules import ModuleMap
 from me2e_compress.graph.rewrite import Array
 from me2e_compress.graph.summary import weight_bytes
 from me2e_compress.passes import Context
-from me2e_compress.passes.fold_constants import (
-    ENTRY_BYTES,
-    FoldConstants,
-    knowledge,
-)
+from me2e_compress.passes.fold_constants import ENTRY_BYTES, FoldConstants, knowledge
 from me2e_compress.passes.fold_constants.knowledge import Knowledge
 from me2e_compress.runtime.session import REFUSALS
 from tests.passes.small import NO_MODULES, apply, compute, ops, read

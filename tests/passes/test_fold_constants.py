@@ -114,8 +114,7 @@ def test_what_is_random_or_quantized_stays(call: str) -> None:
 
 
 @pytest.mark.parametrize(
-    "kind",
-    [ml_dtypes.bfloat16, ml_dtypes.float8_e4m3fn, ml_dtypes.float8_e5m2],
+    "kind", [ml_dtypes.bfloat16, ml_dtypes.float8_e4m3fn, ml_dtypes.float8_e5m2]
 )
 def test_unusual_types_stay_whole(kind: Any) -> None:
     text = """

@@ -11,9 +11,7 @@ from me2e_compress.graph import provenance
 from me2e_compress.graph.modules import ModuleMap
 from me2e_compress.graph.provenance import Provenance
 from me2e_compress.passes import Context, fold_with_onnxsim
-from me2e_compress.passes.fold_with_onnxsim import (
-    FoldWithOnnxsim,
-)
+from me2e_compress.passes.fold_with_onnxsim import FoldWithOnnxsim
 
 CONTEXT = Context(
     ModuleMap.parse('[modules.neck]\nrole = "feature"\npatterns = ["neck"]', "one")

@@ -120,8 +120,7 @@ def test_a_residual_add_stays_and_is_reported() -> None:
 
 
 @pytest.mark.parametrize(
-    ("shape", "left"),
-    [("float[5,4]", ["Gemm"]), ("float[2,5,4]", ["MatMul", "Add"])],
+    ("shape", "left"), [("float[5,4]", ["Gemm"]), ("float[2,5,4]", ["MatMul", "Add"])]
 )
 def test_only_matrices_become_gemm(shape: str, left: list[str]) -> None:
     out = shape.replace("4]", "8]")

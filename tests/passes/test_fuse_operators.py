@@ -228,10 +228,7 @@ LEFT: dict[str, tuple[Any, str]] = {
     "channels": (plain(weights="float[6,4,9,3]"), "from channel to channel"),
     "spread": (plain(weights="float[2,6,4,9,3]", axes=(4,)), "not multiplied"),
     "summed": (plain(axes=(1, 3)), "over channels or heads too"),
-    "unknown": (
-        plain(weights="float[6,1,9,3]").clone(),
-        "run fold-constants first",
-    ),
+    "unknown": (plain(weights="float[6,1,9,3]").clone(), "run fold-constants first"),
 }
 
 

@@ -110,12 +110,7 @@ ONE_ROW_OF_TWO = (
         "v0 = Neg(x) v1 = Expand(v0, c0) v2 = Add(v1, c1) v3 = Gather(v2, c2)"
         " y = MatMul(v3, w)",
     ),
-    {
-        "w": normal(1, 1),
-        "c0": integers(2, 1, 1, 1),
-        "c1": normal(1),
-        "c2": integers(0),
-    },
+    {"w": normal(1, 1), "c0": integers(2, 1, 1, 1), "c1": normal(1), "c2": integers(0)},
 )
 """The product is of one row already; the sum in front of it need not be of two."""
 

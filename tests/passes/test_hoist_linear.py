@@ -8,14 +8,7 @@ from me2e_compress.graph import infer_shapes, provenance
 from me2e_compress.passes.fold_constants import FoldConstants
 from me2e_compress.passes.hoist_linear import HoistLinear
 from tests.calls import calls
-from tests.passes.hoisted import (
-    difference,
-    graph_of,
-    hoist,
-    integers,
-    normal,
-    products,
-)
+from tests.passes.hoisted import difference, graph_of, hoist, integers, normal, products
 from tests.passes.small import NO_MODULES, apply, ops, read
 
 ROWS, TIMES, WIDE = 101, 60, 32
@@ -186,8 +179,7 @@ def test_weights_that_would_overflow_stay_apart() -> None:
 
 def test_open_sizes_are_left_alone() -> None:
     text = graph_of(
-        "(float[N,101,32] x) => (float[A,B,32] y)",
-        "a = Tile(x, t)  y = MatMul(a, w)",
+        "(float[N,101,32] x) => (float[A,B,32] y)", "a = Tile(x, t)  y = MatMul(a, w)"
     )
     model = read(text, t=integers(50, 1, 1), w=normal(32, 32))
     assert apply(HoistLinear(), model).changes == 0

@@ -26,10 +26,7 @@ from me2e_compress.passes.lower_int8 import LowerInt8
 from me2e_compress.passes.quantize_int8 import QuantizeInt8
 from me2e_compress.quantization.plan import plan_of
 from me2e_compress.runtime.session import Session
-from me2e_compress.targets.onnxruntime import (
-    int8_layers,
-    unranged,
-)
+from me2e_compress.targets.onnxruntime import int8_layers, unranged
 from me2e_compress.targets.tensorrt import TensorRT
 from me2e_compress.testing import check_pass
 from tests.frames import record
@@ -180,11 +177,7 @@ def test_close_decisions_are_noted(context: Context) -> None:
         ({"scheme": "fp8"}, RecipeError, "no scheme fp8; there are feature-ext"),
         ({"modules": ("occ",)}, ModuleMapError, "occ: no such module"),
         ({"without": ("speed",)}, RecipeError, "rule speed cannot be switched off"),
-        (
-            {"rules": "int4"},
-            RecipeError,
-            "no rule set 'int4'; there are safe, paper",
-        ),
+        ({"rules": "int4"}, RecipeError, "no rule set 'int4'; there are safe, paper"),
         ({"target": "qnn"}, RecipeError, "no target 'qnn'; there are tensorrt"),
         ({"overrides": Path("none.toml")}, RecipeError, "none.toml: no such file"),
         (
@@ -328,9 +321,7 @@ def test_scales_are_of_the_type_of_the_graph(context: Context) -> None:
     assert min(each.sqnr_db for each in found.outputs) > 20
 
 
-def test_int8_first_and_float16_then_gives_the_same_types(
-    context: Context,
-) -> None:
+def test_int8_first_and_float16_then_gives_the_same_types(context: Context) -> None:
     source = conv_attention()
     source.opset_imports[""] = 19
     int8 = check_pass(PAPER, source, context).model

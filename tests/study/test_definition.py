@@ -88,8 +88,6 @@ def test_a_driver_that_is_no_model_takes_nothing(options: dict[str, object]) -> 
 @pytest.mark.parametrize(
     "numbers", [(0, 1, None), (1, 0, None), (1, 1, 0.0), (1, 1, float("nan"))]
 )
-def test_a_timing_that_measures_nothing(
-    numbers: tuple[int, int, float | None],
-) -> None:
+def test_a_timing_that_measures_nothing(numbers: tuple[int, int, float | None]) -> None:
     with pytest.raises(Me2eError, match="latency: "):
         Timing(*numbers)

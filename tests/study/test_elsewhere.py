@@ -82,11 +82,7 @@ def test_what_was_kept_is_not_driven_again(asked: Path, tmp_path: Path) -> None:
     ("old", "new", "message"),
     [
         ('"none"', '"none"\nweather = "night=1"', "condition ideal: lanes takes no we"),
-        (
-            '"lanes{count=5}"',
-            '"tape"',
-            "variant fast: tape takes no policy",
-        ),
+        ('"lanes{count=5}"', '"tape"', "variant fast: tape takes no policy"),
     ],
 )
 def test_what_an_evaluator_does_not_take(

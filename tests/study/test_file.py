@@ -190,12 +190,7 @@ def test_routes_of_the_command_line_win(models: Path) -> None:
         ("fold-constants", "fold-constant", RecipeError, "no pass 'fold-constant'"),
         ("passes", 'recipe = "full"\npasses', StudyError, "a recipe or passes, not"),
         ('"slow.onnx"\nrecipe', '"quick"\nrecipe', GraphError, "quick: no such file"),
-        (
-            'latency = "none"',
-            'latency = "quick"',
-            EvaluationError,
-            "source 'quick'",
-        ),
+        ('latency = "none"', 'latency = "quick"', EvaluationError, "source 'quick'"),
         ("[latency]", "[latency", StudyError, "not TOML"),
         ('"frames"', '"gone"', StudyError, r"^held_out: \S+/gone: no such folder"),
         (
@@ -234,10 +229,7 @@ def test_no_such_file(tmp_path: Path) -> None:
     ("name", "message"),
     [
         ("smoke", r"^no study smoke: no such file$"),
-        (
-            "paper",
-            r"^the study paper is gone since 0\.3\.0: use benchmarks/paper",
-        ),
+        ("paper", r"^the study paper is gone since 0\.3\.0: use benchmarks/paper"),
     ],
 )
 def test_no_study_ships(name: str, message: str) -> None:

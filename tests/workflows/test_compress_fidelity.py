@@ -211,10 +211,7 @@ def test_state_is_fed_forward_on_held_out_frames(tmp_path: Path) -> None:
     roles = ("backbone", "feature"), ("head", "prediction")
     (tmp_path / "map.toml").write_text("".join(names.format(*each) for each in roles))
     options = me2e.CompressOptions(
-        scheme="full",
-        rules="paper",
-        module_map=tmp_path / "map.toml",
-        verify_frames=0,
+        scheme="full", rules="paper", module_map=tmp_path / "map.toml", verify_frames=0
     )
     found = me2e.compress(
         tmp_path / "in.onnx", tmp_path / "o.onnx", None, tmp_path / "frames", options

@@ -5,10 +5,7 @@ from collections.abc import Callable
 import pytest
 
 import me2e_compress as me2e
-from me2e_compress.errors import (
-    Me2eError,
-    RecipeError,
-)
+from me2e_compress.errors import Me2eError, RecipeError
 
 
 @pytest.mark.parametrize(

@@ -48,9 +48,7 @@ def test_nothing_int8_is_an_error_and_writes_nothing(
     assert sorted(lstm.iterdir()) == before
 
 
-def test_nothing_int8_is_said_first_and_last_where_it_is_allowed(
-    lstm: Path,
-) -> None:
+def test_nothing_int8_is_said_first_and_last_where_it_is_allowed(lstm: Path) -> None:
     warned = list[str]()
     options = me2e.CompressOptions(scheme="full", allow_empty=True)
     listener = Listener(on_warning=warned.append)

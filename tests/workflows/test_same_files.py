@@ -103,10 +103,7 @@ CASES: dict[str, tuple[str, Call]] = {
             me2e.SearchOptions(max_mb=0.001, module_map=MAP),
         ),
     ),
-    "export": (
-        "export highway -o hw.onnx",
-        lambda: export_stack("highway", "hw.onnx"),
-    ),
+    "export": ("export highway -o hw.onnx", lambda: export_stack("highway", "hw.onnx")),
     "record_frames": (
         "frames highway -n 1 -o made --seed 3",
         lambda: me2e.record_frames(

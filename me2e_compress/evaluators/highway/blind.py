@@ -14,11 +14,7 @@ from me2e_compress.driving.contract import (
     Plan,
     RouteInfo,
 )
-from me2e_compress.evaluators.highway.controller import (
-    beyond,
-    reentry,
-    slope_of,
-)
+from me2e_compress.evaluators.highway.controller import beyond, reentry, slope_of
 from me2e_compress.evaluators.highway.observe import scene_and_world
 from me2e_compress.simulator.plane_geometry import RoutePath
 from me2e_compress.simulator.scene import Ego

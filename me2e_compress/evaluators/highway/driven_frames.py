@@ -90,11 +90,7 @@ def _look(
     policy: OnnxPolicy, route: Route, begin_us: int, count: int
 ) -> Iterator[dict[str, Array]]:
     """Yield the model's feeds from a moment on, until enough or the route ends."""
-    world, expert, rules = (
-        World(route),
-        Expert(cameras_only=True),
-        EndingRules(),
-    )
+    world, expert, rules = (World(route), Expert(cameras_only=True), EndingRules())
     # the expert drives, the model looks on
     rig = CameraRig(*policy.image_size)
     texture = paint_texture(world.roadmap, world.path.points)

@@ -21,11 +21,7 @@ from me2e_compress.graph.rewrite import (
     remove_node,
 )
 from me2e_compress.passes.base import Context, Pass, PassResult
-from me2e_compress.passes.eliminate_redundant.rules import (
-    MergeSite,
-    identity_of,
-    merge,
-)
+from me2e_compress.passes.eliminate_redundant.rules import MergeSite, identity_of, merge
 
 COMMUTATIVE = frozenset({"Add", "And", "Equal", "Mul", "Or", "Xor"})
 

@@ -377,10 +377,7 @@ def _fold_before(match: Match, kit: Kit) -> str | None:
 
 
 def _scale_parts(
-    product: ir.Node,
-    parts: list[tuple[str, ir.Node, int]],
-    factor: Numbers,
-    kit: Kit,
+    product: ir.Node, parts: list[tuple[str, ir.Node, int]], factor: Numbers, kit: Kit
 ) -> str | None:
     """Write all scaled weights and biases, or none if one would overflow."""
     made: list[Array] = []

@@ -146,11 +146,7 @@ def _bytes(view: View) -> float:
 
 
 def cost_of(
-    view: View,
-    form: Layout,
-    *,
-    covered: tuple[Digit, ...] = (),
-    part: bool = False,
+    view: View, form: Layout, *, covered: tuple[Digit, ...] = (), part: bool = False
 ) -> float:
     """Return the bytes written to bring a view to a layout.
 

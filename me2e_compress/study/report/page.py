@@ -85,9 +85,7 @@ APART = "Where they part"
 
 
 def study_page(
-    outcome: StudyResult,
-    command: Sequence[str] = (),
-    sections: Sequence[Section] = (),
+    outcome: StudyResult, command: Sequence[str] = (), sections: Sequence[Section] = ()
 ) -> Page:
     """Return the page of a comparison; ``sections`` stand before how it was made."""
     baseline = outcome.study.baseline

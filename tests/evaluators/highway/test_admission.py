@@ -103,9 +103,7 @@ def test_why_a_route_is_admitted_or_refused(
     assert str(words) in str(verdict.refusal)
 
 
-def test_the_gate_drives_as_little_as_it_must(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_the_gate_drives_as_little_as_it_must(monkeypatch: pytest.MonkeyPatch) -> None:
     driven = list[tuple[str, object]]()
     outcomes = [SOLVED, FAILED, SOLVED, FAILED, FAILED, SOLVED, FAILED]
 

@@ -13,12 +13,7 @@ from me2e_compress.evaluators.highway.expert.expert_policy import (
     ceiling,
     decide,
 )
-from me2e_compress.simulator.scene import (
-    ActorKind,
-    Scene,
-    SignalKind,
-    SignalState,
-)
+from me2e_compress.simulator.scene import ActorKind, Scene, SignalKind, SignalState
 from tests.evaluators.highway.tiny_world import (
     TinyWorld,
     actor,

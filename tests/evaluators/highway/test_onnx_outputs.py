@@ -142,9 +142,7 @@ optional = ["**"]
 
 def test_a_module_map_names_the_plan(tmp_path: Path) -> None:
     model = straight_on(
-        tmp_path / "m.onnx",
-        outputs="float[1, 6, 2] way",
-        body="way = Identity (ahead)",
+        tmp_path / "m.onnx", outputs="float[1, 6, 2] way", body="way = Identity (ahead)"
     )
     (tmp_path / "map.toml").write_text(MAP)
     driver = OnnxDriver(model, module_map=str(tmp_path / "map.toml"))

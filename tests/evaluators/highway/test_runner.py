@@ -19,13 +19,7 @@ from me2e_compress.metrics.episode import Ending, InfractionKind
 from me2e_compress.simulator.pictures.route import Moment
 from me2e_compress.simulator.scene import ActorKind, Ego
 from me2e_compress.simulator.world import World
-from tests.evaluators.highway.drivers import (
-    CROSSING,
-    EXIT,
-    GREEN,
-    PARKED,
-    Misbehaving,
-)
+from tests.evaluators.highway.drivers import CROSSING, EXIT, GREEN, PARKED, Misbehaving
 
 IDEAL = Drive()
 

@@ -173,11 +173,7 @@ class ExpertDecision:
 
 
 def decide(
-    scene: Scene,
-    known: Privileged,
-    path: RoutePath,
-    top: Floats,
-    memory: Memory,
+    scene: Scene, known: Privileged, path: RoutePath, top: Floats, memory: Memory
 ) -> ExpertDecision:
     """Plan from any state.
 

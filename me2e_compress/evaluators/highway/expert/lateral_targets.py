@@ -101,12 +101,7 @@ def lateral_targets(path: RoutePath, place: Place, ego: Ego, seen: Forecast) -> 
 
 
 def gap_for_passing(
-    place: Place,
-    ego: Ego,
-    seen: Forecast,
-    block: Block,
-    left_m: float,
-    lane_m: float,
+    place: Place, ego: Ego, seen: Forecast, block: Block, left_m: float, lane_m: float
 ) -> bool:
     """Return whether the blocker can be passed before oncoming traffic arrives.
 
