@@ -165,7 +165,7 @@ _ROOMS = {
     "manager": "PassManager Report Step Verification",
     "passes": "Context PASSES Pass PassResult",
     "study": "StudyResult load_study run_study",
-    "study.write": "write_study",
+    "study.report.page": "write_study",
     "workflows.calibrate": "CalibrateResult RangesResult calibrate ranges",
     "workflows.check_model": "ModelCheck check_model",
     "workflows.compare": (
