@@ -34,8 +34,7 @@ class OutputFidelity:
         most_db: SQNR of the best frame.
         stray: share of the values that are a number in one model alone; above 0 the
             SQNR is -infinity. What is NaN in both, or the same infinity, is left out.
-        small: channels ``SMALLER`` times smaller than the largest, as ``[:, 4:84]``
-            (scores beside boxes), which the SQNR of all says nothing of; else empty.
+        small: channels far smaller than the largest, as ``[:, 4:84]``; else empty.
         small_db: SQNR of those.
     """
 

@@ -35,7 +35,7 @@ class Shortfall:
     Attributes:
         value: in dB; of the plan the mean displacement in metres.
         excess: noise amplitude over the largest allowed, above 1.
-        part: the channels that it is of, as ``[:, 4:84]``; empty if it is of all.
+        part: its channels, as ``[:, 4:84]``; empty if it is of all.
     """
 
     output: str
