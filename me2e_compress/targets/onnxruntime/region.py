@@ -48,7 +48,10 @@ def objection(node: ir.Node) -> str | None:
     bias = bias_of(node)
     if node.op_type == "Conv":
         stored = bias is None or graph.array_of(bias) is not None
-        return None if stored else "the bias is computed"
+        if not stored:
+            return "the bias is computed"
+        reader = None if reads_one_pixel(node) else _magnifier(end_of(node))
+        return reader and f"it writes uint8, whose rounding {reader} magnifies"
     if node.op_type == "Gemm":
         factors = [node.attributes.get_float(each, 1.0) for each in ("alpha", "beta")]
         if (
@@ -61,6 +64,26 @@ def objection(node: ir.Node) -> str | None:
     if (rank_of(node.inputs[0]) or 0) < 2:
         return "the left operand is a vector, or of unknown rank"
     return None if is_one_matrix(node) else "the weight is a batch of matrices"
+
+
+_MAGNIFIERS = ("Log", "Pow", "Reciprocal")
+
+
+def _magnifier(value: ir.Value) -> str | None:
+    """Name an operator that makes a small error of what it reads a large one.
+
+    A QLinearConv writes uint8 of one scale, as TensorRT's convolution need not: small
+    values keep few steps of it, and a logarithm, a quotient or a square lives on them.
+    """
+    for use in value.uses():
+        reader, place = use.node, use.idx
+        squares = reader.op_type == "Mul" and reader.inputs[0] is reader.inputs[1]
+        divides = reader.op_type == "Div" and place == 1
+        if is_standard(reader) and (
+            reader.op_type in _MAGNIFIERS or squares or divides
+        ):
+            return f"{reader.name} ({reader.op_type})"
+    return None
 
 
 def reads_one_pixel(node: ir.Node) -> bool:
