@@ -247,10 +247,10 @@ def test_a_module_that_a_package_lacks_is_told_as_that_package(
 
 
 def test_a_defect_of_ours_keeps_its_traceback(monkeypatch: pytest.MonkeyPatch) -> None:
-    def broken(standalone_mode: bool, prog_name: str) -> None:
+    def broken() -> None:
         raise ModuleNotFoundError("No module named 'x'", name="me2e_compress.nothing")
 
-    monkeypatch.setattr("me2e_compress.cli.app.app", broken)
+    monkeypatch.setattr("me2e_compress.cli._commands", broken)
     with pytest.raises(ModuleNotFoundError):
         main()
 

@@ -162,14 +162,14 @@ class _Writer:
 
 
 def _write_convolution(node: ir.Node, graph: ir.Graph, names: set[str], by: str) -> int:
-    """Write the product of a weight with columns as a convolution of one tap."""
+    """Write the product of a weight with columns as a convolution of kernel 1."""
     weight, columns = node.inputs
     array, shape = array_of(weight), None if columns is None else columns.shape
     if array is None or weight is None or array.ndim != 2 or shape is None:
         return 0
     if len(shape) != 3 or array_of(columns) is not None:
         return 0
-    taps = add_constant(graph, array[:, :, None], f"{weight.name}_taps", names)
+    kernel = add_constant(graph, array[:, :, None], f"{weight.name}_kernel", names)
     attributes = {"kernel_shape": [1]}
-    put(node, "Conv", [columns, taps], by=by, attributes=attributes)
+    put(node, "Conv", [columns, kernel], by=by, attributes=attributes)
     return 1

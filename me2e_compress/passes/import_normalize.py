@@ -184,7 +184,7 @@ class ImportNormalize(Pass):
     7. A model with functions declares at least IR version 8, and all used domains are
        imported.
     8. An Einsum that is a product becomes a MatMul, and a weight in front of its
-       columns a Conv of one tap: layers, which become int8.
+       columns a Conv of kernel 1: layers, which become int8.
 
     Subgraphs and function bodies are included. Unknown operators are left alone.
 

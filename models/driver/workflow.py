@@ -82,6 +82,7 @@ def train(
     output = Path(output)
     check_folder(output, ())
     check_count("--seed", seed)
+    check_count("--workers", workers, least=1)
     course, latency = (SMALL, SMALL_LATENCY) if small else (FULL, FULL_LATENCY)
     course = course.seeded(seed)
     if overlook is not None:

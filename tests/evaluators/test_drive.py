@@ -89,7 +89,9 @@ def test_who_declares_what_it_does_not_have_is_refused(
     monkeypatch.setattr(Declared, "takes", frozenset(takes or ()))
     entry = EntryPoint("declared", "anywhere:Class", EVALUATORS.group)
     monkeypatch.setattr(EntryPoint, "load", lambda entry: cls)
-    monkeypatch.setattr(registry, "_found", lambda path: {EVALUATORS.group: (entry,)})
+    monkeypatch.setattr(
+        registry, "_all_installed", lambda path: {EVALUATORS.group: (entry,)}
+    )
 
     with pytest.raises(EvaluationError, match=message):
         evaluator_named("declared")

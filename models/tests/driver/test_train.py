@@ -68,12 +68,13 @@ def test_a_folder_of_a_course_that_overlooks_nobody(
 
 
 @pytest.mark.parametrize(
-    "words", [("uniad",), ("--workers", "0"), ("--overlook", "1.5")]
+    ("words", "code"),
+    [(("uniad",), 2), (("--workers", "0"), 2), (("--overlook", "1.5"), 2)],
 )
 def test_words_that_make_no_sense(
-    command: Command, tmp_path: Path, words: tuple[str, ...]
+    command: Command, tmp_path: Path, words: tuple[str, ...], code: int
 ) -> None:
-    assert command(*words, "-o", tmp_path / "out") == 2
+    assert command(*words, "-o", tmp_path / "out") == code
     assert not (tmp_path / "out").exists()
 
 
