@@ -18,6 +18,8 @@ from me2e_compress.graph.rewrite.edits import (
 )
 from me2e_compress.graph.shapes import infer_shapes
 
+_SCAN_AS_IS = 9
+"""The first opset whose Scan has no axis of batches."""
 _RESIZE_AS_IS = 11
 """The first opset whose Resize says how coordinates are made. Earlier ones, and
 Upsample, are asymmetric (onnx/docs/Changelog.md, Resize-11), which the converter of
@@ -38,7 +40,7 @@ def raise_opset(model: ir.Model, opset: int, by: str) -> tuple[int, str]:
     changed = [
         node
         for node in model.graph.all_nodes()
-        if changed_since(node, before, opset) and not has_subgraph(node)
+        if changed_since(node, before, opset) and _converts(node, before)
     ]
     if changed:
         infer_shapes(model)
@@ -63,8 +65,15 @@ def raise_opset(model: ir.Model, opset: int, by: str) -> tuple[int, str]:
     return len(changed) + 1, ""
 
 
+def _converts(node: ir.Node, before: int) -> bool:
+    """Return whether a node is another one in a newer opset: If and Loop take more."""
+    return not has_subgraph(node) or (node.op_type == "Scan" and before < _SCAN_AS_IS)
+
+
 def _not_converted(node: ir.Node, before: int) -> str:
     """Return why a node cannot be trusted to the converter, which would take it."""
+    if has_subgraph(node):
+        return "Scan of opset 8 has a batch"
     if node.op_type == "Hardmax":
         return "onnx converts it without its axis"
     if node.op_type != "Resize" or before >= _RESIZE_AS_IS:
