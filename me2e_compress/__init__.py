@@ -9,151 +9,86 @@ import os
 from typing import TYPE_CHECKING
 
 from me2e_compress.extras import explained
-from me2e_compress.version import __version__
+from me2e_compress.version import __version__ as __version__
 
 # onnxruntime (1.31), as soon as it is loaded, would write a device id and a database
 # into the user's home and look its vendor's host up: its own function comes too late.
 os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")
 
-if TYPE_CHECKING:
-    from me2e_compress import graph
-    from me2e_compress.calibration.dataset import CalibrationSet
-    from me2e_compress.errors import Me2eError
-    from me2e_compress.graph.modules import ModuleMap
-    from me2e_compress.manager import PassManager, Report, Step, Verification
-    from me2e_compress.passes import PASSES, Context, Pass, PassResult
-    from me2e_compress.study import StudyResult, load_study, run_study
-    from me2e_compress.study.report.page import write_study
-    from me2e_compress.workflows.calibrate import (
-        CalibrateResult,
-        RangesResult,
-        calibrate,
-        ranges,
-    )
-    from me2e_compress.workflows.check_model import ModelCheck, check_model
+if TYPE_CHECKING:  # what a type checker sees; at run time names load when asked for
+    from me2e_compress import graph as graph
+    from me2e_compress.calibration.dataset import CalibrationSet as CalibrationSet
+    from me2e_compress.errors import Me2eError as Me2eError
+    from me2e_compress.graph.modules import ModuleMap as ModuleMap
+    from me2e_compress.manager import PassManager as PassManager
+    from me2e_compress.manager import Report as Report
+    from me2e_compress.manager import Step as Step
+    from me2e_compress.manager import Verification as Verification
+    from me2e_compress.passes import PASSES as PASSES
+    from me2e_compress.passes import Context as Context
+    from me2e_compress.passes import Pass as Pass
+    from me2e_compress.passes import PassResult as PassResult
+    from me2e_compress.study import StudyResult as StudyResult
+    from me2e_compress.study import load_study as load_study
+    from me2e_compress.study import run_study as run_study
+    from me2e_compress.study.report.page import write_study as write_study
+    from me2e_compress.workflows.calibrate import CalibrateResult as CalibrateResult
+    from me2e_compress.workflows.calibrate import RangesResult as RangesResult
+    from me2e_compress.workflows.calibrate import calibrate as calibrate
+    from me2e_compress.workflows.calibrate import ranges as ranges
+    from me2e_compress.workflows.check_model import ModelCheck as ModelCheck
+    from me2e_compress.workflows.check_model import check_model as check_model
+    from me2e_compress.workflows.compare import CompareResult as CompareResult
     from me2e_compress.workflows.compare import (
-        CompareResult,
-        FirstDifferenceResult,
-        compare,
-        first_difference,
+        FirstDifferenceResult as FirstDifferenceResult,
     )
-    from me2e_compress.workflows.compare_dump import DumpResult, compare_dump
-    from me2e_compress.workflows.compress import CompressResult, compress
-    from me2e_compress.workflows.evaluate import (
-        EvaluateOptions,
-        EvaluateResult,
-        evaluate,
-    )
-    from me2e_compress.workflows.files import (
-        EngineResult,
-        JoinResult,
-        SplitResult,
-        build,
-        join,
-        split,
-    )
-    from me2e_compress.workflows.frames import record_frames
-    from me2e_compress.workflows.inspect import InspectResult, inspect
-    from me2e_compress.workflows.lint import LintResult, lint
-    from me2e_compress.workflows.options import (
-        BuildOptions,
-        CalibrateOptions,
-        CompareOptions,
-        CompressOptions,
-        EerOptions,
-        FramesOptions,
-        GraphOptions,
-        InspectOptions,
-        LintOptions,
-        PlanOptions,
-        ProfileOptions,
-        SearchOptions,
-        SensitivityOptions,
-        WriteOptions,
-    )
-    from me2e_compress.workflows.plan import PlanResult, plan
-    from me2e_compress.workflows.profile import ProfileResult, profile
-    from me2e_compress.workflows.result import Listener
-    from me2e_compress.workflows.score import ScoreResult, score
+    from me2e_compress.workflows.compare import compare as compare
+    from me2e_compress.workflows.compare import first_difference as first_difference
+    from me2e_compress.workflows.compare_dump import DumpResult as DumpResult
+    from me2e_compress.workflows.compare_dump import compare_dump as compare_dump
+    from me2e_compress.workflows.compress import CompressResult as CompressResult
+    from me2e_compress.workflows.compress import compress as compress
+    from me2e_compress.workflows.evaluate import EvaluateOptions as EvaluateOptions
+    from me2e_compress.workflows.evaluate import EvaluateResult as EvaluateResult
+    from me2e_compress.workflows.evaluate import evaluate as evaluate
+    from me2e_compress.workflows.files import EngineResult as EngineResult
+    from me2e_compress.workflows.files import JoinResult as JoinResult
+    from me2e_compress.workflows.files import SplitResult as SplitResult
+    from me2e_compress.workflows.files import build as build
+    from me2e_compress.workflows.files import join as join
+    from me2e_compress.workflows.files import split as split
+    from me2e_compress.workflows.frames import record_frames as record_frames
+    from me2e_compress.workflows.inspect import InspectResult as InspectResult
+    from me2e_compress.workflows.inspect import inspect as inspect
+    from me2e_compress.workflows.lint import LintResult as LintResult
+    from me2e_compress.workflows.lint import lint as lint
+    from me2e_compress.workflows.options import BuildOptions as BuildOptions
+    from me2e_compress.workflows.options import CalibrateOptions as CalibrateOptions
+    from me2e_compress.workflows.options import CompareOptions as CompareOptions
+    from me2e_compress.workflows.options import CompressOptions as CompressOptions
+    from me2e_compress.workflows.options import EerOptions as EerOptions
+    from me2e_compress.workflows.options import FramesOptions as FramesOptions
+    from me2e_compress.workflows.options import GraphOptions as GraphOptions
+    from me2e_compress.workflows.options import InspectOptions as InspectOptions
+    from me2e_compress.workflows.options import LintOptions as LintOptions
+    from me2e_compress.workflows.options import PlanOptions as PlanOptions
+    from me2e_compress.workflows.options import ProfileOptions as ProfileOptions
+    from me2e_compress.workflows.options import SearchOptions as SearchOptions
+    from me2e_compress.workflows.options import SensitivityOptions as SensitivityOptions
+    from me2e_compress.workflows.options import WriteOptions as WriteOptions
+    from me2e_compress.workflows.plan import PlanResult as PlanResult
+    from me2e_compress.workflows.plan import plan as plan
+    from me2e_compress.workflows.profile import ProfileResult as ProfileResult
+    from me2e_compress.workflows.profile import profile as profile
+    from me2e_compress.workflows.result import Listener as Listener
+    from me2e_compress.workflows.score import ScoreResult as ScoreResult
+    from me2e_compress.workflows.score import score as score
+    from me2e_compress.workflows.search import SearchResult as SearchResult
+    from me2e_compress.workflows.search import SensitivityResult as SensitivityResult
     from me2e_compress.workflows.search import (
-        SearchResult,
-        SensitivityResult,
-        measure_sensitivity,
-        search,
+        measure_sensitivity as measure_sensitivity,
     )
-
-__all__ = [
-    "PASSES",
-    "BuildOptions",
-    "CalibrateOptions",
-    "CalibrateResult",
-    "CalibrationSet",
-    "CompareOptions",
-    "CompareResult",
-    "CompressOptions",
-    "CompressResult",
-    "Context",
-    "DumpResult",
-    "EerOptions",
-    "EngineResult",
-    "EvaluateOptions",
-    "EvaluateResult",
-    "FirstDifferenceResult",
-    "FramesOptions",
-    "GraphOptions",
-    "InspectOptions",
-    "InspectResult",
-    "JoinResult",
-    "LintOptions",
-    "LintResult",
-    "Listener",
-    "Me2eError",
-    "ModelCheck",
-    "ModuleMap",
-    "Pass",
-    "PassManager",
-    "PassResult",
-    "PlanOptions",
-    "PlanResult",
-    "ProfileOptions",
-    "ProfileResult",
-    "RangesResult",
-    "Report",
-    "ScoreResult",
-    "SearchOptions",
-    "SearchResult",
-    "SensitivityOptions",
-    "SensitivityResult",
-    "SplitResult",
-    "Step",
-    "StudyResult",
-    "Verification",
-    "WriteOptions",
-    "__version__",
-    "build",
-    "calibrate",
-    "check_model",
-    "compare",
-    "compare_dump",
-    "compress",
-    "evaluate",
-    "first_difference",
-    "graph",
-    "inspect",
-    "join",
-    "lint",
-    "load_study",
-    "measure_sensitivity",
-    "plan",
-    "profile",
-    "ranges",
-    "record_frames",
-    "run_study",
-    "score",
-    "search",
-    "split",
-    "write_study",
-]
+    from me2e_compress.workflows.search import search as search
 
 _MODULES = ("errors", "evaluators", "graph", "passes", "registry", "targets", "testing")
 """Packages and modules whose names are public; they load when they are asked for."""
@@ -194,6 +129,7 @@ _HOMES = {name: room for room, names in _ROOMS.items() for name in names.split()
 
 
 if not TYPE_CHECKING:  # else every name would be one for a type checker
+    __all__ = sorted([*_HOMES, "__version__", "graph"])
 
     def __getattr__(name: str) -> object:
         """Load a public name when it is asked for: a worker pays for what it uses."""
