@@ -38,10 +38,11 @@ class ModelCheck(Result):
         """Return every port of the graph, whether it could drive, and by what."""
         ports = [("input", each) for each in self.inputs]
         ports += [("output", each) for each in self.outputs]
-        rows = [
-            (kind, each.name, _shape(each), each.type, each.problem or each.use or "-")
-            for kind, each in ports
-        ]
+        rows = list[tuple[str, ...]]()
+        for kind, each in ports:
+            shape = str([side or "?" for side in each.shape]).replace("'", "")
+            use = each.problem or each.use or "-"
+            rows.append((kind, each.name, shape, each.type, use))
         columns = ("", "name", "shape", "type", "fed by, or used as")
         tables = [table(self.policy, columns, rows, words=5)] if rows else []
         if not self.problems:
@@ -90,19 +91,9 @@ def check_model(
     # problems are listed once each; only a model without any is run
     found = [each.problem for each in (*fed, *outputs) if each.problem]
     problems = dict.fromkeys([*found, *used.problems])
-    if not problems and (said := _at_work(session, read)):
-        problems[said] = None
+    if not problems:
+        try:
+            OnnxPolicy.of(session, read)  # it runs the model on zeros
+        except (GraphError, FramesError, EvaluationError) as error:
+            problems[str(error)] = None
     return ModelCheck(named, used.drives_by, fed, outputs, tuple(problems))
-
-
-def _at_work(session: Session, adapter: Adapter) -> str:
-    """Run the model on zeros; return what went wrong, else an empty string."""
-    try:
-        OnnxPolicy.of(session, adapter)
-    except (GraphError, FramesError, EvaluationError) as error:
-        return str(error)
-    return ""
-
-
-def _shape(port: PortUse) -> str:
-    return str([side or "?" for side in port.shape]).replace("'", "")

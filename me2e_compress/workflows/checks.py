@@ -241,11 +241,14 @@ def _alone_in(folder: Path) -> Iterator[None]:
     folder.mkdir(parents=True, exist_ok=True)
     handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
     try:
-        if not _try_lock(handle):
-            raise GraphError(
-                f"{folder} is in use: another me2e-compress works there; wait for it,"
-                " or choose another folder"
-            )
+        try:  # without waiting; file systems without locks grant every one
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            if error.errno in (errno.EWOULDBLOCK, errno.EAGAIN):
+                raise GraphError(
+                    f"{folder} is in use: another me2e-compress works there; wait for"
+                    " it, or choose another folder"
+                ) from error
         try:
             yield
         finally:
@@ -254,15 +257,6 @@ def _alone_in(folder: Path) -> Iterator[None]:
                     folder.rmdir()
     finally:
         os.close(handle)
-
-
-def _try_lock(handle: int) -> bool:
-    """Take a lock without waiting; file systems without locks grant every one."""
-    try:
-        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError as error:
-        return error.errno not in (errno.EWOULDBLOCK, errno.EAGAIN)
-    return True
 
 
 STAGE = "first opening"

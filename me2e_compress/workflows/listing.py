@@ -73,25 +73,6 @@ class ListResult(Result):
         return self.kinds
 
 
-def _registered(kind: str) -> tuple[Entry, ...]:
-    return describe(REGISTRIES[kind])
-
-
-def _recipes() -> tuple[Entry, ...]:
-    found = resources.files("me2e_compress").joinpath("recipes").iterdir()
-    files = sorted(found, key=lambda path: path.name.removesuffix(".toml"))
-    return tuple(_file(path) for path in files if path.name.endswith(".toml"))
-
-
-def _adapters() -> tuple[Entry, ...]:
-    return tuple(_file(adapter_file(Path(name))) for name in shipped_adapters())
-
-
-def _module_maps() -> tuple[Entry, ...]:
-    maps = [modules.ModuleMap.load(name) for name in (*modules.presets(), "whole")]
-    return tuple(Entry(each.name, _OURS, ", ".join(each.names())) for each in maps)
-
-
 def _file(path: Traversable) -> Entry:
     """Describe a TOML file by the first sentence of the comment at its head."""
     found = _COMMENT.match(path.read_text(encoding="utf-8"))
@@ -119,10 +100,22 @@ REGISTRIES: Mapping[str, Registry[Any]] = {
 }
 """Registries to which other packages add."""
 KINDS: Mapping[str, Callable[[], tuple[Entry, ...]]] = {
-    **{kind: partial(_registered, kind) for kind in REGISTRIES},
-    "recipes": _recipes,
-    "adapters": _adapters,
-    "module-maps": _module_maps,
+    **{kind: partial(describe, each) for kind, each in REGISTRIES.items()},
+    "recipes": lambda: tuple(
+        _file(path)
+        for path in sorted(
+            resources.files("me2e_compress").joinpath("recipes").iterdir(),
+            key=lambda path: path.name.removesuffix(".toml"),
+        )
+        if path.name.endswith(".toml")
+    ),
+    "adapters": lambda: tuple(
+        _file(adapter_file(Path(name))) for name in shipped_adapters()
+    ),
+    "module-maps": lambda: tuple(
+        Entry(each.name, _OURS, ", ".join(each.names()))
+        for each in map(modules.ModuleMap.load, (*modules.presets(), "whole"))
+    ),
     "stacks": lambda: tuple(
         Entry(name, _OURS, "trained; ships with the package") for name in SHIPPED
     ),
@@ -196,18 +189,15 @@ class DoctorResult(Result):
 
 def doctor() -> DoctorResult:
     """Look for everything that the toolkit can make use of."""
-    return DoctorResult((*_machine(), *_packages(), _kernels(), _gpu(), _energy()))
-
-
-def _machine() -> list[Checkup]:
     memory = psutil.virtual_memory().total / 2**30
     enough = "" if memory >= 6 else "VAD-tiny needs 6 GiB to calibrate"
-    return [
+    machine = (
         Checkup("cores", str(os.cpu_count())),
         Checkup("memory", f"{memory:.1f} GiB", enough),
         Checkup("platform", platform.platform()),
         Checkup("onnxruntime on", ", ".join(onnxruntime.get_available_providers())),
-    ]
+    )
+    return DoctorResult((*machine, *_packages(), _gpu(), _energy()))
 
 
 def _packages() -> list[Checkup]:
@@ -216,22 +206,17 @@ def _packages() -> list[Checkup]:
         if importlib.util.find_spec(module) is None:
             advice = f"{purpose}: pip install 'me2e-compress[{extra}]'"
             found.append(Checkup(module, None, advice))
-        else:
-            found.append(Checkup(module, _version(module)))
-    return found
-
-
-def _version(module: str) -> str:
-    with contextlib.suppress(importlib.metadata.PackageNotFoundError):
-        return importlib.metadata.version(module.replace("_", "-"))
-    return "of unknown version"
-
-
-def _kernels() -> Checkup:
-    what = "compiled kernels"
-    if reason := why_not():
-        return Checkup(what, None, f"fused operators run as their bodies: {reason}")
-    return Checkup(what, ", ".join(each.op_type for each in KERNELS))
+            continue
+        version = "of unknown version"
+        with contextlib.suppress(importlib.metadata.PackageNotFoundError):
+            version = importlib.metadata.version(module.replace("_", "-"))
+        found.append(Checkup(module, version))
+    # compiled kernels are of the extra ``fast``
+    if why := why_not():
+        advice = f"fused operators run as their bodies: {why}"
+        return [*found, Checkup("compiled kernels", None, advice)]
+    names = ", ".join(each.op_type for each in KERNELS)
+    return [*found, Checkup("compiled kernels", names)]
 
 
 def _energy() -> Checkup:

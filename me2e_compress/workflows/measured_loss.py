@@ -277,8 +277,13 @@ class RuntimeTally:
         worst = max(apart, key=lambda name: self._first[name])
         if not causes and self._overflows(model):
             causes = [_OVERFLOW]
-        elif not causes and (node := self._first_node(model, worst)) is not None:
-            causes = [f"{worst} differs from {node.name} ({node.op_type}) on"]
+        # else the first node from which the output is half as far off as at last
+        elif not causes and self._frame is not None and self._first[worst]:
+            inputs = VerificationInputs([self._frame], "recorded", self._provider)
+            half = self._first[worst] / 2
+            node = first_node(model, worst, "all", half, inputs, int8_kernels=True)
+            if node is not None:
+                causes = [f"{worst} differs from {node.name} ({node.op_type}) on"]
         return RuntimeLoss(
             {name: runs[name] for name in apart},
             {name: nodes[name] for name in apart},
@@ -293,22 +298,12 @@ class RuntimeTally:
         (nodes,) = replay(Session(model, provider=provider), shown)
         (stock,) = replay(Session(model, stock=True, provider=provider), shown)
         (wide,) = replay(Session(model, int8_kernels=True, provider=provider), shown)
-        return any(
-            4 * _noise(nodes[name], wide[name]) < _noise(nodes[name], stock[name])
-            for name in nodes
-        )
 
-    def _first_node(self, model: ir.Model, output: str) -> ir.Node | None:
-        """Return the first node from which an output is half as far off as at last."""
-        allowed = self._first[output] / 2
-        if self._frame is None or not allowed:
-            return None
-        inputs = VerificationInputs([self._frame], "recorded", self._provider)
-        return first_node(model, output, "all", allowed, inputs, int8_kernels=True)
+        def noise(name: str, answers: dict[str, Array]) -> float:
+            apart = nodes[name].astype(np.float64) - answers[name].astype(np.float64)
+            return float(np.square(apart).sum())
 
-
-def _noise(a: Array, b: Array) -> float:
-    return float(np.square(a.astype(np.float64) - b.astype(np.float64)).sum())
+        return any(4 * noise(name, wide) < noise(name, stock) for name in nodes)
 
 
 def has_int8_kernels(model: ir.Model, provider: Provider) -> bool:

@@ -4,7 +4,7 @@ import dataclasses
 import itertools
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import NoReturn, Self
+from typing import Self
 
 import onnx_ir as ir
 
@@ -18,7 +18,6 @@ from me2e_compress.passes import Context, Pass
 from me2e_compress.passes.lower_int8 import LowerInt8
 from me2e_compress.passes.quantize_int8 import QuantizeInt8
 from me2e_compress.quantization.plan import (
-    Decision,
     PlanDifference,
     QuantPlan,
     differences,
@@ -79,7 +78,13 @@ class PreparedGraph:
         manager = PassManager(chosen[:at], verify_frames=0)
         model = manager.run(loaded, Context(module_map)).model
         graph.infer_shapes(model)
-        _leave_the_message(model)
+        # weights are copied out of the protobuf message that the file was read into: a
+        # single one left there would keep the whole message in memory
+        for value in (v for g in model.graphs() for v in g.initializers.values()):
+            tensor = value.const_value
+            if isinstance(tensor, ir.serde.TensorProtoTensor):
+                array, name = tensor.numpy().copy(), value.name
+                value.const_value = ir.Tensor(array, dtype=tensor.dtype, name=name)
         return cls(file, model, module_map, reader)
 
     @property
@@ -97,39 +102,24 @@ class PreparedGraph:
         For a quantized graph to be rewritten, these are the tensors without a range in
         it. If there is none, PreconditionError is raised.
         """
-        if self.reader is None or self.reader.quantizes:
-            return self._of_all() or self._refuse("no node can become int8")
-        missing = self.reader.ranged_tensors(self.model, Context(self.modules))
-        return missing or self._refuse(
-            f"it tells every range that {self.reader.name} needs: none to measure"
-        )
-
-    def _of_all(self) -> tuple[str, ...]:
-        names: dict[str, None] = {}
-        sets = (*RULE_SETS.usable(), _MOST)
-        for rules, target in itertools.product(sets, TARGETS.usable()):
-            every = QuantizeInt8(
-                modules=self.modules.names(), rules=rules, target=target
+        context, names = Context(self.modules), dict[str, None]()
+        if self.reader is not None and not self.reader.quantizes:
+            names |= dict.fromkeys(self.reader.ranged_tensors(self.model, context))
+            none = (
+                f"it tells every range that {self.reader.name} needs: none to measure"
             )
-            plan = every.plan(self.model, Context(self.modules))
-            found = TARGETS.parse(target).tensors(plan, self.model)
-            names |= dict.fromkeys(found)
+        else:
+            sets, none = (*RULE_SETS.usable(), _MOST), "no node can become int8"
+            for rules, target in itertools.product(sets, TARGETS.usable()):
+                every = QuantizeInt8(
+                    modules=self.modules.names(), rules=rules, target=target
+                )
+                plan = every.plan(self.model, context)
+                tensors = TARGETS.parse(target).tensors(plan, self.model)
+                names |= dict.fromkeys(tensors)
+        if not names:
+            raise PreconditionError(f"{self.file}: {none}")
         return tuple(names)
-
-    def _refuse(self, reason: str) -> NoReturn:
-        raise PreconditionError(f"{self.file}: {reason}")
-
-
-def _leave_the_message(model: ir.Model) -> None:
-    """Copy weights out of the protobuf message that the file was read into.
-
-    A single weight left there would keep the whole message in memory.
-    """
-    for value in (v for g in model.graphs() for v in g.initializers.values()):
-        tensor = value.const_value
-        if isinstance(tensor, ir.serde.TensorProtoTensor):
-            array = tensor.numpy().copy()
-            value.const_value = ir.Tensor(array, dtype=tensor.dtype, name=value.name)
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
@@ -160,11 +150,13 @@ class PlanResult(Result):
         return Shown(self.plan.headline, (*self.plan.tables(), *more), lines)
 
     def _nodes(self) -> Iterator[Table]:
-        rows = [
-            (each.node or each.output, _what(each))
-            for each in self.plan.decisions
-            if each.could_be_int8
-        ]
+        rows = list[tuple[str, str]]()
+        for each in self.plan.decisions:
+            if each.could_be_int8:
+                where = f" of {each.module}" if each.module else ""
+                close = f" ({each.borderline})" if each.borderline else ""
+                why = f"{each.dtype} by {each.rule}, {each.reason}{close}"
+                rows.append((each.node or each.output, f"{each.op}{where}: {why}"))
         yield table("Decisions", ("node", "what, by which rule, why"), rows, words=2)
         groups = [
             (group.name, group.kind, ", ".join(group.tensors), ", ".join(group.nodes))
@@ -224,13 +216,6 @@ def plan(
             return PlanResult(made, hint=hint)
         other = _made(files[1], read[1], plain, options)
         return PlanResult(made, tuple(differences(other, made)))
-
-
-def _what(decision: Decision) -> str:
-    where = f" of {decision.module}" if decision.module else ""
-    close = f" ({decision.borderline})" if decision.borderline else ""
-    said = f"{decision.dtype} by {decision.rule}, {decision.reason}{close}"
-    return f"{decision.op}{where}: {said}"
 
 
 def _read(path: Path) -> QuantPlan | ir.Model:
