@@ -45,25 +45,18 @@ def explained(error: Exception) -> Exception:
     """
     if not isinstance(error, ImportError | OSError):
         return error
-    module = _module_behind(error)
-    if not module:
-        return error
-    if util.find_spec(module) is None:
-        return MissingExtraError(module, _EXTRA_OF[module])
-    return BrokenPackageError(module, _EXTRA_OF[module], str(error))
-
-
-def _module_behind(error: ImportError | OSError) -> str:
-    """Return the module of an extra whose import failed; empty if none did.
-
-    The error may name it, or something that it needs in its turn: then it is the last
-    one whose own code was running as it was imported.
-    """
-    named = error.name or "" if isinstance(error, ImportError) else ""
+    # the error may name the module, or something that it needs in its turn: then it is
+    # the last one whose own code was running as it was imported
     running = (
         str(frame.f_globals.get("__name__"))
         for frame, _ in traceback.walk_tb(error.__traceback__)
         if frame.f_code.co_name == "<module>"
     )
+    named = error.name or "" if isinstance(error, ImportError) else ""
     candidates = [each.partition(".")[0] for each in (*running, named)]
-    return next((each for each in reversed(candidates) if each in _EXTRA_OF), "")
+    module = next((each for each in reversed(candidates) if each in _EXTRA_OF), "")
+    if not module:
+        return error
+    if util.find_spec(module) is None:
+        return MissingExtraError(module, _EXTRA_OF[module])
+    return BrokenPackageError(module, _EXTRA_OF[module], str(error))

@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import cast
 
 from me2e_compress import graph
-from me2e_compress.display import Table
 from me2e_compress.driving.contract import RouteInfo
 from me2e_compress.driving.latency import parse_latency
 from me2e_compress.driving.policies import POLICIES, Driver, driver_named
@@ -24,7 +23,7 @@ from me2e_compress.shipped.drivers import SHIPPED
 from me2e_compress.simulator.routes import Route, pick_routes
 from me2e_compress.targets.onnxruntime import slow_here
 from me2e_compress.workflows.checks import check_folder, model_path, try_first, writing
-from me2e_compress.workflows.result import SILENT, Listener, Result
+from me2e_compress.workflows.result import SILENT, Listener, Result, Shown
 from me2e_compress.workflows.score import driving_score, scores_table
 
 _FLAGS = {"module_map": "map"}
@@ -125,25 +124,21 @@ class EvaluateResult(Result):
     late: Deadlines | None = None
     slow_here: str | None = None
 
-    @property
-    def headline(self) -> str:
-        """The policy, its driving score and the routes."""
-        return f"{self.policy}: {driving_score(self.scores)}"
+    def shown(self) -> Shown:
+        """Return every score with its interval, and the latencies charged.
 
-    def lines(self) -> tuple[str, ...]:
-        """Return no line: the table says everything."""
-        return ()
-
-    def alerts(self) -> tuple[str, ...]:
-        """Return the routes that ended by a failure, and a form that is slow here."""
+        Alerts are the routes that ended by a failure, and a form that is slow here.
+        """
+        tables = [scores_table(self.policy, self.scores)]
+        if self.late is not None:
+            tables.append(deadlines_table(self.policy, self.late))
         slow = self.slow_here and f"{self.policy}: {self.slow_here}"
-        return tuple(filter(None, [self.scores.failed, slow]))
-
-    def tables(self) -> tuple[Table, ...]:
-        """Return every score with its interval, and the latencies charged."""
-        late = None if self.late is None else deadlines_table(self.policy, self.late)
-        scores = scores_table(self.policy, self.scores)
-        return (scores,) if late is None else (scores, late)
+        return Shown(
+            f"{self.policy}: {driving_score(self.scores)}",
+            tables,
+            lines=(),  # the tables say everything
+            alerts=filter(None, [self.scores.failed, slow]),
+        )
 
     def to_json(self) -> object:
         """Return the scores, and the latencies charged to decisions."""

@@ -10,7 +10,6 @@ import onnx_ir as ir
 from me2e_compress.display import counted, megabytes
 from me2e_compress.graph import WEIGHTED
 from me2e_compress.manager import Report
-from me2e_compress.manager.report import LossyPass
 from me2e_compress.passes import Context
 from me2e_compress.passes.quantize_int8 import QuantizeInt8
 from me2e_compress.quantization.plan import FLOAT, QuantPlan, plan_of
@@ -117,8 +116,11 @@ class Int8Outcome:
         if quantizer is None:
             return None
         name, changes = quantizer.applied.name, quantizer.changes
+        # the plan that was carried out; if nothing changed, it is made again
+        plan = plan_of(report.model) if changes else None
+        if plan is None and isinstance(quantizer.applied, QuantizeInt8):
+            plan = quantizer.applied.plan(quantizer.before, context)
         # without a plan only the number of changes is known
-        plan = _plan(report, quantizer, context)
         if plan is None:
             return cls(name, changes)
         layers = [each for each in plan.decisions if each.op in WEIGHTED]
@@ -171,11 +173,3 @@ class Int8Outcome:
                 f" {largest.node!r}, rule {largest.rule}: {largest.reason}"
             )
         return "; ".join(found)
-
-
-def _plan(report: Report, quantizer: LossyPass, context: Context) -> QuantPlan | None:
-    """Return the plan that was carried out; if nothing changed, make it again."""
-    found = plan_of(report.model) if quantizer.changes else None
-    if found is None and isinstance(quantizer.applied, QuantizeInt8):
-        found = quantizer.applied.plan(quantizer.before, context)
-    return found

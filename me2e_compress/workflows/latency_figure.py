@@ -62,21 +62,17 @@ def modules_figure(trace: LatencyTrace, name: str) -> Figure:
     left, right = figure.subplots(1, 2, width_ratios=(2.3, 1))
     shown = _gathered(trace.modules_us)
     total = np.sum([np.array(each) for each in shown.values()], axis=0)
-    said = f"{name}: {trace.machine}\n{_slower(trace, total)}"
-    figure.suptitle(said, x=0.01, ha="left", fontsize=10)
+    # the profiler, which timed the modules, costs an inference time
+    taken_us = total, trace.samples_us
+    under, without = (f"{np.mean(each) / 1e3:.3g}" for each in taken_us)
+    title = (
+        f"{name}: {trace.machine}\ntimed by onnxruntime's profiler, which takes time"
+        f" itself: {under} ms on average, {without} ms without it"
+    )
+    figure.suptitle(title, x=0.01, ha="left", fontsize=10)
     _stack(left, shown, total)
     _tail(right, total)
     return figure
-
-
-def _slower(trace: LatencyTrace, total: Totals) -> str:
-    """Say what the profiler, which timed the modules, costs an inference."""
-    taken_us = total, trace.samples_us
-    under, without = (f"{np.mean(each) / 1e3:.3g}" for each in taken_us)
-    return (
-        f"timed by onnxruntime's profiler, which takes time itself: {under} ms on"
-        f" average, {without} ms without it"
-    )
 
 
 def _gathered(parts: Microseconds) -> Microseconds:

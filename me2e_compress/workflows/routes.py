@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from pydantic import TypeAdapter
 
-from me2e_compress.display import Table, counted, table
+from me2e_compress.display import counted, table
 from me2e_compress.errors import EvaluationError
 from me2e_compress.extras import need_extra
 from me2e_compress.registry import documents
@@ -26,7 +26,7 @@ from me2e_compress.simulator.scenarios import VARIANTS
 from me2e_compress.version import __version__
 from me2e_compress.workflows.checks import writing
 from me2e_compress.workflows.options import check_count
-from me2e_compress.workflows.result import SILENT, Listener, Result, Status
+from me2e_compress.workflows.result import SILENT, Listener, Result, Shown
 
 if TYPE_CHECKING:  # they take highway-env, an extra and a second to import
     from me2e_compress.evaluators.highway.generate import Admission, ScenarioRoutes
@@ -82,16 +82,7 @@ class RoutesResult(Result):
         """The number of routes proposed."""
         return sum(one.tried for one in self.harvests)
 
-    @property
-    def headline(self) -> str:
-        """The number of routes, of tries, and the file."""
-        share = self.admitted / self.tried
-        return (
-            f"{self.admitted} of {counted(self.tried, 'route')} tried ({share:.0%}) ->"
-            f" {self.output}"
-        )
-
-    def tables(self) -> tuple[Table, ...]:
+    def shown(self) -> Shown:
         """Return the routes admitted by scenario, and why others were not."""
         rows = list[tuple[str, ...]]()
         for one in self.harvests:
@@ -102,7 +93,12 @@ class RoutesResult(Result):
             )
             rows.append((one.scenario, f"{len(one.routes)}", f"{one.tried}", reasons))
         columns = ("scenario", "admitted", "tried", "refused because")
-        return (table("Routes", columns, rows, words=4),)
+        share = self.admitted / self.tried
+        tried = f"{counted(self.tried, 'route')} tried ({share:.0%})"
+        return Shown(
+            f"{self.admitted} of {tried} -> {self.output}",
+            [table("Routes", columns, rows, words=4)],
+        )
 
     def to_json(self) -> object:
         """Return the counts, in all and by scenario."""
@@ -186,36 +182,24 @@ class ExaminationResult(Result):
         """The routes that are not admitted."""
         return tuple(one for one in self.verdicts if not one.admitted)
 
-    @property
-    def headline(self) -> str:
-        """The number of routes admitted."""
-        admitted = len(self.verdicts) - len(self.refused)
-        return f"{admitted} of {counted(len(self.verdicts), 'route')} admitted"
-
-    def tables(self) -> tuple[Table, ...]:
-        """Return the routes that are refused, and why."""
-        rows = [(one.route.id, str(one.refusal)) for one in self.refused]
+    def shown(self) -> Shown:
+        """Return the routes that are refused, and why; the error names the first."""
+        every, refused = len(self.verdicts), self.refused
+        headline = f"{every - len(refused)} of {counted(every, 'route')} admitted"
+        if not refused:
+            return Shown(headline)
+        rows = [(one.route.id, str(one.refusal)) for one in refused]
+        error = EvaluationError(
+            f"{self.manifest}: {len(refused)} of {every} routes are not admitted, the"
+            f" first is {refused[0].route.id}: {refused[0].refusal}"
+        )
         columns = ("route", "refused because")
-        return (table("Refused", columns, rows, words=2),) if rows else ()
+        return Shown(headline, [table("Refused", columns, rows, words=2)], error=error)
 
     def to_json(self) -> object:
         """Return how many were examined, and why some are refused."""
         why = {one.route.id: one.refusal for one in self.refused}
         return {"examined": len(self.verdicts), "refused": why}
-
-    @property
-    def status(self) -> Status:
-        """``ok`` if all are admitted, else ``refused``."""
-        return "refused" if self.refused else "ok"
-
-    def check(self) -> None:
-        """Raise EvaluationError unless all are admitted; it names the first."""
-        if self.refused:
-            first = self.refused[0]
-            raise EvaluationError(
-                f"{self.manifest}: {len(self.refused)} of {len(self.verdicts)} routes"
-                f" are not admitted, the first is {first.route.id}: {first.refusal}"
-            )
 
 
 def examine_routes(

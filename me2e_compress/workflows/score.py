@@ -50,8 +50,48 @@ class RealRun:
     stood: tuple[str, ...]
 
     def tables(self, name: str) -> tuple[Table, ...]:
-        """Return the records found, and the scores as given and as computed."""
-        return (self._counts(name), self._quotients())
+        """Return the records, and the scores as given and as computed.
+
+        Each figure is shown over the whole set, and over what was driven.
+        """
+        collected = self.collected
+        counts = [
+            ("evaluated", "", str(len(collected.episodes))),
+            *((key, some_of(of), str(len(of))) for key, of in self._named().items()),
+            ("unfinished files", "", str(len(collected.unfinished))),
+            ("broken", some_of(tuple(collected.broken)), str(len(collected.broken))),
+        ]
+        # not every figure is both given by the simulator and computed here
+        of = self.leaderboard
+        none = Measure(None, "", "not so")
+        nothing = Quotients(none, none)
+        figures = [
+            ("driving score", of.given_score, of.score, "%"),
+            ("success rate", nothing, of.success_rate, "%"),
+            ("route completion", of.given_completion, nothing, "%"),
+            ("infraction penalty", of.given_penalty, of.penalty, "ratio"),
+        ]
+        rows = list[tuple[str, ...]]()
+        for label, given, computed, unit in figures:
+            if unit == "%":  # a missing route has no penalty
+                over = (given.over_set, computed.over_set)
+                values = [number(each.value, ".4f") for each in over]
+                rows.append((label, "set", *values, str(of.set_size), unit))
+            over = (given.over_driven, computed.over_driven)
+            values = [number(each.value, ".4f") for each in over]
+            rows.append((label, "driven", *values, str(of.driven), unit))
+        real = f"{name}: real runs, Bench2Drive's routes"
+        both = "given by the simulator, and computed with Bench2Drive's penalties"
+        columns = ("score", "over", "given", "computed", "n", "unit")
+        return (
+            table(
+                f"{real} {collected.route_set or 'of no known set'}",
+                ("records", "which", "n"),
+                counts,
+                words=2,
+            ),
+            table(both, columns, rows, words=2),
+        )
 
     def alerts(self, name: str) -> Iterator[str]:
         """Yield warnings, one line each."""
@@ -132,41 +172,6 @@ class RealRun:
                     values = " or ".join(number(mean, "g") for mean in means[key])
                     yield f"{path}: it says {key} {said:g}, its records say {values}"
 
-    def _counts(self, name: str) -> Table:
-        found = self.collected
-        rows = [
-            ("evaluated", "", str(len(found.episodes))),
-            *((key, some_of(of), str(len(of))) for key, of in self._named().items()),
-            ("unfinished files", "", str(len(found.unfinished))),
-            ("broken", some_of(tuple(found.broken)), str(len(found.broken))),
-        ]
-        route_set = found.route_set or "of no known set"
-        title = f"{name}: real runs, Bench2Drive's routes {route_set}"
-        return table(title, ("records", "which", "n"), rows, words=2)
-
-    def _quotients(self) -> Table:
-        """Show given and computed figures, each over the set and over the records."""
-        of = self.leaderboard
-        none = Measure(None, "", "not so")
-        nothing = Quotients(none, none)
-        # not every figure is both given by the simulator and computed here
-        lines = [
-            ("driving score", of.given_score, of.score, "%"),
-            ("success rate", nothing, of.success_rate, "%"),
-            ("route completion", of.given_completion, nothing, "%"),
-            ("infraction penalty", of.given_penalty, of.penalty, "ratio"),
-        ]
-        # each figure is shown over the whole set, and over what was driven
-        rows = [
-            (label, over, _shown(given, over), _shown(computed, over), str(n), unit)
-            for label, given, computed, unit in lines
-            for over, n in (("set", of.set_size), ("driven", of.driven))
-            if unit == "%" or over == "driven"  # a missing route has no penalty
-        ]
-        columns = ("score", "over", "given", "computed", "n", "unit")
-        title = "given by the simulator, and computed with Bench2Drive's penalties"
-        return table(title, columns, rows, words=2)
-
 
 def score_real_run(path: Path, metric_folder: Path | None = None) -> RealRun:
     """Read and score the results of a real run.
@@ -183,11 +188,6 @@ def score_real_run(path: Path, metric_folder: Path | None = None) -> RealRun:
         leaderboard_scores(episodes, set_size),
         stood_most(episodes),
     )
-
-
-def _shown(quotients: Quotients, over: str) -> str:
-    measure = quotients.over_set if over == "set" else quotients.over_driven
-    return number(measure.value, ".4f")
 
 
 def some_of(names: Sequence[str]) -> str:
@@ -338,7 +338,11 @@ def scores_table(name: str, scores: Scores) -> Table:
     """Return every score with its unit, its interval and its number of routes."""
     routes = f"{scores.routes} of {scores.expected} routes"
     partial = ", PARTIAL: no comparison with a whole set" if scores.partial else ""
-    rows = [(label, *_cells(estimate)) for label, estimate in _each(scores)]
+    rows = list[tuple[str, ...]]()
+    for label, estimate in _each(scores):
+        unit = estimate.measure.unit
+        cells = estimate_cells(estimate, ".2f" if unit == "%" else ".3f")
+        rows.append((label, *cells, unit))
     columns = ("score", "mean", "95 %", "95 %, other types", "n", "unit")
     why = {label: e.measure.reason for label, e in _each(scores) if e.value is None}
     return table(f"{name}: {routes}{partial}", columns, rows, not_measured(why))
@@ -360,8 +364,3 @@ def _each(scores: Scores) -> Iterator[tuple[str, Estimate]]:
     yield "smallest PET", scores.safety.smallest_pet
     yield "smallest distance", scores.safety.smallest_distance
     yield "at-fault collisions", scores.safety.at_fault_collisions
-
-
-def _cells(estimate: Estimate) -> Sequence[str]:
-    unit = estimate.measure.unit
-    return *estimate_cells(estimate, ".2f" if unit == "%" else ".3f"), unit

@@ -107,8 +107,31 @@ class EerScores:
 
     def tables(self) -> tuple[Table, ...]:
         """Return the scores and their weights."""
-        scale = self.found.scale
-        return (self._scores(), *(() if scale is None else (self._weights(scale),)))
+        scores, scale = self.found.scores, self.found.scale
+        rows = [[n, *estimate_cells(each, ".2f")] for n, each in scores.items()]
+        why = not_measured(
+            {
+                f"EER_AV of {name}": each.measure.reason
+                for name, each in scores.items()
+                if each.value is None
+            }
+        )
+        columns = ("results", "EER_AV", "95 %", "95 %, other types", "n")
+        points = table("Driving and energy, points", columns, rows, why)
+        if scale is None:
+            return (points,)
+        # a measure is scaled so that its offset is 0 and offset plus span is 1
+        rows = [
+            [measure, f"{weight:.3f}", significant(low), significant(low + span), unit]
+            for measure, weight, low, span, unit in zip(
+                MEASURES, scale.weights, scale.offset, scale.span, UNITS, strict=True
+            )
+        ]
+        left = [f"{n} for want of {name}" for name, n in self.found.left_out.items()]
+        note = f"Routes left out of all: {', '.join(left)}." if left else ""
+        columns = ("measure", "weight", "0 is", "1 is", "unit")
+        by = f"Weights by CRITIC, {scale.normalization}"
+        return (points, table(by, columns, rows, note))
 
     def lines(self) -> tuple[str, ...]:
         """Return whether the order depends on the normalization."""
@@ -131,30 +154,6 @@ class EerScores:
             "left_out": dict(found.left_out),
             "rankings": {k: list(v) for k, v in self.rankings.items()},
         }
-
-    def _scores(self) -> Table:
-        scores = self.found.scores
-        rows = [[n, *estimate_cells(each, ".2f")] for n, each in scores.items()]
-        why = {
-            f"EER_AV of {name}": each.measure.reason
-            for name, each in scores.items()
-            if each.value is None
-        }
-        columns = ("results", "EER_AV", "95 %", "95 %, other types", "n")
-        return table("Driving and energy, points", columns, rows, not_measured(why))
-
-    def _weights(self, scale: EerScale) -> Table:
-        # a measure is scaled so that its offset is 0 and offset plus span is 1
-        rows = [
-            (measure, f"{weight:.3f}", significant(low), significant(low + span), unit)
-            for measure, weight, low, span, unit in zip(
-                MEASURES, scale.weights, scale.offset, scale.span, UNITS, strict=True
-            )
-        ]
-        left = [f"{n} for want of {name}" for name, n in self.found.left_out.items()]
-        note = f"Routes left out of all: {', '.join(left)}." if left else ""
-        columns = ("measure", "weight", "0 is", "1 is", "unit")
-        return table(f"Weights by CRITIC, {scale.normalization}", columns, rows, note)
 
 
 def score_eer(

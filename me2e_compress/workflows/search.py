@@ -190,30 +190,26 @@ def search(
                 counter.close()
         # calibrate once, then search variants of that one graph
         trials, modules = files.trials(options, listener)
-        budgets = _budgets(options, trials)
+        # sizes and seconds in base units, as they are measured
+        mb, ms, most_j = options.max_mb, options.max_ms, options.max_joules
+        budgets = list[Budget]()
+        if mb is not None:
+            budgets.append(
+                Budget(
+                    mb * 1e6,
+                    "bytes of weights",
+                    lambda made: float(graph.size(made).weight_bytes),
+                )
+            )
+        if ms is not None:
+            budgets.append(Budget(ms / 1e3, "s", partial(_seconds, trials)))
+        if most_j is not None:
+            budgets.append(Budget(most_j, "J", partial(_joules, trials)))
         report = partial(listener.on_progress, "modules")
         tried = find(trials, modules, budgets, progress=report)
         written = files.write(Int8Choice(tried[-1].modules), options)
     limits = tuple((each.unit, each.limit) for each in budgets)
     return SearchResult(files.output, tried, limits, written)
-
-
-def _budgets(options: SearchOptions, trials: Trials) -> list[Budget]:
-    # sizes and seconds in base units, as they are measured
-    found = list[Budget]()
-    if options.max_mb is not None:
-        found.append(Budget(options.max_mb * 1e6, "bytes of weights", _weight_bytes))
-    if options.max_ms is not None:
-        seconds = partial(_seconds, trials)
-        found.append(Budget(options.max_ms / 1e3, "s", seconds))
-    if options.max_joules is not None:
-        joules = partial(_joules, trials)
-        found.append(Budget(options.max_joules, "J", joules))
-    return found
-
-
-def _weight_bytes(made: ir.Model) -> float:
-    return float(graph.size(made).weight_bytes)
 
 
 def _joules(trials: Trials, made: ir.Model) -> float:
