@@ -58,33 +58,26 @@ def _run(run: Callable[[], None]) -> int:
 
     set_verbosity(Verbosity.NORMAL)
     try:
-        _check_place()
+        # file names that are not UTF-8, and a current folder that is gone
+        try:
+            Path.cwd()
+        except OSError as error:
+            raise Me2eError(f"the current folder: {error.strerror}") from error
+        for word in sys.argv[1:]:
+            if any("\ud800" <= each <= "\udfff" for each in word):
+                raise Me2eError(f"{word!a} is not UTF-8: rename the file")
         run()
     except (CycloptsError, Me2eError, OSError, ImportError) as error:
         told = explained(error)
         if isinstance(told, ImportError):
             raise  # of no optional package: a defect of ours, which needs its traceback
-        # an error of the user's is one line, without a traceback
-        line = printable(" ".join(_told(told).split()))
+        # an error of the user's is one line, without a traceback; that of the system
+        # is preceded by its file, if any
+        text = str(told)
+        if isinstance(told, OSError) and told.filename is not None and told.strerror:
+            text = f"{os.fsdecode(told.filename)}: {told.strerror}"
+        line = printable(" ".join(text.split()))
         errors.print(f"me2e-compress: {line}", soft_wrap=True, markup=False)
         usage = isinstance(error, CycloptsError | OptionError) or names_former(error)
         return 2 if usage else 1
     return 0
-
-
-def _check_place() -> None:
-    """Refuse file names that are not UTF-8, and a current folder that is gone."""
-    try:
-        Path.cwd()
-    except OSError as error:
-        raise Me2eError(f"the current folder: {error.strerror}") from error
-    for word in sys.argv[1:]:
-        if any("\ud800" <= each <= "\udfff" for each in word):
-            raise Me2eError(f"{word!a} is not UTF-8: rename the file")
-
-
-def _told(error: Exception) -> str:
-    """Return an error's message; a system error is preceded by its file, if any."""
-    if isinstance(error, OSError) and error.filename is not None and error.strerror:
-        return f"{os.fsdecode(error.filename)}: {error.strerror}"
-    return str(error)

@@ -161,13 +161,19 @@ def print_table(content: Table) -> None:
     """
     content = content.printable()
     # intervals are shown if the terminal is wide, or the table narrow
-    intervals = _is_wide() or _room(content, intervals=True) >= 0
+    room = console.width - _frame(content) - sum(_longest(content, True, False))
+    intervals = _is_wide() or room >= 0
     widths = _widths(content, intervals)
     console.print(Text(content.title, "bold"), soft_wrap=True)
-    if widths is None:
-        _print_rows(content)
-    else:
+    if widths is not None:
         console.print(_grid(content, widths, intervals))
+    # each row as its name and, indented, its other cells
+    for first, *others in content.rows if widths is None else ():
+        console.print(Text(first.text), soft_wrap=True)
+        for name, cell in zip(content.columns[1:], others, strict=True):
+            if cell.text:
+                label = f"{name}: " if name and len(content.columns) > 2 else ""
+                console.print(Text(f"    {label}{cell.text}"), soft_wrap=True)
     # what the table leaves out is said below it
     if content.note:
         console.print(Text(content.note, "dim"))
@@ -175,11 +181,6 @@ def print_table(content: Table) -> None:
         console.print(Text(f"Intervals: in a terminal of {WIDE} columns.", "dim"))
     if content.details and is_verbose():
         console.print(Text(content.details, "dim"), soft_wrap=True)
-
-
-def _room(content: Table, *, intervals: bool) -> int:
-    """Return how many columns of the terminal a table leaves; below 0 means too few."""
-    return console.width - _frame(content) - sum(_longest(content, intervals, False))
 
 
 def _frame(content: Table) -> int:
@@ -229,17 +230,6 @@ def _grid(content: Table, widths: Sequence[int], intervals: bool) -> Shown:
     return made
 
 
-def _print_rows(content: Table) -> None:
-    """Print each row as its name and, indented, its other cells."""
-    alone = len(content.columns) == 2
-    for first, *others in content.rows:
-        console.print(Text(first.text), soft_wrap=True)
-        for name, cell in zip(content.columns[1:], others, strict=True):
-            if cell.text:
-                label = "" if alone or not name else f"{name}: "
-                console.print(Text(f"    {label}{cell.text}"), soft_wrap=True)
-
-
 def _is_wide() -> bool:
     return console.width >= WIDE
 
@@ -287,13 +277,9 @@ class ProgressLines:
         if now - self._said < EVERY_S:
             return
         self._said = now
-        left = _left(now - self._begun, done, total)
-        said = f"{stage}: {_done(done, total, what)}"
-        self._write(", ".join(filter(None, [said, left])))
-
-
-def _left(seconds: float, done: int, total: int) -> str:
-    """Return how long the rest takes at the pace so far; empty if not known."""
-    if not 0 < done < total:
-        return ""
-    return f"{duration(seconds / done * (total - done))} left"
+        line = f"{stage}: {_done(done, total, what)}"
+        # how long the rest takes at the pace so far
+        if 0 < done < total:
+            left = (now - self._begun) / done * (total - done)
+            line += f", {duration(left)} left"
+        self._write(line)

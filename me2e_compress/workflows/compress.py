@@ -119,7 +119,26 @@ class CompressResult(Result):
         if self.int8 is not None:
             yield self.int8.line
             yield from filter(None, [self.int8.slow_here])
-        yield from _proof(self.report)
+        # how far exact passes moved the outputs, and what is not proven
+        judged = [
+            (check.errors[name], check.fed)
+            for check in self.report.verifications
+            for name in check.judged
+        ]
+        # with lossy passes in the pipeline, sameness is not the claim
+        if judged and not self.report.lossy:
+            worst, inputs = max(judged)
+            near = f" to within {worst:.1e} of its largest value" if worst else ""
+            yield f"every output is the same{near} ({inputs})"
+        if not any(step.changes for step in self.report.steps):
+            yield "every output is the same: no pass changed anything"
+        # what could not be proven is said too
+        for check in self.report.verifications:
+            if check.unproven is not None:
+                yield f"not proven: {', '.join(check.passes)}: {check.unproven}"
+            elif check.left_out:
+                yield f"not proven of every output: {check.left_out}"
+            yield from check.remarks
         if self.loss is not None:
             yield from self.loss.lines()
         if self.lint is not None:
@@ -284,29 +303,6 @@ def _refuse(
 def beside(output: Path, what: str) -> Path:
     """Return the path of the ``plan`` or ``report`` beside a compressed graph."""
     return output.with_name(f"{output.stem}.{what}.json")
-
-
-def _proof(report: Report) -> Iterator[str]:
-    """Say how far exact passes moved the outputs, and what is not proven."""
-    judged = [
-        (check.errors[name], check.fed)
-        for check in report.verifications
-        for name in check.judged
-    ]
-    # with lossy passes in the pipeline, sameness is not the claim
-    if judged and not report.lossy:
-        worst, inputs = max(judged)
-        near = f" to within {worst:.1e} of its largest value" if worst else ""
-        yield f"every output is the same{near} ({inputs})"
-    if not any(step.changes for step in report.steps):
-        yield "every output is the same: no pass changed anything"
-    # what could not be proven is said too
-    for check in report.verifications:
-        if check.unproven is not None:
-            yield f"not proven: {', '.join(check.passes)}: {check.unproven}"
-        elif check.left_out:
-            yield f"not proven of every output: {check.left_out}"
-        yield from check.remarks
 
 
 def _written(

@@ -60,7 +60,12 @@ def modules_figure(trace: LatencyTrace, name: str) -> Figure:
     """Return the figure that :func:`draw_modules` writes."""
     figure = Figure(figsize=(9.6, 3.6), layout="constrained")
     left, right = figure.subplots(1, 2, width_ratios=(2.3, 1))
-    shown = _gathered(trace.modules_us)
+    # the largest parts in their order, and the others as one
+    shown, most = dict(trace.modules_us), _MOST_COLOURS - 1
+    if len(shown) > _MOST_COLOURS:
+        small = {name: shown.pop(name) for name in list(shown)[most:]}
+        others = tuple(map(sum, zip(*small.values(), strict=True)))
+        shown[f"{len(small)} others"] = others
     total = np.sum([np.array(each) for each in shown.values()], axis=0)
     # the profiler, which timed the modules, costs an inference time
     taken_us = total, trace.samples_us
@@ -73,17 +78,6 @@ def modules_figure(trace: LatencyTrace, name: str) -> Figure:
     _stack(left, shown, total)
     _tail(right, total)
     return figure
-
-
-def _gathered(parts: Microseconds) -> Microseconds:
-    """Return the largest parts in their order, and the others as one."""
-    if len(parts) <= _MOST_COLOURS:
-        return parts
-    names = list(parts)
-    small = names[_MOST_COLOURS - 1 :]
-    others = tuple(map(sum, zip(*(parts[name] for name in small), strict=True)))
-    kept = {name: parts[name] for name in names[: _MOST_COLOURS - 1]}
-    return {**kept, f"{len(small)} others": others}
 
 
 def _stack(axes: Axes, parts: Microseconds, total: Totals) -> None:

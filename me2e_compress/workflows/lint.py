@@ -163,7 +163,19 @@ def lint(
     path = model_path(model)
     loaded = graph.load(path)
     options = asked_of(loaded, options or LintOptions())
-    found = _found(loaded, path.name, options, listener)
+    judge, provider = _judge(options), options.runs_on
+    found = judge.lint(loaded)
+    if provider.native != CPU.native:  # the list of kernels is the CPU's
+        found = tuple(each for each in found if each.rule != "kernel")
+    # a graph that the rules refuse is not opened
+    if not any(each.severity == "error" for each in found):
+        if judge.opens:
+            try_first(loaded, path.name, listener=listener, provider=provider)
+        # a node that a rule has named already is not named again
+        known = {each.node for each in found if each.rule == "float-answer"}
+        opened = judge.read_back(loaded, provider)
+        new = [each for each in opened if each.node not in known]
+        found = worst_first((*found, *new))
     build = check(loaded, options.sm) if options.trt_check else None
     return LintResult(path, options, found, build)
 
@@ -204,26 +216,6 @@ def lint_written(
     options = LintOptions(target=targets[-1])
     found = _judge(options).lint(with_own_domains(model))
     return LintResult(Path(output.name), options, found, asked=asked is not None)
-
-
-def _found(
-    model: ir.Model, name: str, options: LintOptions, listener: Listener
-) -> tuple[LintFinding, ...]:
-    """Return the rules' findings and, if none is an error, those of opening it."""
-    judge, provider = _judge(options), options.runs_on
-    found = judge.lint(model)
-    if provider.native != CPU.native:  # the list of kernels is the CPU's
-        found = tuple(each for each in found if each.rule != "kernel")
-    if any(each.severity == "error" for each in found):
-        return found
-    if judge.opens:
-        try_first(model, name, listener=listener, provider=provider)
-    # a node that a rule has named already is not named again
-    known = {each.node for each in found if each.rule == "float-answer"}
-    opened = [
-        each for each in judge.read_back(model, provider) if each.node not in known
-    ]
-    return worst_first((*found, *opened))
 
 
 def _said(verdict: BuildResult, sm: int) -> tuple[str, ...]:

@@ -7,7 +7,7 @@ import importlib.util
 import os
 import platform
 import re
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from functools import partial
 from importlib import resources
 from importlib.resources.abc import Traversable
@@ -63,7 +63,21 @@ class ListResult(Result):
         headline = ", ".join(f"{len(each)} {kind}" for kind, each in self.kinds.items())
         tables, by = list[Table](), "other packages add theirs by entry point: "
         for kind, entries in self.kinds.items():
-            rows = [row for each in entries for row in _rows(each, self.closely)]
+            rows = list[tuple[str, str]]()
+            for entry in entries:
+                theirs = "" if entry.source == _OURS else f" ({entry.source})"
+                about = entry.error or f"{entry.doc}{theirs}".replace("`", "")
+                rows.append((entry.name, about))
+                # then the options: closely on rows of their own, else on one
+                words = list[str]()
+                for each in entry.options:
+                    gap = " = " if self.closely else "="
+                    default = "" if each.default is None else f"{gap}{each.default}"
+                    text = f"{each.name}: {each.type}{default} {each.doc}"
+                    words.append(text if self.closely else f"{each.name}{default}")
+                if words and not self.closely:
+                    words = [", ".join(words)]
+                rows += [("", text.replace("`", "")) for text in words]
             note = by + REGISTRIES[kind].group if kind in REGISTRIES else ""
             tables.append(table(kind, ("name", "what it is"), rows, note, words=2))
         return Shown(headline, tables, ())
@@ -134,23 +148,6 @@ def list_entries(kind: str | None = None) -> ListResult:
     # options are only explained for a single kind, since all would be long
     chosen = KINDS if kind is None else {kind: KINDS[kind]}
     return ListResult({name: find() for name, find in chosen.items()}, kind is not None)
-
-
-def _rows(entry: Entry, closely: bool) -> Iterator[tuple[str, str]]:
-    """Yield the name with its description, then the options on rows of their own."""
-    theirs = "" if entry.source == _OURS else f" ({entry.source})"
-    yield entry.name, entry.error or f"{entry.doc}{theirs}".replace("`", "")
-    if closely:
-        for each in entry.options:
-            default = "" if each.default is None else f" = {each.default}"
-            text = f"{each.name}: {each.type}{default} {each.doc}"
-            yield "", text.replace("`", "")
-    elif entry.options:
-        words = (
-            each.name if each.default is None else f"{each.name}={each.default}"
-            for each in entry.options
-        )
-        yield "", ", ".join(words).replace("`", "")
 
 
 _EXTRAS = (

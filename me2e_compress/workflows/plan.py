@@ -199,7 +199,16 @@ def plan(
     with writing([written], inputs, force=options.force):
         # a file is a plan, carries one, or is a float graph to plan
         read = [_read(path) for path in files]
-        _check_options(options, files, read)
+        # options that would change nothing, as all plans are made already
+        names = ("scheme", "rules", "target", "overrides")
+        given = [name for name in names if getattr(options, name)]
+        only = read[:1] if "overrides" in given else read
+        if given and all(isinstance(each, QuantPlan) for each in only):
+            option = "overrides" if "overrides" in given else given[0]
+            raise RecipeError(
+                f"--{option} is for a plan that is yet to be made, and {files[0]} has"
+                " its own: give the float model"
+            )
         # overrides apply to the first plan only: the other shows what they change
         plain = QuantizeInt8(
             scheme=options.scheme or "full",
@@ -224,21 +233,6 @@ def _read(path: Path) -> QuantPlan | ir.Model:
         return load_plan(path)
     model = graph.load(path)
     return plan_of(model) or model
-
-
-def _check_options(
-    options: PlanOptions, files: Sequence[Path], read: Sequence[QuantPlan | ir.Model]
-) -> None:
-    """Refuse options that would change nothing, because all plans are made already."""
-    names = ("scheme", "rules", "target", "overrides")
-    given = [name for name in names if getattr(options, name)]
-    only = read[:1] if "overrides" in given else read
-    if given and all(isinstance(each, QuantPlan) for each in only):
-        option = "overrides" if "overrides" in given else given[0].replace("_", "-")
-        raise RecipeError(
-            f"--{option} is for a plan that is yet to be made, and {files[0]} has its"
-            " own: give the float model"
-        )
 
 
 def _made(

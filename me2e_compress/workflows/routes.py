@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 from collections import Counter
-from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -122,7 +121,7 @@ def make_routes(
 ) -> RoutesResult:
     """Make a fresh set of routes, each admitted by the expert and the blind driver."""
     need_extra("highway", "making routes")
-    from me2e_compress.evaluators.highway.generate import generate
+    from me2e_compress.evaluators.highway.generate import ScenarioRoutes, generate
 
     options, output = options or RoutesOptions(), Path(output)
     deciding = {
@@ -133,41 +132,34 @@ def make_routes(
     with writing([output], force=options.force):
         # go on where a run that was killed left off
         draft = output.with_name(f"{output.name}.part")
-        harvests = {one.scenario: one for one in _begun(draft, deciding)}
+        begun = list[ScenarioRoutes]()
+        if draft.exists():
+            with documents.reading(draft, EvaluationError, "not a set that was begun"):
+                content = documents.content(draft)
+                record = TypeAdapter(dict[str, Any]).validate_json(content)
+                for key, wanted in deciding.items():
+                    if record.get(key) != wanted:
+                        raise EvaluationError(
+                            f"{draft}: is a set that was begun with {key}"
+                            f" {record.get(key)}, not {wanted}; delete it, or choose"
+                            " another name"
+                        )
+                done = TypeAdapter(list[ScenarioRoutes])
+                begun = done.validate_python(record.get("done"))
+        harvests = {one.scenario: one for one in begun}
         names = [name for name in options.names if name not in harvests]
         # keep and report each scenario type as soon as its routes are admitted
         made = generate(options.seed, names, options.variants, options.workers)
         for harvest in made:
             harvests[harvest.scenario] = harvest
-            done = [dataclasses.asdict(one) for one in harvests.values()]
-            write_document(draft, deciding | {"done": done})
+            kept = [dataclasses.asdict(one) for one in harvests.values()]
+            write_document(draft, deciding | {"done": kept})
             count = len(harvests), len(options.names)
             listener.on_progress("admitting", *count, harvest.scenario)
         ordered = tuple(harvests[name] for name in options.names)
         save_routes([route for one in ordered for route in one.routes], output)
         draft.unlink(missing_ok=True)
         return RoutesResult(output, ordered)
-
-
-def _begun(draft: Path, deciding: Mapping[str, object]) -> list[ScenarioRoutes]:
-    """Read the types that a run with these options has admitted already.
-
-    Raises:
-        EvaluationError: The draft is of other options, or no draft.
-    """
-    from me2e_compress.evaluators.highway.generate import ScenarioRoutes
-
-    if not draft.exists():
-        return []
-    with documents.reading(draft, EvaluationError, "not a set that was begun"):
-        record = TypeAdapter(dict[str, Any]).validate_json(documents.content(draft))
-        for key, wanted in deciding.items():
-            if record.get(key) != wanted:
-                raise EvaluationError(
-                    f"{draft}: is a set that was begun with {key} {record.get(key)},"
-                    f" not {wanted}; delete it, or choose another name"
-                )
-        return TypeAdapter(list[ScenarioRoutes]).validate_python(record.get("done"))
 
 
 @dataclasses.dataclass(frozen=True, repr=False)

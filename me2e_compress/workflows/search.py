@@ -81,14 +81,23 @@ class TrialFiles:
         scheme = QuantScheme.named(options.scheme or "full", modules)
         # the graph is prepared once; every trial starts from there
         ready = PreparedGraph.of(self.model, loaded, options.module_map)
+        model, tensors, provider = ready.model, ready.tensors(), options.runs_on
+        if options.ranges is not None:
+            ranges, name = Ranges.load(Path(options.ranges)), options.ranges
+            digest, method = graph.digest(model), ranges.method
+            ranges.check(model=digest, tensors=tensors, method=method, named=name)
+        else:
+            listening = listener.counting("calibrate")
+            calibrator = Calibrator(rules.method, provider=provider)
+            ranges = calibrator.run(model, tensors, recording, listening)
         return Trials(
-            ready.model,
+            model,
             ready.modules,
             rules,
             place,
-            _ranges(ready, recording, options, listener),
+            ranges,
             draw(recording, options.count, 0),
-            provider=options.runs_on,
+            provider=provider,
         ), scheme.modules
 
     def write(self, choice: Int8Choice, options: TrialOptions) -> str:
@@ -100,26 +109,6 @@ class TrialFiles:
         listed = ", ".join(choice.modules) or "no module"
         more = f", {len(choice.floats)} of their nodes in float" if overrides else ""
         return f"{self.output}: int8 in {listed}{more}"
-
-
-def _ranges(
-    ready: PreparedGraph,
-    recording: CalibrationSet,
-    options: TrialOptions,
-    listener: Listener,
-) -> Ranges:
-    tensors = ready.tensors()
-    if options.ranges is not None:
-        ranges = Ranges.load(Path(options.ranges))
-        digest = graph.digest(ready.model)
-        ranges.check(
-            model=digest, tensors=tensors, method=ranges.method, named=options.ranges
-        )
-        return ranges
-    method = RULE_SETS.parse(options.rules or DEFAULT_RULES).method
-    return Calibrator(method, provider=options.runs_on).run(
-        ready.model, tensors, recording, listener.counting("calibrate")
-    )
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
