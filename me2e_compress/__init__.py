@@ -36,8 +36,6 @@ if TYPE_CHECKING:  # what a type checker sees; at run time names load when asked
     from me2e_compress.workflows.calibrate import RangesResult as RangesResult
     from me2e_compress.workflows.calibrate import calibrate as calibrate
     from me2e_compress.workflows.calibrate import ranges as ranges
-    from me2e_compress.workflows.check_model import ModelCheck as ModelCheck
-    from me2e_compress.workflows.check_model import check_model as check_model
     from me2e_compress.workflows.compare import CompareResult as CompareResult
     from me2e_compress.workflows.compare import (
         FirstDifferenceResult as FirstDifferenceResult,
@@ -50,6 +48,8 @@ if TYPE_CHECKING:  # what a type checker sees; at run time names load when asked
     from me2e_compress.workflows.compress import compress as compress
     from me2e_compress.workflows.evaluate import EvaluateOptions as EvaluateOptions
     from me2e_compress.workflows.evaluate import EvaluateResult as EvaluateResult
+    from me2e_compress.workflows.evaluate import ModelCheck as ModelCheck
+    from me2e_compress.workflows.evaluate import check_model as check_model
     from me2e_compress.workflows.evaluate import evaluate as evaluate
     from me2e_compress.workflows.files import EngineResult as EngineResult
     from me2e_compress.workflows.files import JoinResult as JoinResult
@@ -102,13 +102,14 @@ _ROOMS = {
     "study": "StudyResult load_study run_study",
     "study.report.page": "write_study",
     "workflows.calibrate": "CalibrateResult RangesResult calibrate ranges",
-    "workflows.check_model": "ModelCheck check_model",
     "workflows.compare": (
         "CompareResult FirstDifferenceResult compare first_difference"
     ),
     "workflows.compare_dump": "DumpResult compare_dump",
     "workflows.compress": "CompressResult compress",
-    "workflows.evaluate": "EvaluateOptions EvaluateResult evaluate",
+    "workflows.evaluate": (
+        "EvaluateOptions EvaluateResult ModelCheck check_model evaluate"
+    ),
     "workflows.files": "EngineResult JoinResult SplitResult build join split",
     "workflows.frames": "record_frames",
     "workflows.inspect": "InspectResult inspect",
@@ -149,4 +150,4 @@ if not TYPE_CHECKING:  # else every name would be one for a type checker
 def __dir__() -> list[str]:
     """List the public names and what is loaded, for completion."""
     dunders = (name for name in globals() if name.startswith("__"))
-    return sorted({*__all__, *_MODULES, *dunders})
+    return sorted({*_HOMES, *_MODULES, *dunders})

@@ -55,7 +55,6 @@ def evaluate(
         evaluator: who drives it: highway, NAME{option=value}, or see list
     """
     from me2e_compress.workflows import evaluate as workflow
-    from me2e_compress.workflows.check_model import check_model
 
     model = model or GraphOptions()
     adapter, module_map, provider = model.adapter, model.module_map, model.runs_on
@@ -64,7 +63,9 @@ def evaluate(
         if policy is None:
             raise OptionError("--check needs a policy: POLICY")
         with listening() as listener:
-            checked = check_model(policy, adapter, provider, listener, module_map)
+            checked = workflow.check_model(
+                policy, adapter, provider, listener, module_map
+            )
         show(checked)
         checked.check()
         return

@@ -99,7 +99,20 @@ class LintResult(Result):
                 more.append(f"{row.severity} {row.rule}: {row.nodes - shown} more")
         columns = ("", "rule", "node", "what")
         findings = table("Findings", columns, rows, "\n".join(more), words=4)
-        answer = () if self.build is None else _said(self.build, self.options.sm)
+        answer = list[str]()
+        if (build := self.build) is not None:
+            built = "built" if build.built else "not built"
+            where = "" if build.built is None else f", {built} for SM{self.options.sm}"
+            parsed = "parsed" if build.parsed else "not parsed"
+            version = f"TensorRT-RTX {build.version}, on this CPU"
+            answer.append(f"{version}: {parsed}{where}")
+            int8 = Counter(each.kind for each in build.kernels if each.is_int8)
+            kinds = Counter(each.kind for each in build.kernels)
+            kernels = ", ".join(f"{int8[k]} of {n} {k}s" for k, n in kinds.items())
+            if kernels:
+                answer.append(f"kernels with int8 operands: {kernels}")
+            if cut := build.cut:
+                answer.append(f"cut at {len(cut)} plugins: {', '.join(cut[:5])}")
         reason = self.refusal or self.miscomputed
         return Shown(
             self.headline,
@@ -216,18 +229,3 @@ def lint_written(
     options = LintOptions(target=targets[-1])
     found = _judge(options).lint(with_own_domains(model))
     return LintResult(Path(output.name), options, found, asked=asked is not None)
-
-
-def _said(verdict: BuildResult, sm: int) -> tuple[str, ...]:
-    int8 = Counter(each.kind for each in verdict.kernels if each.is_int8)
-    every = Counter(each.kind for each in verdict.kernels)
-    kernels = ", ".join(f"{int8[kind]} of {every[kind]} {kind}s" for kind in every)
-    parsed = "parsed" if verdict.parsed else "not parsed"
-    built = "built" if verdict.built else "not built"
-    more = "" if verdict.built is None else f", {built} for SM{sm}"
-    lines = [f"TensorRT-RTX {verdict.version}, on this CPU: {parsed}{more}"]
-    if kernels:
-        lines.append(f"kernels with int8 operands: {kernels}")
-    if verdict.cut:
-        lines.append(f"cut at {len(verdict.cut)} plugins: {', '.join(verdict.cut[:5])}")
-    return tuple(lines)

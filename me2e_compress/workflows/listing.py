@@ -194,26 +194,21 @@ def doctor() -> DoctorResult:
         Checkup("platform", platform.platform()),
         Checkup("onnxruntime on", ", ".join(onnxruntime.get_available_providers())),
     )
-    return DoctorResult((*machine, *_packages(), _gpu(), _energy()))
-
-
-def _packages() -> list[Checkup]:
-    found = [Checkup(name, version) for name, version in versions().items()]
+    packages = [Checkup(name, version) for name, version in versions().items()]
     for module, extra, purpose in _EXTRAS:
         if importlib.util.find_spec(module) is None:
             advice = f"{purpose}: pip install 'me2e-compress[{extra}]'"
-            found.append(Checkup(module, None, advice))
+            packages.append(Checkup(module, None, advice))
             continue
         version = "of unknown version"
         with contextlib.suppress(importlib.metadata.PackageNotFoundError):
             version = importlib.metadata.version(module.replace("_", "-"))
-        found.append(Checkup(module, version))
-    # compiled kernels are of the extra ``fast``
-    if why := why_not():
-        advice = f"fused operators run as their bodies: {why}"
-        return [*found, Checkup("compiled kernels", None, advice)]
-    names = ", ".join(each.op_type for each in KERNELS)
-    return [*found, Checkup("compiled kernels", names)]
+        packages.append(Checkup(module, version))
+    # compiled kernels, or why there are none
+    why, names = why_not(), ", ".join(each.op_type for each in KERNELS)
+    advice = f"fused operators run as their bodies: {why}" if why else ""
+    kernels = Checkup("compiled kernels", None if why else names, advice)
+    return DoctorResult((*machine, *packages, kernels, _gpu(), _energy()))
 
 
 def _energy() -> Checkup:

@@ -114,7 +114,25 @@ class MeasuredLoss:
         """Yield how far the outputs moved, and which are alive or not judged."""
         found = self.fidelity
         if found is not None:
-            yield self._summary(found)
+            parts = list[str]()
+            if found.plan is not None:
+                parts.append(
+                    f"the plan moves {found.plan.mean_m:.3f} m on average,"
+                    f" {found.plan.max_m:.2f} m at most"
+                )
+            judged = [
+                each
+                for each in found.outputs
+                if each.name != found.plan_output
+                and not (each.discrete or each.name in self.unsteady)
+            ]
+            if judged:
+                worst = min(judged, key=lambda each: each.sqnr_db)
+                noise, spread = shown(worst.sqnr_db, "dB"), worst.by_frame
+                spread = f" ({spread} by frame)" if spread else ""
+                parts.append(f"the noisiest output is {worst.name}, {noise}{spread}")
+            where = f"on {counted(found.frames, 'frame')} {self.on}"
+            yield f"{'; '.join(parts) or 'no output could be judged'} ({where})"
         elif self.on != NOT_ASKED:
             yield f"fidelity: not measured ({self.on})"
         if found is not None and self.rounding is not None:
@@ -176,24 +194,6 @@ class MeasuredLoss:
         """Return what the report says of it: all but the time."""
         names = (each.name for each in dataclasses.fields(self))
         return {name: getattr(self, name) for name in names if name != "seconds"}
-
-    def _summary(self, found: Fidelity) -> str:
-        """Return how far the plan moved, and which output is the noisiest."""
-        said = []
-        if found.plan is not None:
-            said.append(
-                f"the plan moves {found.plan.mean_m:.3f} m on average,"
-                f" {found.plan.max_m:.2f} m at most"
-            )
-        others = [each for each in found.outputs if each.name != found.plan_output]
-        judged = [e for e in others if not e.discrete and e.name not in self.unsteady]
-        if judged:
-            worst = min(judged, key=lambda each: each.sqnr_db)
-            noise, spread = shown(worst.sqnr_db, "dB"), worst.by_frame
-            spread = f" ({spread} by frame)" if spread else ""
-            said.append(f"the noisiest output is {worst.name}, {noise}{spread}")
-        where = f"on {counted(found.frames, 'frame')} {self.on}"
-        return f"{'; '.join(said) or 'no output could be judged'} ({where})"
 
     def _rounded(self, found: Fidelity, rounding: Rounding) -> Iterator[str]:
         """Say what rounding one input does to the graph before; nothing in silence."""

@@ -2,7 +2,7 @@
 
 import dataclasses
 import itertools
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Self
 
@@ -10,7 +10,7 @@ import onnx_ir as ir
 
 from me2e_compress import graph
 from me2e_compress.calibration.observers import DEFAULT_METHOD
-from me2e_compress.display import Table, table
+from me2e_compress.display import table
 from me2e_compress.errors import PreconditionError, RecipeError
 from me2e_compress.graph.modules import ModuleMap
 from me2e_compress.manager import PassManager, recipe
@@ -146,10 +146,9 @@ class PlanResult(Result):
             said = filter(None, (self.hint, headline))
             return Shown(headline, (), (*map(str, self.changes), *said))
         lines = filter(None, (self.hint, self.plan.headline))
-        more = self._nodes() if every else ()
-        return Shown(self.plan.headline, (*self.plan.tables(), *more), lines)
-
-    def _nodes(self) -> Iterator[Table]:
+        tables = list(self.plan.tables())
+        if not every:
+            return Shown(self.plan.headline, tables, lines)
         rows = list[tuple[str, str]]()
         for each in self.plan.decisions:
             if each.could_be_int8:
@@ -157,14 +156,16 @@ class PlanResult(Result):
                 close = f" ({each.borderline})" if each.borderline else ""
                 why = f"{each.dtype} by {each.rule}, {each.reason}{close}"
                 rows.append((each.node or each.output, f"{each.op}{where}: {why}"))
-        yield table("Decisions", ("node", "what, by which rule, why"), rows, words=2)
+        what = ("node", "what, by which rule, why")
+        tables.append(table("Decisions", what, rows, words=2))
         groups = [
             (group.name, group.kind, ", ".join(group.tensors), ", ".join(group.nodes))
             for group in self.plan.groups
         ]
         if groups:
             columns = ("of", "kind", "tensors", "read by")
-            yield table("Decided together", columns, groups, words=4)
+            tables.append(table("Decided together", columns, groups, words=4))
+        return Shown(self.plan.headline, tables, lines)
 
     def to_json(self) -> object:
         """Return the plan, or the differences from another."""
