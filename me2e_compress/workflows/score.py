@@ -144,7 +144,7 @@ class RealRun:
             },
         }
 
-    def _named(self) -> dict[str, tuple[str, ...]]:
+    def _named(self) -> dict[str, Sequence[str]]:
         names = (
             *("crashed", "missing", "foreign", "repeated", "rerun"),
             *("contradictory", "unrecorded"),

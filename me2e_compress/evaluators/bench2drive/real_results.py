@@ -1,19 +1,17 @@
 """Evaluator that turns results of real CARLA runs into episodes."""
 
-import dataclasses
 import json
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import ClassVar, Literal
+from typing import ClassVar, Literal, Self
 
 from me2e_compress.driving.policies import Driver
 from me2e_compress.errors import EvaluationError
 from me2e_compress.evaluators.bench2drive.recordings import (
     TICK_S,
     BrokenRecordingError,
-    RecordedRoute,
     read_decisions,
     read_recording,
 )
@@ -25,7 +23,7 @@ from me2e_compress.evaluators.bench2drive.result_files import (
     find_files,
 )
 from me2e_compress.evaluators.contract import Drive, Evaluator, Listener
-from me2e_compress.metrics.episode import Episode, InferenceRecord
+from me2e_compress.metrics.episode import EgoFrame, Episode, InferenceRecord
 from me2e_compress.metrics.scores import FULL_SET
 from me2e_compress.registry import documents
 
@@ -40,9 +38,9 @@ leaderboard/data/bench2drive220.xml and of bench2drive_0.0.4_val.xml, which shar
 The ten routes of "dev10" belong to the first."""
 
 
-@dataclass(frozen=True)
+@dataclass
 class CollectedResults:
-    """Every route once, in the order of numbers, and everything else that was found.
+    """Every route once, in the order of numbers, and everything else below a folder.
 
     Attributes:
         route_set: The version of Bench2Drive that the routes are from, if any.
@@ -61,21 +59,130 @@ class CollectedResults:
         stated: Merged files that state scores of their own.
     """
 
-    episodes: tuple[Episode, ...]
-    route_set: RouteSet | None
-    crashed: tuple[str, ...] = ()
-    missing: tuple[str, ...] = ()
-    foreign: tuple[str, ...] = ()
-    repeated: tuple[str, ...] = ()
-    rerun: tuple[str, ...] = ()
-    contradictory: tuple[str, ...] = ()
-    broken: Mapping[str, str] = dataclasses.field(default_factory=dict)
-    unfinished: tuple[Path, ...] = ()
-    unrecorded: tuple[str, ...] = ()
-    off_rate: Mapping[str, float] = dataclasses.field(default_factory=dict)
+    episodes: list[Episode] = field(default_factory=list)
+    route_set: RouteSet | None = None
+    crashed: list[str] = field(default_factory=list)
+    missing: list[str] = field(default_factory=list)
+    foreign: list[str] = field(default_factory=list)
+    repeated: list[str] = field(default_factory=list)
+    rerun: list[str] = field(default_factory=list)
+    contradictory: list[str] = field(default_factory=list)
+    broken: dict[str, str] = field(default_factory=dict)
+    unfinished: list[Path] = field(default_factory=list)
+    unrecorded: list[str] = field(default_factory=list)
+    off_rate: dict[str, float] = field(default_factory=dict)
     repetitions: int = 1
-    stated: Mapping[Path, ResultFile] = dataclasses.field(default_factory=dict)
-    notes: tuple[str, ...] = ()
+    stated: dict[Path, ResultFile] = field(default_factory=dict)
+    notes: list[str] = field(default_factory=list)
+
+    @classmethod
+    def of(cls, files: FoundFiles) -> Self:
+        """Choose one record of each route, and read the recordings that belong to it.
+
+        One of the files must hold a record.
+        """
+        # what the results files are, whole or not
+        made, by_route = cls(), dict[str, list[RouteRecord]]()
+        made.broken = {str(path): why for path, why in files.broken.items()}
+        for file in files.results:
+            for place, why in file.broken.items():
+                made.broken[f"{file.path}, record {place}"] = why
+            for record in file.records:
+                by_route.setdefault(record.episode.route, []).append(record)
+            if not file.records and not file.broken:
+                made.unfinished.append(file.path)
+            if file.stated:
+                made.stated[file.path] = file
+        # one record of each route, in order
+        records = [made._chosen(route, each) for route, each in by_route.items()]
+        for record in records:
+            made.notes += (f"{record.episode.route}: {note}" for note in record.notes)
+        records.sort(key=lambda each: (_by_number(each.number), each.content))
+        made.crashed = [each.episode.route for each in records if each.crashed]
+        # episodes with frames and decisions
+        recorded = DriveRecordings(files.recordings, files.results)
+        logs = DriveRecordings(files.decisions, files.results)
+        for record in records:
+            frames = made._frames(record, recorded.of(record))
+            decisions = made._decisions(logs.of(record))
+            episode = replace(record.episode, frames=frames, decisions=decisions)
+            made.episodes.append(episode)
+        if others := recorded.of_none:
+            more = f" and {len(others) - 1} others" if len(others) > 1 else ""
+            made.notes.insert(0, f"{others[0]}{more}: of no record")
+        # which routes of the set are missing, and which are foreign
+        times = Counter(each.number for each in records)
+        made.repetitions = max(times.values())
+        best = max(ROUTE_SETS, key=lambda name: len(ROUTE_SETS[name] & set(times)))
+        whole = ROUTE_SETS[best]
+        if whole & set(times):
+            made.route_set = best
+            made.missing = sorted(whole - set(times), key=_by_number)
+            foreign = (each for each in records if each.number not in whole)
+            made.foreign = [each.episode.route for each in foreign]
+        return made
+
+    def _chosen(self, route: str, records: Sequence[RouteRecord]) -> RouteRecord:
+        """Choose one record of a route, so that uncertainty never improves a result.
+
+        A drive replaces a crash, as when Bench2Drive resumes. Among drives with
+        different results the lowest score counts: taking the best would bias the
+        evaluation.
+        """
+        # identical copies count once
+        distinct = list({each.content: each for each in records}.values())
+        if len(distinct) < len(records):
+            self.repeated.append(route)
+        # crashes count only without a drive
+        drives = [each for each in distinct if not each.crashed]
+        if drives and len(drives) < len(distinct):
+            self.rerun.append(route)
+        counted = drives or distinct
+        if len(counted) > 1:
+            self.contradictory.append(route)
+
+        def lowest_first(record: RouteRecord) -> tuple[float, bool, str]:
+            given = record.episode.given
+            composed = given.composed_percent if given else 0.0
+            return composed, record.episode.succeeded, record.content
+
+        return min(counted, key=lowest_first)
+
+    def _frames(
+        self, record: RouteRecord, paths: Sequence[Path]
+    ) -> tuple[EgoFrame, ...]:
+        """Return the frames of the first whole recording; others are reported."""
+        route = record.episode.route
+        if not paths:
+            self.unrecorded.append(route)
+        for path in paths:
+            try:
+                raw = documents.from_json(documents.content(path), finite=False)
+                recording = read_recording(raw)
+            except OSError as error:
+                self.broken[str(path)] = str(error.strerror)
+                continue
+            except (documents.MalformedError, BrokenRecordingError) as error:
+                self.broken[str(path)] = str(error)
+                continue
+            if len(paths) > 1:
+                self.notes.append(f"{path}: one of {len(paths)} of the same drive")
+            if not recording.in_order:
+                self.notes.append(f"{path}: steps out of order: comfort is of no drive")
+            interval_s = recording.interval_s(record.duration_s)
+            if interval_s != TICK_S:
+                self.off_rate[route] = interval_s
+            return recording.frames(interval_s)
+        return ()
+
+    def _decisions(self, paths: Sequence[Path]) -> tuple[InferenceRecord, ...]:
+        """Return the decisions of a drive; an incomplete log is reported."""
+        for path in paths:
+            try:
+                return read_decisions(path)
+            except (OSError, documents.MalformedError, BrokenRecordingError) as error:
+                self.broken[str(path)] = str(error)
+        return ()
 
 
 @dataclass(frozen=True)
@@ -116,8 +223,8 @@ class Bench2DriveResults(Evaluator):
             found.recordings += apart.recordings
             found.decisions += apart.decisions
         # links may lead to the same file twice
-        found.recordings = _once(found.recordings)
-        found.decisions = _once(found.decisions)
+        for paths in (found.recordings, found.decisions):
+            paths[:] = {path.resolve(): path for path in paths}.values()
         if not any(file.records for file in found.results):
             why = "no results of a leaderboard below it"
             reports = [
@@ -133,144 +240,7 @@ class Bench2DriveResults(Evaluator):
                 *(f"no record: {file.path.name} holds none" for file in found.results),
             ]
             raise EvaluationError(f"{self.folder}: {[*reports, why][0]}")
-        return _Collection(found).results()
-
-
-def _once(paths: Sequence[Path]) -> list[Path]:
-    return list({path.resolve(): path for path in paths}.values())
-
-
-class _Collection:
-    def __init__(self, found: FoundFiles) -> None:
-        self.found = found
-        self.repeated, self.rerun = list[str](), list[str]()
-        self.contradictory = list[str]()
-        self.unrecorded, self.off_rate = list[str](), dict[str, float]()
-        self.notes = list[str]()
-        self.broken = {str(path): why for path, why in found.broken.items()}
-        for file in found.results:
-            for place, reason in file.broken.items():
-                self.broken[f"{file.path}, record {place}"] = reason
-
-    def results(self) -> CollectedResults:
-        records = self._one_each()
-        recorded = DriveRecordings(self.found.recordings, self.found.results)
-        logs = DriveRecordings(self.found.decisions, self.found.results)
-        # episodes with frames and decisions
-        episodes = tuple(
-            dataclasses.replace(
-                self._with_frames(each, recorded),
-                decisions=self._decisions(logs.of(each)),
-            )
-            for each in records
-        )
-        if others := recorded.of_none:
-            more = f" and {len(others) - 1} others" if len(others) > 1 else ""
-            self.notes.insert(0, f"{others[0]}{more}: of no record")
-        # which routes of the set are missing, and which are foreign
-        numbers = [each.number for each in records]
-        best = max(ROUTE_SETS, key=lambda name: len(ROUTE_SETS[name] & set(numbers)))
-        route_set = best if ROUTE_SETS[best] & set(numbers) else None
-        whole = ROUTE_SETS[route_set] if route_set else frozenset[str]()
-        return CollectedResults(
-            episodes,
-            route_set,
-            crashed=tuple(each.episode.route for each in records if each.crashed),
-            missing=tuple(sorted(whole - set(numbers), key=_by_number)),
-            foreign=tuple(
-                each.episode.route
-                for each in records
-                if route_set and each.number not in whole
-            ),
-            repeated=tuple(self.repeated),
-            rerun=tuple(self.rerun),
-            contradictory=tuple(self.contradictory),
-            broken=self.broken,
-            unfinished=tuple(
-                file.path
-                for file in self.found.results
-                if not file.records and not file.broken
-            ),
-            unrecorded=tuple(self.unrecorded),
-            off_rate=self.off_rate,
-            repetitions=max(Counter(numbers).values()),
-            stated={file.path: file for file in self.found.results if file.stated},
-            notes=tuple(self.notes),
-        )
-
-    def _one_each(self) -> list[RouteRecord]:
-        by_route = dict[str, list[RouteRecord]]()
-        for file in self.found.results:
-            for record in file.records:
-                by_route.setdefault(record.episode.route, []).append(record)
-        chosen = [self._chosen(route, each) for route, each in by_route.items()]
-        for record in chosen:
-            self.notes += (f"{record.episode.route}: {note}" for note in record.notes)
-        return sorted(chosen, key=lambda each: (_by_number(each.number), each.content))
-
-    def _chosen(self, route: str, records: Sequence[RouteRecord]) -> RouteRecord:
-        """Choose one record of a route, so that uncertainty never improves a result.
-
-        A drive replaces a crash, as when Bench2Drive resumes. Among drives with
-        different results the lowest score counts: taking the best would bias the
-        evaluation.
-        """
-        # identical copies count once
-        distinct = list({each.content: each for each in records}.values())
-        if len(distinct) < len(records):
-            self.repeated.append(route)
-        # crashes count only without a drive
-        drives = [each for each in distinct if not each.crashed]
-        if drives and len(drives) < len(distinct):
-            self.rerun.append(route)
-        counted = drives or distinct
-        if len(counted) > 1:
-            self.contradictory.append(route)
-
-        def lowest_first(record: RouteRecord) -> tuple[float, bool, str]:
-            given = record.episode.given
-            composed = given.composed_percent if given else 0.0
-            return composed, record.episode.succeeded, record.content
-
-        return min(counted, key=lowest_first)
-
-    def _with_frames(self, record: RouteRecord, recorded: DriveRecordings) -> Episode:
-        episode, paths = record.episode, recorded.of(record)
-        if not paths:
-            self.unrecorded.append(episode.route)
-        for path in paths:
-            recording = self._read(path)
-            if recording is None:
-                continue
-            if len(paths) > 1:
-                self.notes.append(f"{path}: one of {len(paths)} of the same drive")
-            if not recording.in_order:
-                self.notes.append(f"{path}: steps out of order: comfort is of no drive")
-            interval_s = recording.interval_s(record.duration_s)
-            if interval_s != TICK_S:
-                self.off_rate[episode.route] = interval_s
-            return dataclasses.replace(episode, frames=recording.frames(interval_s))
-        return episode
-
-    def _decisions(self, paths: Sequence[Path]) -> tuple[InferenceRecord, ...]:
-        """Return the decisions of a drive; an incomplete log is reported."""
-        for path in paths:
-            try:
-                return read_decisions(path)
-            except (OSError, documents.MalformedError, BrokenRecordingError) as error:
-                self.broken[str(path)] = str(error)
-        return ()
-
-    def _read(self, path: Path) -> RecordedRoute | None:
-        """Return a recording; an incomplete one is reported."""
-        try:
-            raw = documents.from_json(documents.content(path), finite=False)
-            return read_recording(raw)
-        except OSError as error:
-            self.broken[str(path)] = str(error.strerror)
-        except (documents.MalformedError, BrokenRecordingError) as error:
-            self.broken[str(path)] = str(error)
-        return None
+        return CollectedResults.of(found)
 
 
 def _by_number(number: str) -> tuple[int, str]:

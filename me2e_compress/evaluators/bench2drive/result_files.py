@@ -342,7 +342,10 @@ def _read(path: Path) -> ResultFile:
             records.append(read_record(raw))
         except BrokenRecordError as error:
             broken[place] = str(error)
-    return ResultFile(path, tuple(records), broken, checked.stated())
+    stated = checked.model_dump(
+        by_alias=True, exclude={"checkpoint"}, exclude_none=True
+    )
+    return ResultFile(path, tuple(records), broken, stated)
 
 
 def _number(value: object) -> float | None:
@@ -367,14 +370,6 @@ class _Document(BaseModel):
     driving_score: _Stated = Field(None, alias="driving score")
     success_rate: _Stated = Field(None, alias="success rate")
     eval_num: _Stated = Field(None, alias="eval num")
-
-    def stated(self) -> dict[str, float]:
-        written = {
-            "driving score": self.driving_score,
-            "success rate": self.success_rate,
-            "eval num": self.eval_num,
-        }
-        return {name: value for name, value in written.items() if value is not None}
 
 
 class DriveRecordings:

@@ -44,7 +44,7 @@ def test_files_are_found_by_what_they_hold(tmp_path: Path) -> None:
 
     assert routes(found) == ["1711", "2082", "2084"]
     assert found.route_set == "0.0.3"
-    assert found.crashed == ("RouteScenario_2084_rep0",)
+    assert found.crashed == ["RouteScenario_2084_rep0"]
     assert len(found.missing) == 217
     assert found.missing[0] == "1773"
 
@@ -68,7 +68,7 @@ def test_links_to_folders_are_followed_but_not_in_circles(tmp_path: Path) -> Non
 
     found = collect(tmp_path / "run")
 
-    assert (routes(found), found.repeated) == (["1711"], ())
+    assert (routes(found), found.repeated) == (["1711"], [])
 
 
 def test_the_evaluator_keeps_its_promises(tmp_path: Path) -> None:
@@ -91,7 +91,7 @@ def test_the_same_result_once_more_counts_once(tmp_path: Path) -> None:
 
     assert routes(found) == ["1711", "2082"]
     assert len(found.repeated) == 2
-    assert found.contradictory == ()
+    assert found.contradictory == []
 
 
 def test_the_worst_of_contradictory_drives_counts(tmp_path: Path) -> None:
@@ -103,7 +103,7 @@ def test_the_worst_of_contradictory_drives_counts(tmp_path: Path) -> None:
 
     found = collect(tmp_path)
 
-    assert found.contradictory == ("RouteScenario_1711_rep0",)
+    assert found.contradictory == ["RouteScenario_1711_rep0"]
     (episode,) = found.episodes
     assert episode.given is not None
     assert episode.given.composed_percent == 60.0
@@ -116,8 +116,8 @@ def test_a_crash_gives_way_to_the_drive_that_followed(tmp_path: Path) -> None:
 
     found = collect(tmp_path)
 
-    assert found.rerun == ("RouteScenario_1711_rep0",)
-    assert (found.contradictory, found.crashed) == ((), ())
+    assert found.rerun == ["RouteScenario_1711_rep0"]
+    assert (found.contradictory, found.crashed) == ([], [])
     assert found.episodes[0].succeeded
 
 
@@ -127,7 +127,7 @@ def test_crashes_with_different_results_are_a_contradiction(tmp_path: Path) -> N
 
     found = collect(tmp_path)
 
-    assert found.contradictory == ("RouteScenario_2084_rep0",)
+    assert found.contradictory == ["RouteScenario_2084_rep0"]
     assert found.episodes[0].completion_percent == 0.0
 
 
@@ -137,7 +137,7 @@ def test_repetitions_are_other_drives(tmp_path: Path) -> None:
     found = collect(tmp_path)
 
     assert len(found.episodes) == found.repetitions == 2
-    assert found.repeated == found.contradictory == ()
+    assert found.repeated == found.contradictory == []
 
 
 def test_sets_are_told_apart(tmp_path: Path) -> None:
@@ -147,8 +147,8 @@ def test_sets_are_told_apart(tmp_path: Path) -> None:
     mixed, unknown = collect(tmp_path / "a"), collect(tmp_path / "b")
 
     assert mixed.route_set == "0.0.3"
-    assert mixed.foreign == ("RouteScenario_469_rep0",)
-    assert (unknown.route_set, unknown.missing) == (None, ())
+    assert mixed.foreign == ["RouteScenario_469_rep0"]
+    assert (unknown.route_set, unknown.missing) == (None, [])
 
 
 def test_what_is_broken_is_named_and_the_rest_read(tmp_path: Path) -> None:
@@ -169,7 +169,7 @@ def test_what_is_broken_is_named_and_the_rest_read(tmp_path: Path) -> None:
     assert reasons[1] == "infractions: Field required"
     assert reasons[2].startswith("scores.score_composed: Input should be")
     assert list(found.broken)[1] == f"{tmp_path / 'r.json'}, record 1"
-    assert found.unfinished == (tmp_path / "killed.json",)
+    assert found.unfinished == [tmp_path / "killed.json"]
 
 
 @pytest.mark.parametrize(
