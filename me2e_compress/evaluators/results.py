@@ -54,7 +54,14 @@ class ResultsFolder:
         try:
             path.mkdir(parents=True, exist_ok=True)
             if not (path / MANIFEST).exists():
-                _refuse_foreign(path)
+                # a killed run of ours leaves only drafts
+                there = [each.name for each in path.iterdir()]
+                there = [name for name in there if not name.startswith(".")]
+                if any(name != ROUTES for name in there):
+                    why = f"not empty, and holds no {MANIFEST}"
+                    raise EvaluationError(f"{path}: {why}")
+                if there and any((path / ROUTES).iterdir()):
+                    raise EvaluationError(f"{path}: holds routes but no {MANIFEST}")
             (path / ROUTES).mkdir(exist_ok=True)
             if not (path / MANIFEST).exists():
                 drawn = {} if measured is None else {MEASURED: measured}
@@ -186,15 +193,6 @@ def _check_manifest(path: Path, made_by: object) -> None:
             f"{path}: {MANIFEST}: set_size is {_short(size)}, it must be"
             f" {len(routes)} or more"
         )
-
-
-def _refuse_foreign(path: Path) -> None:
-    """Refuse a folder with foreign files; a killed run of ours leaves only drafts."""
-    names = [file.name for file in path.iterdir() if not file.name.startswith(".")]
-    if any(name != ROUTES for name in names):
-        raise EvaluationError(f"{path}: not empty, and holds no {MANIFEST}")
-    if names and any((path / ROUTES).iterdir()):
-        raise EvaluationError(f"{path}: holds routes but no {MANIFEST}")
 
 
 def _unwritable(path: Path, error: OSError) -> EvaluationError:

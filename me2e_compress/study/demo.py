@@ -6,7 +6,7 @@ from pathlib import Path
 
 from me2e_compress.display import Cell, Table
 from me2e_compress.evaluators.highway.engine import LocalEngine
-from me2e_compress.metrics.measure import Estimate, Measure
+from me2e_compress.metrics.measure import Estimate
 from me2e_compress.metrics.route_summary import shown_by
 from me2e_compress.metrics.scores import Scores
 from me2e_compress.quantization.plan import plan_of
@@ -42,18 +42,21 @@ def before_and_after(outcome: StudyResult, name: str) -> Table:
     driven = [drives[each.name] for each in (before, after)]
     # size, latency and plan
     most = after.fidelity.max_m.value
-    rows = [
-        _row("size, MB", before.size_mb, after.size_mb, ".2f"),
-        _row(
-            "time of a decision, ms", before.latency_ms[50], after.latency_ms[50], ".1f"
-        ),
-        (
-            Cell("the plan moves by, m"),
-            Cell(MISSING),
-            measure_cell(after.fidelity.mean_m, ".3f"),
-            Cell("" if most is None else f"{most:.2f} m at most"),
-        ),
-    ]
+    both = before.latency_ms[50], after.latency_ms[50]
+    costs = (
+        ("size, MB", before.size_mb, after.size_mb, ".2f"),
+        ("time of a decision, ms", *both, ".1f"),
+    )
+    rows = list[tuple[Cell, ...]]()
+    for what, old, new, form in costs:
+        share = ""
+        if old.value and new.value is not None:
+            share = f"{new.value / old.value:.0%}"
+        cells = measure_cell(old, form), measure_cell(new, form)
+        rows.append((Cell(what), *cells, Cell(share)))
+    moved = measure_cell(after.fidelity.mean_m, ".3f")
+    words = "" if most is None else f"{most:.2f} m at most"
+    rows.append((Cell("the plan moves by, m"), Cell(MISSING), moved, Cell(words)))
     # the drives, and their paired difference in points with its 95 % interval
     gap = driven[1].difference
     picks: dict[str, Callable[[Scores], Estimate]] = {
@@ -72,14 +75,6 @@ def before_and_after(outcome: StudyResult, name: str) -> Table:
             points = gap.room_kept if "room" in what else gap.driving_score
         rows.append((Cell(what), *cells, Cell(_points(points))))
     return Table("Before and after", ("", before.name, after.name, ""), tuple(rows))
-
-
-def _row(what: str, before: Measure, after: Measure, form: str) -> tuple[Cell, ...]:
-    share = ""
-    if before.value and after.value is not None:
-        share = f"{after.value / before.value:.0%}"
-    cells = measure_cell(before, form), measure_cell(after, form)
-    return Cell(what), *cells, Cell(share)
 
 
 def _points(gap: Estimate | None) -> str:

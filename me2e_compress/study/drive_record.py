@@ -5,7 +5,7 @@ A drive of 220 routes takes 30 MB of episodes and 0.1 MB of these lines.
 
 import json
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, Self
 
@@ -110,36 +110,32 @@ class DriveRecord:
 
     def to_json(self) -> dict[str, Any]:
         """Return scores, difference and routes, as they stand in the study's JSON."""
+        apart_m = {route: each.distance_m for route, each in self.apart.items()}
         return {
             "scheme": self.variant,
             "condition": self.condition,
             "reason": self.reason or None,
             "scores": self.scores.to_json() if self.scores else None,
             "difference": self.difference.to_json() if self.difference else None,
-            "routes": [self._route_json(each) for each in self.routes],
-        }
-
-    def _route_json(self, route: RouteSummary) -> dict[str, Any]:
-        apart = self.apart.get(route.route)
-        return {
-            "route": route.route,
-            "driving_score": route.driving_score,
-            "room_kept": route.room_kept,
-            "succeeded": route.succeeded,
-            "ending": route.ending,
-            "infractions": [
-                {"kind": kind, "time_us": time_us} for kind, time_us in route.moments
+            "routes": [
+                {
+                    "route": each.route,
+                    "driving_score": each.driving_score,
+                    "room_kept": each.room_kept,
+                    "succeeded": each.succeeded,
+                    "ending": each.ending,
+                    "infractions": [
+                        {"kind": kind, "time_us": us} for kind, us in each.moments
+                    ],
+                    "apart_m": apart_m.get(each.route),
+                }
+                for each in self.routes
             ],
-            "apart_m": None if apart is None else apart.distance_m,
         }
 
     def save(self, path: Path) -> None:
         """Write it as JSON lines: the fingerprint, then one line per route."""
-        head = {
-            "variant": self.variant,
-            "condition": self.condition,
-            "made_by": self.made_by,
-        }
+        head = asdict(_Head(self.variant, self.condition, dict(self.made_by)))
         rows = [_ROUTE.dump_python(each, mode="json") for each in self.routes]
         lines = [json.dumps(row, ensure_ascii=False) for row in (head, *rows)]
         with drafts.written(path, StudyError):
@@ -214,9 +210,7 @@ class Change:
         return {
             "drive": self.drive,
             "against": self.against,
-            "driving_score": self.driving_score.to_json(),
-            "room_kept": self.room_kept.to_json(),
-            "success_rate": self.success_rate.to_json(),
+            **{name: getattr(self, name).to_json() for name in _CHANGED},
             "beyond_baseline": {
                 name: each and each.to_json() for name, each in beyond.items()
             },

@@ -93,18 +93,16 @@ def load_study(
     )
     study.provider.check()
     # routes are the evaluator's, which may take none
-    if which is not None or "routes" in study.driven_by.takes:
-        study = _with_routes(study, "all" if which is None else which, path)
+    if which is None and "routes" in study.driven_by.takes:
+        which = "all"
+    if which is not None:
+        if isinstance(which, bool) or not isinstance(which, str | int):
+            raise StudyError(f"{path}: routes: it must be a number, names or a file")
+        study.driven_by.check_takes(["routes"], "routes: ")
+        ours, size = study.driven_by.routes(str(which), path.parent)
+        study = dataclasses.replace(study, routes=ours, set_size=size)
     study.check()
     return study
-
-
-def _with_routes(study: Study, which: object, path: Path) -> Study:
-    if isinstance(which, bool) or not isinstance(which, str | int):
-        raise StudyError(f"{path}: routes: it must be a number, names or a file")
-    study.driven_by.check_takes(["routes"], "routes: ")
-    routes, set_size = study.driven_by.routes(str(which), path.parent)
-    return dataclasses.replace(study, routes=routes, set_size=set_size)
 
 
 def _content(path: Path) -> dict[str, object]:

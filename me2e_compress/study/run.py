@@ -66,40 +66,47 @@ def run_study(
     check_ours([folder / name for name in (JSON, MARKDOWN, HTML)], force=force)
     with writing(folders=[folder]):
         cells, prepared = prepare_study(study, folder, engine, listener)
-        return _compared(cells, prepared, pictures)
+        # plans and drives of every variant are compared with the baseline's
+        study, clock = cells.study, cells.clock
+        baseline = next(each for each in prepared if each.variant == study.reference)
+        variants = tuple(
+            VariantOutcome.of(each, clock, judge(study, baseline, each, listener))
+            for each in prepared
+        )
+        drives = tuple(
+            drive
+            for condition in study.conditions
+            for drive in cells.under(condition, prepared)
+        )
+        shown = cells.pictures(prepared, drives, pictures)
+        machine, load = this_machine(), clock.load
+        return StudyResult(
+            study, variants, drives, shown, clock.scale, machine, versions(), load
+        )
 
 
 def prepare_study(
     study: Study, folder: Path, engine: Engine | None, listener: Listener
 ) -> tuple["StudyCells", list[PreparedVariant]]:
     """Record frames, make the models and time them; return what drives them."""
-    workspace = Workspace(folder)
-    study = _recorded(study, workspace, listener)
+    # frames are recorded unless they exist; those held out are of the next seed, so
+    # of other routes
+    workspace, asked = Workspace(folder), study.to_record
+    if asked is not None:
+        frames, held_out = folder / "frames", folder / "frames-held-out"
+        for place, count, seed in (
+            (frames, asked.frames, asked.seed),
+            (held_out, asked.held_out, asked.seed + 1),
+        ):
+            if not (place / "scenes.json").is_file():
+                folder.mkdir(parents=True, exist_ok=True)
+                options = FramesOptions(count=count, seed=seed, provider=study.provider)
+                policy = Path(study.reference.policy)
+                record_frames(policy, place, options, listener)
+        study = replace(study, frames=frames, held_out=held_out, to_record=None)
     prepared = prepare_all(study, workspace, listener)
     clock = time_all(study, prepared, workspace, listener)
     return StudyCells(study, clock, workspace, engine, listener), prepared
-
-
-def _recorded(study: Study, workspace: Workspace, listener: Listener) -> Study:
-    """Return the study with folders of frames, recorded unless they exist.
-
-    The held-out frames use the next seed, hence other routes.
-    """
-    asked = study.to_record
-    if asked is None:
-        return study
-    frames, held_out = (
-        workspace.folder / name for name in ("frames", "frames-held-out")
-    )
-    for folder, count, seed in (
-        (frames, asked.frames, asked.seed),
-        (held_out, asked.held_out, asked.seed + 1),
-    ):
-        if not (folder / "scenes.json").is_file():
-            folder.parent.mkdir(parents=True, exist_ok=True)
-            options = FramesOptions(count=count, seed=seed, provider=study.provider)
-            record_frames(Path(study.reference.policy), folder, options, listener)
-    return replace(study, frames=frames, held_out=held_out, to_record=None)
 
 
 @dataclass(frozen=True)
@@ -224,30 +231,3 @@ class StudyCells:
                 study.driven_by.overlay(labelled, route, us, path)
             contrasts.append(replace(pair, picture=path))
         return tuple(contrasts)
-
-
-def _compared(
-    cells: StudyCells, prepared: list[PreparedVariant], pictures: int
-) -> StudyResult:
-    """Compare the plans and the drives of every variant with the baseline's."""
-    study, clock = cells.study, cells.clock
-    baseline = next(each for each in prepared if each.variant == study.reference)
-    variants = tuple(
-        VariantOutcome.of(each, clock, judge(study, baseline, each, cells.listener))
-        for each in prepared
-    )
-    drives = [
-        drive
-        for condition in study.conditions
-        for drive in cells.under(condition, prepared)
-    ]
-    return StudyResult(
-        study,
-        variants,
-        tuple(drives),
-        cells.pictures(prepared, drives, pictures),
-        clock.scale,
-        this_machine(),
-        versions(),
-        clock.load,
-    )

@@ -2,12 +2,13 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
+from itertools import chain
 from typing import Any
 
 from me2e_compress.display import Cell, Table, counted
 from me2e_compress.metrics.bench2drive import ABILITIES
 from me2e_compress.metrics.route_summary import COLUMNS, PairedDifference, holm
-from me2e_compress.metrics.scores import Scores
 from me2e_compress.runtime.latency_trace import Load
 from me2e_compress.runtime.providers import PROVIDERS
 from me2e_compress.study.cells import MISSING, anew_cell, estimate_cell, measure_cell
@@ -21,7 +22,7 @@ from me2e_compress.study.drive_record import (
     held_against,
 )
 from me2e_compress.study.outcome import VariantOutcome
-from me2e_compress.workflows.result import Result
+from me2e_compress.workflows.result import Result, Shown
 
 SCORES = tuple(each.name for each in COLUMNS)
 MOST_ROUTES = 40
@@ -79,13 +80,13 @@ class StudyResult(Result):
         """Return the drives under one condition."""
         return tuple(each for each in self.drives if each.condition == condition.name)
 
-    @property
+    @cached_property
     def changes(self) -> tuple[Change, ...]:
         """Cost of each change of a condition, by variant."""
         study = self.study
         return changes(study.conditions, self.drives, study.baseline, study.seed)
 
-    @property
+    @cached_property
     def pairs(self) -> tuple[Change, ...]:
         """Comparisons of the pairs that the study names."""
         return held_against(self.study.pairs, self.drives, self.study.seed)
@@ -94,24 +95,11 @@ class StudyResult(Result):
         """Return a variant by its name."""
         return next(each for each in self.variants if each.name == name)
 
-    @property
-    def headline(self) -> str:
-        """Title, and numbers of variants, conditions and routes."""
+    def shown(self) -> Shown:
+        """Return the title with numbers, every table, what failed, a busy machine."""
         study, (driven, whole) = self.study, self.coverage
-        return (
-            f"{study.title}: {counted(len(study.variants), 'variant')} under"
-            f" {counted(len(study.conditions), 'condition')} on {driven} of"
-            f" {counted(whole, 'route')}"
-        )
-
-    def lines(self) -> tuple[str, ...]:
-        """Return nothing: the tables say it all."""
-        return ()
-
-    def alerts(self) -> tuple[str, ...]:
-        """Return the variants that failed, and whether the machine was busy."""
         prepared = [each.prepared for each in self.variants]
-        return (
+        alerts = (
             *(
                 f"variant {each.variant.name} was left out: {each.failure}"
                 for each in prepared
@@ -124,8 +112,16 @@ class StudyResult(Result):
             ),
             *([str(self.load)] if self.load is not None and self.load.busy else []),
         )
+        return Shown(
+            f"{study.title}: {counted(len(study.variants), 'variant')} under"
+            f" {counted(len(study.conditions), 'condition')} on {driven} of"
+            f" {counted(whole, 'route')}",
+            chain.from_iterable(self.tables_by_section.values()),
+            (),
+            alerts,
+        )
 
-    @property
+    @cached_property
     def tables_by_section(self) -> Mapping[str, tuple[Table, ...]]:
         """Every table, in reading order; a preview is marked as such."""
         sections = {
@@ -141,11 +137,6 @@ class StudyResult(Result):
             heading: tuple(replace(e, title=f"{e.title}{preview}") for e in tables)
             for heading, tables in sections.items()
         }
-
-    def tables(self) -> tuple[Table, ...]:
-        """Return every table, in reading order."""
-        by_section = self.tables_by_section.values()
-        return tuple(table for tables in by_section for table in tables)
 
     def to_json(self) -> dict[str, Any]:
         """Return a document; the same study and seed give the same bytes but latencies.
@@ -200,12 +191,22 @@ def scoreboards(result: StudyResult) -> tuple[Table, ...]:
         f" Plan and SQNR: how far waypoints move from {baseline}'s on held-out frames, "
         "and the noise on them."
     )
+    costs = {
+        each.name: (
+            measure_cell(each.size_mb, ".2f"),
+            measure_cell(each.latency_ms[50], ".1f"),
+            measure_cell(each.latency_ms[99], ".1f"),
+            measure_cell(each.fidelity.mean_m, ".3f"),
+            measure_cell(each.fidelity.plan_sqnr_db, ".1f"),
+        )
+        for each in result.variants
+    }
     return tuple(
         Table(
             f"Scoreboard, {_condition(result, condition)}",
             ("variant", *SCORES, *COSTS),
             tuple(
-                (Cell(each.variant), *_scores(each), *_costs(result, each))
+                (Cell(each.variant), *_scores(each), *costs[each.variant])
                 for each in result.under(condition)
             ),
             note,
@@ -230,17 +231,6 @@ def _scores(drive: DriveRecord) -> tuple[Cell, ...]:
         *(of.bench2drive_efficiency, of.comfort, of.bench2drive_smoothness),
     )
     return tuple(map(estimate_cell, shown))
-
-
-def _costs(result: StudyResult, drive: DriveRecord) -> tuple[Cell, ...]:
-    variant = result.variant(drive.variant)
-    return (
-        measure_cell(variant.size_mb, ".2f"),
-        measure_cell(variant.latency_ms[50], ".1f"),
-        measure_cell(variant.latency_ms[99], ".1f"),
-        measure_cell(variant.fidelity.mean_m, ".3f"),
-        measure_cell(variant.fidelity.plan_sqnr_db, ".1f"),
-    )
 
 
 def differences(result: StudyResult) -> Table:
@@ -299,33 +289,37 @@ def _gaps(of: Change | PairedDifference) -> tuple[Cell, ...]:
 
 def abilities(result: StudyResult) -> tuple[Table, ...]:
     """Show the success rate by ability, in tables like the scoreboards."""
-    baseline = result.study.baseline
+    # scores by the heading of their column, and who is printed in bold
+    heading, strong = "variant", result.study.baseline
+    scores = {
+        f"Success by ability in %, {_condition(result, each)}": {
+            drive.variant: drive.scores for drive in result.under(each)
+        }
+        for each in result.study.conditions
+    }
     if len(result.variants) == 1:
         by_condition = {drive.condition: drive.scores for drive in result.drives}
-        title = f"Success of {baseline} by ability in %"
-        return (_abilities(title, by_condition, "", "condition"),)
-    return tuple(
-        _abilities(
-            f"Success by ability in %, {_condition(result, each)}",
-            {drive.variant: drive.scores for drive in result.under(each)},
-            baseline,
-            "variant",
-        )
-        for each in result.study.conditions
-    )
-
-
-def _abilities(
-    title: str, scores: Mapping[str, Scores | None], strong: str, heading: str
-) -> Table:
-    rows = tuple(
-        (Cell(name), *map(estimate_cell, (*of.each_ability.values(), of.abilities)))
-        for name, of in scores.items()
-        if of is not None
-    )
+        scores = {f"Success of {strong} by ability in %": by_condition}
+        heading, strong = "condition", ""
     columns = (heading, *(name.replace("_", " ") for name in ABILITIES), "mean")
     note = "A route may test two abilities. Intervals are exact, the mean's by "
-    return Table(title, columns, rows, f"{note}bootstrap.", strong)
+    return tuple(
+        Table(
+            title,
+            columns,
+            tuple(
+                (
+                    Cell(name),
+                    *map(estimate_cell, (*e.each_ability.values(), e.abilities)),
+                )
+                for name, e in of.items()
+                if e is not None
+            ),
+            f"{note}bootstrap.",
+            strong,
+        )
+        for title, of in scores.items()
+    )
 
 
 def change_tables(result: StudyResult) -> tuple[Table, ...]:
@@ -352,18 +346,18 @@ def change_tables(result: StudyResult) -> tuple[Table, ...]:
         ),
         ("Pairs of drives on the same routes", columns, result.pairs, note),
     )
-    return tuple(
-        Table(title, heads, tuple(_change(each)[: len(heads)] for each in rows), words)
-        for title, heads, rows, words in titled
-        if rows
-    )
-
-
-def _change(change: Change) -> tuple[Cell, ...]:
     own = Cell(MISSING, reason="the baseline itself")
-    beyond = [estimate_cell(each, signed=True) for each in change.beyond.values()]
-    names = Cell(change.drive), Cell(change.against)
-    return (*names, *_gaps(change), *(beyond or [own] * 3))
+    tables = list[Table]()
+    for title, heads, compared, words in titled:
+        rows = list[tuple[Cell, ...]]()
+        for each in compared:
+            beyond = [estimate_cell(e, signed=True) for e in each.beyond.values()]
+            names = Cell(each.drive), Cell(each.against)
+            cells = (*names, *_gaps(each), *(beyond or [own] * 3))
+            rows.append(cells[: len(heads)])
+        if rows:
+            tables.append(Table(title, heads, tuple(rows), words))
+    return tuple(tables)
 
 
 def route_tables(result: StudyResult) -> tuple[Table, ...]:

@@ -6,13 +6,13 @@ from pathlib import Path
 
 import numpy as np
 
-from me2e_compress.display import Table, counted, duration, number, table
+from me2e_compress.display import counted, duration, number, table
 from me2e_compress.driving.latency import DecisionFacts
 from me2e_compress.driving.realtime import LatencyModel, skipped_decisions
 from me2e_compress.study.condition import Condition
 from me2e_compress.study.definition import Study
 from me2e_compress.study.workspace import Workspace
-from me2e_compress.workflows.result import Result
+from me2e_compress.workflows.result import Result, Shown
 
 FRAME_S, DECISION_S = 0.0024, 0.021
 """CPU seconds of a frame of the world, and of a decision: six pictures and one
@@ -43,28 +43,21 @@ class Workload(Result):
     workers: int
     measured: bool
 
-    @property
-    def hours(self) -> float:
-        """Sum over all drives."""
-        return sum(each.hours for each in self.drives)
-
-    @property
-    def headline(self) -> str:
-        """Numbers of drives and routes, and time."""
-        drives = counted(len(self.drives), "drive")
-        if not self.set_size:
-            return f"{self.title}: {drives}, of routes that the evaluator knows"
-        routes = sum(each.routes for each in self.drives)
-        done = sum(each.done for each in self.drives)
-        how = "by this folder's logs" if self.measured else "an estimate"
-        return (
-            f"{self.title}: {drives}, {counted(routes, 'route')},"
-            f" {number(done)} of them driven; about {duration(3600 * self.hours)}"
-            f" on {counted(self.workers, 'worker')} ({how})"
-        )
-
-    def tables(self) -> tuple[Table, ...]:
-        """Return a table with one row per drive."""
+    def shown(self) -> Shown:
+        """Return numbers of drives and routes, the time left, and a row per drive."""
+        headline = f"{self.title}: {counted(len(self.drives), 'drive')}"
+        if self.set_size:
+            routes = sum(each.routes for each in self.drives)
+            done = sum(each.done for each in self.drives)
+            left = duration(3600 * sum(each.hours for each in self.drives))
+            how = "by this folder's logs" if self.measured else "an estimate"
+            headline += (
+                f", {counted(routes, 'route')}, {number(done)} of them driven; about"
+                f" {left} on {counted(self.workers, 'worker')} ({how})"
+            )
+        else:
+            headline += ", of routes that the evaluator knows"
+        columns = ("variant", "condition", "routes driven", "time left")
         rows = [
             (
                 *(each.variant, each.condition, f"{each.done} of {each.routes}"),
@@ -72,8 +65,7 @@ class Workload(Result):
             )
             for each in self.drives
         ]
-        columns = ("variant", "condition", "routes driven", "time left")
-        return (table("Drives", columns, rows, words=2),)
+        return Shown(headline, [table("Drives", columns, rows, words=2)])
 
 
 def workload(study: Study, folder: str | Path, workers: int = 1) -> Workload:

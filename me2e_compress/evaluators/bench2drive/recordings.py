@@ -107,8 +107,7 @@ class RecordedRoute:
         stood, the agent's steps are taken as ticks.
         """
         # the best correlated pair of signals
-        found = [each for each in self._correlations() if each.likeness > _LIKENESS]
-        moved = max(found, key=lambda each: each.likeness, default=None)
+        likeness, interval_s = max(self._correlations(), key=lambda pair: pair[0])
         # the usual interval within 10 % of the duration's, if there is one
         lasted = None
         if duration_s is not None:
@@ -116,7 +115,7 @@ class RecordedRoute:
             nearest = _nearest(mean_s)
             lasted = nearest if abs(np.log(nearest / mean_s)) < _EQUALS else None
         # no motion to infer from: duration, or the agent's steps
-        if moved is None:
+        if likeness <= _LIKENESS:
             stood = float(np.ptp(self.position_m, axis=0).max()) < _STOOD_M
             if not stood and lasted is not None:
                 return lasted
@@ -124,12 +123,12 @@ class RecordedRoute:
             ticks = float(np.median(between)) if between.size else 1.0
             return TICK_S * max(1.0, min(ticks, 20.0))
         # a weak correlation yields to a duration that agrees
-        apart = abs(np.log(lasted / moved.interval_s)) if lasted else np.inf
-        if lasted and moved.likeness < _SURE and apart < _AGREES:
+        apart = abs(np.log(lasted / interval_s)) if lasted else np.inf
+        if lasted and likeness < _SURE and apart < _AGREES:
             return lasted
-        return _nearest(moved.interval_s)
+        return _nearest(interval_s)
 
-    def _correlations(self) -> Iterator["_Correlation"]:
+    def _correlations(self) -> Iterator[tuple[float, float]]:
         """Compare pairs of signals that differ by a power of the interval.
 
         Second differences of the position are dt^2 times the acceleration. CARLA's
@@ -141,27 +140,23 @@ class RecordedRoute:
         between = (self.yaw_rate_radps[1:] + self.yaw_rate_radps[:-1]) / 2.0
         for part in (slice(2, None), slice(1, -1)):
             pulls = self.acceleration_mps2[part]
-            yield _Correlation.of(bends.ravel(), pulls.ravel(), 0.5, _LEAST_MPS2)
-        yield _Correlation.of(turns, between, 1.0, _LEAST_RADPS)
+            yield _correlation(bends.ravel(), pulls.ravel(), 0.5, _LEAST_MPS2)
+        yield _correlation(turns, between, 1.0, _LEAST_RADPS)
 
 
-@dataclass(frozen=True)
-class _Correlation:
-    """The interval that two signals imply, and their correlation, -1 to 1."""
+def _correlation(
+    of: Floats, over: Floats, power: float, least: float
+) -> tuple[float, float]:
+    """Return the correlation of two signals, -1 to 1, and the interval they imply.
 
-    interval_s: float
-    likeness: float
-
-    @classmethod
-    def of(cls, of: Floats, over: Floats, power: float, least: float) -> "_Correlation":
-        """Compare root mean squares: they are least sensitive to noise."""
-        if not over.size:
-            return cls(0.0, 0.0)
-        left, right = (float(np.sqrt((each * each).mean())) for each in (of, over))
-        if right < least or left == 0.0:
-            return cls(0.0, 0.0)
-        likeness = float((of * over).mean()) / (left * right)
-        return cls((left / right) ** power, likeness)
+    It follows from root mean squares, which are least sensitive to noise.
+    """
+    if not over.size:
+        return 0.0, 0.0
+    left, right = (float(np.sqrt((each * each).mean())) for each in (of, over))
+    if right < least or left == 0.0:
+        return 0.0, 0.0
+    return float((of * over).mean()) / (left * right), (left / right) ** power
 
 
 def _lengths(vectors: Any) -> Floats:

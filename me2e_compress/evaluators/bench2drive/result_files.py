@@ -393,7 +393,13 @@ class DriveRecordings:
 
     def of(self, record: RouteRecord) -> tuple[Path, ...]:
         """Return the recordings of a record, best match first; usually one."""
-        found = self._named(record.recording) if record.recording else ()
+        exact, prefixed = list[Path](), list[Path]()
+        for path, names in self._names.items() if record.recording else ():
+            if record.recording in names:
+                exact.append(path)
+            elif any(each.endswith(f"_{record.recording}") for each in names):
+                prefixed.append(path)
+        found = (*exact, *prefixed)
         if not found:
             where = self._beside.get(record.content)
             found = tuple(path for path in self._names if path.parent == where)
@@ -405,12 +411,3 @@ class DriveRecordings:
     def of_none(self) -> list[Path]:
         """Recordings that matched no record asked for so far."""
         return [path for path in self._names if path not in self._taken]
-
-    def _named(self, name: str) -> tuple[Path, ...]:
-        exact, prefixed = list[Path](), list[Path]()
-        for path, names in self._names.items():
-            if name in names:
-                exact.append(path)
-            elif any(each.endswith(f"_{name}") for each in names):
-                prefixed.append(path)
-        return (*exact, *prefixed)

@@ -174,16 +174,8 @@ class ConflictRecorder:
         nearest, soonest = np.full((2, len(counts)), np.inf)
         np.minimum.at(nearest, frame, distance)
         np.minimum.at(soonest, frame, seconds)
-        return ConflictRecord(
-            _known(nearest, math.inf),
-            _known(soonest, TTC_HORIZON_S),
-            tuple(self._encounters(egos, actors, frame)),
-        )
-
-    def _encounters(
-        self, egos: Floats, actors: Floats, frame: npt.NDArray[np.int64]
-    ) -> list[Encounter]:
-        found = list[Encounter]()
+        # where both came to one place, of every actor that moved
+        encounters = list[Encounter]()
         for number in np.unique(actors[:, 6]).astype(int).tolist():
             own = actors[:, 6] == number
             if actors[own, 5].any():
@@ -192,8 +184,12 @@ class ConflictRecorder:
                     time_us = max(ego_at, at) * FRAME_US
                     pet_s = abs(ego_at - at) * FRAME_US / 1e6
                     what = number, kind, time_us, pet_s, round(angle, 3), ego_at < at
-                    found.append(Encounter(*what))
-        return sorted(found, key=lambda each: (each.time_us, each.actor))
+                    encounters.append(Encounter(*what))
+        return ConflictRecord(
+            _known(nearest, math.inf),
+            _known(soonest, TTC_HORIZON_S),
+            tuple(sorted(encounters, key=lambda each: (each.time_us, each.actor))),
+        )
 
 
 def contact_of(ego: Ego, actor: Actor) -> Contact:

@@ -122,11 +122,8 @@ class AnchoredPlan:
         model says when the control acts and for how long (`driving.realtime`). It does
         not steer between two decisions.
         """
+        # acceleration: the least-squares fit to the positions in 0.5 s and 1 s
         age_s = (time_us - self.time_us) / 1e6
-        return Control(self._acceleration(ego, age_s), self._steering(ego))
-
-    def _acceleration(self, ego: Ego, age_s: float) -> float:
-        """Return the least-squares fit to the positions in 0.5 s and 1 s, with lag."""
         here, speed = self.nearest(ego.x, ego.y), ego.speed_mps
         lag, asked, weight = ACCELERATION_LAG_S, 0.0, 0.0
         for ahead in AHEAD_S:
@@ -138,20 +135,18 @@ class AnchoredPlan:
             asked += gain * (self.travel_at(age_s + ahead) - here - free)
             weight += gain * gain
         low, high = ACCELERATION_RANGE_MPS2
-        return min(max(asked / weight, low), high)
-
-    def _steering(self, ego: Ego) -> float:
-        # from where the ego is once the wheels have turned
-        travel = ego.speed_mps * STEERING_LAG_S
+        acceleration = min(max(asked / weight, low), high)
+        # steering: from where the ego is once the wheels have turned
+        travel = speed * STEERING_LAG_S
         pose = (ego.x, ego.y, ego.heading)
         x, y, heading = advance(*pose, ego.steering_rad, travel, ego.length)
         # to the point of the curve one lookahead further
-        lookahead = max(SHORTEST_LOOKAHEAD_M, LOOKAHEAD_S * ego.speed_mps)
+        lookahead = max(SHORTEST_LOOKAHEAD_M, LOOKAHEAD_S * speed)
         target_x, target_y = self.point(self.nearest(x, y) + lookahead)
         cos, sin = math.cos(heading), math.sin(heading)
         forward = cos * (target_x - x) + sin * (target_y - y)
         left = cos * (target_y - y) - sin * (target_x - x)
-        return steering_through(forward, left, ego.length)
+        return Control(acceleration, steering_through(forward, left, ego.length))
 
 
 def _advance_only(points: Floats) -> tuple[Floats, Floats]:

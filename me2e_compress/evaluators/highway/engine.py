@@ -57,20 +57,19 @@ class RouteWorker:
         process, heartbeat, line = self._started()
         line.send(route)
         # watch the heartbeat: one call must not take too long
-        asked, since = 0.0, begun
-        while not self._answers(line):
-            if stop is not None and stop.is_set():
-                self.close()
-                return None
-            if heartbeat[0] != asked:
-                asked, since = heartbeat[0], time.perf_counter()
-            elif asked and time.perf_counter() - since > self.conditions.frame_limit_s:
-                limit = f"{self.conditions.frame_limit_s:g} s"
-                return self._lost(route, begun, f"no plan within {limit}")
-        # a closed pipe means that the process ended
+        asked, since, limit_s = 0.0, begun, self.conditions.frame_limit_s
         try:
+            while not line.poll(POLL_S):
+                if stop is not None and stop.is_set():
+                    self.close()
+                    return None
+                if heartbeat[0] != asked:
+                    asked, since = heartbeat[0], time.perf_counter()
+                elif asked and time.perf_counter() - since > limit_s:
+                    return self._lost(route, begun, f"no plan within {limit_s:g} s")
             answer = line.recv()
-        except (EOFError, ConnectionResetError):
+        # a closed pipe means that the process ended
+        except (EOFError, BrokenPipeError, ConnectionResetError):
             process.join()
             return self._lost(route, begun, self._cause(route, process))
         if isinstance(answer, Me2eError):
@@ -103,13 +102,6 @@ class RouteWorker:
             theirs.close()
             self._process, self._heartbeat, self._line = process, heartbeat, ours
         return self._process, self._heartbeat, self._line
-
-    @staticmethod
-    def _answers(line: Connection[Route, Driven | Me2eError]) -> bool:
-        try:
-            return line.poll(POLL_S)
-        except (BrokenPipeError, ConnectionResetError):
-            return True
 
     def _cause(self, route: Route, process: SpawnProcess) -> str:
         code = process.exitcode

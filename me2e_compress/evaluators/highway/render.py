@@ -2,7 +2,7 @@
 
 import contextlib
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -27,25 +27,6 @@ STRIP = 4
 _NO_IMAGES = np.zeros((0, 0, 0, 3), np.uint8)
 
 
-@dataclass
-class _Film:
-    """Keeps every fourth moment, and the last one."""
-
-    kept: list[Moment] = field(default_factory=list)
-    last: Moment | None = None
-
-    def see(self, moment: Moment) -> None:
-        self.last = moment
-        if moment.scene.time_us % EVERY_US == 0:
-            self.kept.append(moment)
-
-    @property
-    def moments(self) -> list[Moment]:
-        if self.last is None or self.kept[-1] is self.last:
-            return self.kept
-        return [*self.kept, self.last]
-
-
 def render(
     policy: Driver, drive: Drive, route: Route, folder: Path
 ) -> tuple[Path, Path]:
@@ -54,10 +35,15 @@ def render(
     The animation shows six cameras and the view from above with the plan, infractions
     marked; the strip shows four moments including the end.
     """
-    film = _Film()
-    listeners = runner.Listeners(on_moment=film.see)
-    runner.drive(route, policy.open(), drive, listeners)
-    moments = film.moments
+    moments = list[Moment]()
+
+    def see(moment: Moment) -> None:
+        # every fourth moment stays, and the last one
+        if moments and moments[-1].scene.time_us % EVERY_US:
+            moments.pop()
+        moments.append(moment)
+
+    runner.drive(route, policy.open(), drive, runner.Listeners(on_moment=see))
     picture = _picture(f"{route.scenario} {route.id} {policy.label}", route, moments)
     gif, png = folder / f"{route.id}.gif", folder / f"{route.id}.png"
     write_gif(gif, picture.frames(), EVERY_US)

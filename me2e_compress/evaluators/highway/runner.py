@@ -15,7 +15,6 @@ from me2e_compress.driving.contract import (
     HostedPolicy,
     PedalsAndWheel,
     Policy,
-    Trajectory,
     checked,
 )
 from me2e_compress.driving.latency import DecisionFacts
@@ -65,29 +64,21 @@ class EndingRules:
         if world.reason is not None:
             reached = world.reason is EndReason.GOAL
             return Ending.COMPLETED if reached else Ending.COLLISION
-        if self._deviated(world, speed_mps):
-            return Ending.DEVIATION
-        if self._blocked(world, speed_mps):
-            return Ending.BLOCKED
-        return Ending.TIMEOUT if world.time_us >= TIMEOUT_US else None
-
-    def _deviated(self, world: World, speed_mps: float) -> bool:
-        away_m = abs(world.lateral_m)
-        passed_s = (world.time_us - self._last_us) / 1e6
-        self._last_us = world.time_us
+        # far from the route, or for long
+        away_m, now_us = abs(world.lateral_m), world.time_us
         if away_m >= ASTRAY_M:
-            self._astray_m += speed_mps * passed_s
-        return (
-            away_m >= DEVIATION_M or self._astray_m > ASTRAY_SHARE * world.path.goal_m
-        )
-
-    def _blocked(self, world: World, speed_mps: float) -> bool:
+            self._astray_m += speed_mps * (now_us - self._last_us) / 1e6
+        self._last_us = now_us
+        if away_m >= DEVIATION_M or self._astray_m > ASTRAY_SHARE * world.path.goal_m:
+            return Ending.DEVIATION
+        # standing since when
         if speed_mps > BLOCKED_MPS:
             self._stopped_at_us = None
-            return False
-        if self._stopped_at_us is None:
-            self._stopped_at_us = world.time_us
-        return world.time_us - self._stopped_at_us >= BLOCKED_US
+        elif self._stopped_at_us is None:
+            self._stopped_at_us = now_us
+        elif now_us - self._stopped_at_us >= BLOCKED_US:
+            return Ending.BLOCKED
+        return Ending.TIMEOUT if now_us >= TIMEOUT_US else None
 
 
 Plan = npt.NDArray[np.float64]
@@ -208,7 +199,13 @@ class _Drive:
             valid = checked(answer)
         except EvaluationError as error:
             raise PolicyFailedError(str(error)) from error
-        control = self.control_by(valid, scene)
+        if isinstance(valid, PedalsAndWheel):
+            self.plan = None
+            control = control_of(valid, scene.ego.length)
+        else:
+            self.plan = scene.ego, np.asarray(valid.points, np.float64)
+            anchored = AnchoredPlan.of(valid, scene.ego, scene.time_us)
+            control = anchored.control(scene.ego, scene.time_us)
         work = 0, 0
         if self.hosted is not None:
             work = self.hosted.host_iterations, self.hosted.host_cells
@@ -216,14 +213,6 @@ class _Drive:
         latency_us = self.charge(facts)
         self.recorder.decisions.append(InferenceRecord(scene.time_us, latency_us))
         self.clock.decide(control, latency_us)
-
-    def control_by(self, answer: Trajectory | PedalsAndWheel, scene: Scene) -> Control:
-        if isinstance(answer, PedalsAndWheel):
-            self.plan = None
-            return control_of(answer, scene.ego.length)
-        self.plan = scene.ego, np.asarray(answer.points, np.float64)
-        anchored = AnchoredPlan.of(answer, scene.ego, scene.time_us)
-        return anchored.control(scene.ego, scene.time_us)
 
     def show(self, scene: Scene) -> None:
         """Render this frame for the listener that draws pictures."""

@@ -1,7 +1,7 @@
 """The figures of a report, as SVG."""
 
 import io
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.style import context
 
-from me2e_compress.metrics.measure import Estimate, Measure
+from me2e_compress.metrics.measure import Estimate
 from me2e_compress.metrics.scores import Scores
 from me2e_compress.study.condition import Condition
 from me2e_compress.study.study_result import StudyResult
@@ -82,13 +82,20 @@ def front(points: Sequence[Point]) -> list[Point]:
 def pareto(outcome: StudyResult, condition: Condition) -> Markup | None:
     """Draw driving score against latency and against size; None below two points."""
     # panels with at least two points
-    sizes = {each.name: each.size_mb for each in outcome.variants}
-    medians = {each.name: each.latency_ms[50] for each in outcome.variants}
-    drawn = (
-        (_points(outcome, condition, medians), "median latency, ms"),
-        (_points(outcome, condition, sizes), "size, MB"),
-    )
-    panels = [each for each in drawn if len(each[0]) > 1]
+    baseline, panels = outcome.study.baseline, list[tuple[list[Point], str]]()
+    costs = {
+        "median latency, ms": {e.name: e.latency_ms[50] for e in outcome.variants},
+        "size, MB": {each.name: each.size_mb for each in outcome.variants},
+    }
+    for words, by_name in costs.items():
+        points = [
+            Point(name, cost, drive.scores.driving_score, name == baseline)
+            for drive in outcome.under(condition)
+            if drive.scores is not None
+            if (cost := by_name[name := drive.variant].value) is not None
+        ]
+        if len(points) > 1:
+            panels.append((points, words))
     if not panels:
         return None
     with styled():
@@ -100,8 +107,7 @@ def pareto(outcome: StudyResult, condition: Condition) -> Markup | None:
         # names are placed last, when the limits are final
         figure.canvas.draw_idle()
         for each, (points, _) in zip(axes, panels, strict=True):
-            named = [(p.name, p.cost, p.height) for p in _named(points)]
-            _place_names(figure, each, named)
+            _place_names(figure, each, _named(points))
         return svg(figure)
 
 
@@ -124,23 +130,22 @@ def forest(outcome: StudyResult) -> Markup | None:
             "success rate, points": [each.success_rate for each in gaps],
         }
         for axes, (title, found) in zip(panels, scores.items(), strict=True):
-            _whiskers(axes, found)
+            bare(axes)
+            axes.axvline(0.0, color=INK, linewidth=0.8)
+            for row, estimate in enumerate(found):
+                low, high = estimate.low, estimate.high
+                colour = ACCENT if estimate.sign else MUTED
+                if low is not None and high is not None:
+                    axes.plot([low, high], [row, row], color=colour, linewidth=1.6)
+                if estimate.value is not None:
+                    axes.plot(estimate.value, row, "o", color=colour, markersize=5)
+            axes.margins(y=0.08 if len(found) > 3 else 0.3)
+            left, right = axes.get_xlim()
+            axes.set_xlim(min(left, -1.0), max(right, 1.0))
             axes.set_title(title, color=MUTED)
         panels[0].set_yticks(range(len(rows)), names, color=INK)
         panels[0].invert_yaxis()
         return svg(figure)
-
-
-def _points(
-    outcome: StudyResult, condition: Condition, costs: Mapping[str, Measure]
-) -> list[Point]:
-    baseline = outcome.study.baseline
-    return [
-        Point(name, cost, drive.scores.driving_score, name == baseline)
-        for drive in outcome.under(condition)
-        if drive.scores is not None
-        if (cost := costs[name := drive.variant].value) is not None
-    ]
 
 
 def _named(points: Sequence[Point]) -> Sequence[Point]:
@@ -192,35 +197,19 @@ def _scatter(axes: Axes, points: Sequence[Point], words: str) -> None:
     axes.set_xlim(left=0.0)
 
 
-def _whiskers(axes: Axes, found: Sequence[Estimate]) -> None:
-    bare(axes)
-    axes.axvline(0.0, color=INK, linewidth=0.8)
-    for row, estimate in enumerate(found):
-        low, high = estimate.low, estimate.high
-        colour = ACCENT if estimate.sign else MUTED
-        if low is not None and high is not None:
-            axes.plot([low, high], [row, row], color=colour, linewidth=1.6)
-        if estimate.value is not None:
-            axes.plot(estimate.value, row, "o", color=colour, markersize=5)
-    axes.margins(y=0.08 if len(found) > 3 else 0.3)
-    left, right = axes.get_xlim()
-    axes.set_xlim(min(left, -1.0), max(right, 1.0))
-
-
-def _place_names(
-    figure: Figure, axes: Axes, names: Sequence[tuple[str, float, float]]
-) -> None:
+def _place_names(figure: Figure, axes: Axes, points: Sequence[Point]) -> None:
     """Write names right of their points, shifted where they would overlap."""
     # positions in points, independent of the axes
     scale = POINTS_AN_INCH / figure.dpi
     ends = list[tuple[float, float, float]]()
     spots = [
-        (name, x, y, axes.transData.transform((x, y)) * scale) for name, x, y in names
+        (each, axes.transData.transform((each.cost, each.height)) * scale)
+        for each in points
     ]
-    for name, x, y, (left, up) in sorted(spots, key=lambda spot: -spot[3][1]):
+    for point, (left, up) in sorted(spots, key=lambda spot: -spot[1][1]):
         # from the top down, move below the names already placed
         start = left + GAP_PT
-        end = start + CHARACTER_PT * len(name)
+        end = start + CHARACTER_PT * len(point.name)
         height = up
         for other_start, other_end, other_height in ends:
             meets = start < other_end and other_start < end
@@ -230,8 +219,8 @@ def _place_names(
         # a line connects a moved name with its point
         moved = abs(height - up) > 1.0
         axes.annotate(
-            name,
-            (x, y),
+            point.name,
+            (point.cost, point.height),
             xytext=(GAP_PT, height - up),
             textcoords="offset points",
             va="center",
@@ -265,12 +254,7 @@ def curves(outcome: StudyResult) -> Markup | None:
         # one curve per variant
         for axes, (title, pick) in zip(figure.subplots(1, 3), panels, strict=True):
             for variant in outcome.variants:
-                estimates = [
-                    None if drive.scores is None else pick(drive.scores)
-                    for drive in outcome.drives
-                    if drive.variant == variant.name
-                ]
-                _curve(axes, variant.name, estimates, outcome)
+                _curve(axes, variant.name, pick, outcome)
             axes.set_title(title, color=MUTED)
             axes.set_xticks(range(len(names)), names)
             axes.set_ylim(0.0, 102.0)
@@ -279,15 +263,14 @@ def curves(outcome: StudyResult) -> Markup | None:
         return svg(figure)
 
 
-def _curve(
-    axes: Axes, name: str, estimates: Sequence[Estimate | None], outcome: StudyResult
-) -> None:
+def _curve(axes: Axes, name: str, pick: Score, outcome: StudyResult) -> None:
     # conditions under which the variant was driven
     colour = BASELINE if name == outcome.study.baseline else ACCENT
+    drives = [each for each in outcome.drives if each.variant == name]
     driven = [
         (place, each.value, each.low, each.high)
-        for place, each in enumerate(estimates)
-        if each is not None and each.value is not None
+        for place, drive in enumerate(drives)
+        if drive.scores is not None and (each := pick(drive.scores)).value is not None
     ]
     # intervals are drawn under the curve
     for place, _, low, high in driven:

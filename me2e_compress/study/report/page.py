@@ -1,11 +1,11 @@
 """A report as one self-contained HTML page, built from a template."""
 
 import base64
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from jinja2 import Environment, FileSystemLoader, StrictUndefined, Template
+from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 
 from me2e_compress.display import Table, counted, in_markdown
@@ -16,7 +16,6 @@ from me2e_compress.registry.drafts import MARK
 from me2e_compress.runtime.atomic import write_bytes, write_document
 from me2e_compress.study.cells import number
 from me2e_compress.study.drive_record import Contrast, DriveRecord
-from me2e_compress.study.outcome import VariantOutcome
 from me2e_compress.study.report.figures import curves, forest, pareto
 from me2e_compress.study.study_result import StudyResult
 from me2e_compress.study.workspace import HTML, JSON, MARKDOWN
@@ -65,18 +64,14 @@ class Page:
 
     def html(self) -> str:
         """Write it as HTML that needs no other file."""
-        return template().render(page=self)
-
-
-def template() -> Template:
-    """Return the template of pages, with autoescape on."""
-    return Environment(
-        loader=FileSystemLoader(Path(__file__).parent),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    ).get_template("page.html", globals={"mark": MARK})
+        templates = Environment(
+            loader=FileSystemLoader(Path(__file__).parent),
+            autoescape=True,
+            undefined=StrictUndefined,
+            trim_blocks=True,
+            lstrip_blocks=True,
+        )
+        return templates.get_template("page.html").render(page=self, mark=MARK)
 
 
 TIMES = "\N{MULTIPLICATION SIGN}"
@@ -88,18 +83,40 @@ def study_page(
     outcome: StudyResult, command: Sequence[str] = (), sections: Sequence[Section] = ()
 ) -> Page:
     """Return the page of a comparison; ``sections`` stand before how it was made."""
-    baseline = outcome.study.baseline
+    # what the variants were made of, and how they were timed
+    variants = list[tuple[str, str, str | None]]()
+    for prepared in (each.prepared for each in outcome.variants):
+        made_of = prepared.source or prepared.variant.policy
+        if prepared.pipeline:
+            made_of = f"{made_of} → {prepared.pipeline}"
+        if prepared.weights:
+            made_of = f"{made_of}; {prepared.weights}"
+        variants.append((prepared.variant.name, made_of, prepared.sha256))
+    timing = outcome.study.timing
+    load = "" if outcome.load is None else f"; while it was timed, {outcome.load}"
+    timed = (
+        f"{timing.samples} inferences a model, in turn, on"
+        f" {counted(timing.threads, 'thread')}; device scale {outcome.device_scale:.3g}"
+    )
+    made = [
+        ("Command", " ".join(command)),
+        ("Machine", f"{outcome.machine}{load}"),
+        ("Latency", timed if outcome.timed else ""),
+        ("Versions", ", ".join(f"{k} {text}" for k, text in outcome.versions.items())),
+        ("Seed", str(outcome.study.seed)),
+    ]
+    # what is remembered stands first
     remembered = findings(outcome)
     note = (
-        f"Against {baseline}, the same routes; in brackets the 95 % interval of the"
-        " mean difference."
+        f"Against {outcome.study.baseline}, the same routes; in brackets the 95 %"
+        " interval of the mean difference."
     )
     return Page(
         outcome.title,
         _lede(outcome),
         [*_sections(outcome), *sections],
-        _made(outcome, command),
-        [_recipe(each) for each in outcome.variants],
+        made,
+        variants,
         remembered,
         note if remembered else "",
         outcome.alerts(),
@@ -108,13 +125,30 @@ def study_page(
 
 def _sections(outcome: StudyResult) -> list[Section]:
     """Return the sections that have something to show, in reading order."""
-    baseline = outcome.study.baseline
+    study, baseline = outcome.study, outcome.study.baseline
+    # pictures by the heading that they stand under
+    drawings = dict[str, tuple[Drawing, ...]]()
+    if (curve := curves(outcome)) is not None:
+        note = "Dots are means over routes, bars their 95 % intervals."
+        drawings["Scoreboard"] = (Drawing(curve, note),)
+    if (gaps := forest(outcome)) is not None:
+        note = (
+            f"Each dot is the mean difference to {baseline} over the routes, the bar"
+            " its 95 % interval; blue where it does not hold zero."
+        )
+        drawings["Paired differences"] = (Drawing(gaps, note),)
+    fronts = {each.name: pareto(outcome, each) for each in study.conditions}
+    drawn = {name: front for name, front in fronts.items() if front is not None}
+    drawings[COSTS] = tuple(
+        Drawing(front, caption=name if len(drawn) > 1 else "")
+        for name, front in drawn.items()
+    )
+    drawings[APART] = tuple(_contrast(each, baseline) for each in outcome.contrasts)
+    # without a difference there is nothing to compare
     tables = dict(outcome.tables_by_section)
     headings = [*tables, APART]
     headings.insert(headings.index("Route by route"), COSTS)
-    drawings = _drawings(outcome)
-    # without a difference there is nothing to compare
-    if not drawings["Paired differences"]:
+    if gaps is None:
         tables["Paired differences"] = ()
     notes = {
         COSTS: "The line joins the variants that no other beats on both counts. Bars:"
@@ -125,7 +159,7 @@ def _sections(outcome: StudyResult) -> list[Section]:
         " traffic; the route in pale blue; crosses mark infractions. A drive that was"
         " over by then shows its last moment.",
     }
-    sections = (
+    return [
         Section(
             name,
             tables.get(name, ()),
@@ -133,30 +167,8 @@ def _sections(outcome: StudyResult) -> list[Section]:
             note=notes.get(name, ""),
         )
         for name in headings
-    )
-    return [each for each in sections if each.tables or each.drawings]
-
-
-def _drawings(outcome: StudyResult) -> Mapping[str, tuple[Drawing, ...]]:
-    """Return the figures by the heading that they stand under."""
-    study = outcome.study
-    curve, gaps = curves(outcome), forest(outcome)
-    fronts = {each.name: pareto(outcome, each) for each in study.conditions}
-    drawn = {name: front for name, front in fronts.items() if front is not None}
-    over_conditions = "Dots are means over routes, bars their 95 % intervals."
-    to_baseline = (
-        f"Each dot is the mean difference to {study.baseline} over the routes, the bar"
-        " its 95 % interval; blue where it does not hold zero."
-    )
-    return {
-        "Scoreboard": () if curve is None else (Drawing(curve, over_conditions),),
-        "Paired differences": () if gaps is None else (Drawing(gaps, to_baseline),),
-        COSTS: tuple(
-            Drawing(front, caption=name if len(drawn) > 1 else "")
-            for name, front in drawn.items()
-        ),
-        APART: tuple(_contrast(each, study.baseline) for each in outcome.contrasts),
-    }
+        if tables.get(name) or drawings.get(name)
+    ]
 
 
 def _lede(outcome: StudyResult) -> str:
@@ -197,33 +209,6 @@ def _contrast(contrast: Contrast, baseline: str) -> Drawing:
         f"at most {contrast.apart.distance_m:.1f} m apart"
     )
     return Drawing(image, caption=caption, words=words)
-
-
-def _recipe(variant: VariantOutcome) -> tuple[str, str, str | None]:
-    """Return name, source and digest."""
-    prepared = variant.prepared
-    made_of = prepared.source or prepared.variant.policy
-    if prepared.pipeline:
-        made_of = f"{made_of} → {prepared.pipeline}"
-    if prepared.weights:
-        made_of = f"{made_of}; {prepared.weights}"
-    return variant.name, made_of, prepared.sha256
-
-
-def _made(outcome: StudyResult, command: Sequence[str]) -> list[tuple[str, str]]:
-    timing = outcome.study.timing
-    load = "" if outcome.load is None else f"; while it was timed, {outcome.load}"
-    timed = (
-        f"{timing.samples} inferences a model, in turn, on"
-        f" {counted(timing.threads, 'thread')}; device scale {outcome.device_scale:.3g}"
-    )
-    return [
-        ("Command", " ".join(command)),
-        ("Machine", f"{outcome.machine}{load}"),
-        ("Latency", timed if outcome.timed else ""),
-        ("Versions", ", ".join(f"{k} {text}" for k, text in outcome.versions.items())),
-        ("Seed", str(outcome.study.seed)),
-    ]
 
 
 def findings(outcome: StudyResult) -> tuple[tuple[str, str], ...]:

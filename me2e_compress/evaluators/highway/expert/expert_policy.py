@@ -15,16 +15,14 @@ from me2e_compress.evaluators.highway.expert.forecast import (
     near,
 )
 from me2e_compress.evaluators.highway.expert.futures import (
+    Place,
     collision_cost,
     drive_cost,
     emergency_cost,
     headway_cost,
+    lateral_targets,
     rule_cost,
     sample,
-)
-from me2e_compress.evaluators.highway.expert.lateral_targets import (
-    Place,
-    lateral_targets,
 )
 from me2e_compress.evaluators.highway.observe import scene_and_world, seen
 from me2e_compress.simulator.plane_geometry import Floats, RoutePath
