@@ -22,10 +22,9 @@ from me2e_compress.runtime.energy.meter import measure_energy
 from me2e_compress.runtime.profile import record_traces
 from me2e_compress.runtime.providers import CPU
 from me2e_compress.study.definition import Study
-from me2e_compress.study.outcome import this_machine
+from me2e_compress.study.outcome import Clock, this_machine
 from me2e_compress.study.prepared import PreparedVariant
 from me2e_compress.study.run import StudyCells
-from me2e_compress.study.timing import Clock
 from me2e_compress.workflows.inspect import inspect
 from me2e_compress.workflows.options import InspectOptions, ProfileOptions
 from me2e_compress.workflows.profile import profile

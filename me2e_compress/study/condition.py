@@ -140,18 +140,17 @@ class Condition:
             "driving on after collisions": self.drive_on,
         }
         words = [words for words, changed in changes.items() if changed]
-        return ", ".join([f"{self.name}: {self._cost(device)}", *words])
-
-    def _cost(self, device: str) -> str:
+        # what a decision costs
+        cost = f"{self.latency}, {device}" if self.traced else self.latency
         if self.mean_of:
-            return f"every decision costs the mean of {self.mean_of}"
-        if self.latency == "none":
-            return "decisions cost no time"
-        if self.latency == TRACE:
-            return f"each model's own latency, {device}"
-        if name_in(self.latency) == "fps" and ":" in self.latency:
-            return _per_second(float(self.latency.removeprefix("fps:")))
-        return f"{self.latency}, {device}" if self.traced else self.latency
+            cost = f"every decision costs the mean of {self.mean_of}"
+        elif self.latency == "none":
+            cost = "decisions cost no time"
+        elif self.latency == TRACE:
+            cost = f"each model's own latency, {device}"
+        elif name_in(self.latency) == "fps" and ":" in self.latency:
+            cost = _per_second(float(self.latency.removeprefix("fps:")))
+        return ", ".join([f"{self.name}: {cost}", *words])
 
     def to_json(self) -> dict[str, Any]:
         """Return every option; ``charged`` is the latency, None for a mean."""

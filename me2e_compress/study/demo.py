@@ -70,20 +70,16 @@ def before_and_after(outcome: StudyResult, name: str) -> Table:
             else measure_cell(pick(each.scores).measure, ".1f")
             for each in driven
         ]
-        points = None
+        words = ""
         if gap is not None:
             points = gap.room_kept if "room" in what else gap.driving_score
-        rows.append((Cell(what), *cells, Cell(_points(points))))
+            if points.value is not None:
+                words = number(points.value, "+.1f")
+            if words and points.low is not None and points.high is not None:
+                low, high = number(points.low, "+.1f"), number(points.high, "+.1f")
+                words = f"{words} ({low} to {high})"
+        rows.append((Cell(what), *cells, Cell(words)))
     return Table("Before and after", ("", before.name, after.name, ""), tuple(rows))
-
-
-def _points(gap: Estimate | None) -> str:
-    if gap is None or gap.value is None:
-        return ""
-    points = number(gap.value, "+.1f")
-    if gap.low is None or gap.high is None:
-        return points
-    return f"{points} ({number(gap.low, '+.1f')} to {number(gap.high, '+.1f')})"
 
 
 def road_verdict(outcome: StudyResult, name: str) -> str:

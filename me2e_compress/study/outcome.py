@@ -1,27 +1,220 @@
-"""What a study knows of a variant without its drives: size, latency, plan."""
+"""What a study knows of a variant without its drives: latency, size, plan.
+
+Latencies are traces: recorded on a device, kept, or measured here in turn.
+"""
 
 import math
 import os
 import platform
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 from me2e_compress.calibration.dataset import CalibrationSet
+from me2e_compress.driving.latency import LatencySource
 from me2e_compress.errors import EvaluationError, FramesError
 from me2e_compress.fidelity.compare import compare
-from me2e_compress.metrics.measure import Measure
+from me2e_compress.metrics.measure import Measure, too_few
 from me2e_compress.runtime.frames import Frame
-from me2e_compress.runtime.latency_trace import Load
-from me2e_compress.runtime.profile import processor
+from me2e_compress.runtime.latency_trace import LatencyTrace, Load
+from me2e_compress.runtime.profile import describe_machine, processor, record_traces
 from me2e_compress.runtime.session import Session
 from me2e_compress.study.cells import EXACT
-from me2e_compress.study.definition import Study
+from me2e_compress.study.condition import Condition
+from me2e_compress.study.definition import Study, Variant
 from me2e_compress.study.prepared import PreparedVariant
-from me2e_compress.study.timing import Clock
+from me2e_compress.study.workspace import Workspace
 from me2e_compress.workflows.result import Listener
 
 LATENCY_PERCENTILES = (50, 99)
+
+
+@dataclass(frozen=True)
+class Clock:
+    """Latencies of the variants on one device.
+
+    Attributes:
+        traces: As measured, by the variant's name.
+        scale: How many times slower the device is than the machine of the traces.
+        reason: Why a variant has no trace; empty if all have one.
+        load: The highest load by other processes during measurements, if there were
+            any.
+    """
+
+    traces: Mapping[str, LatencyTrace]
+    scale: float
+    reason: str = ""
+    load: Load | None = None
+
+    def latencies(self, prepared: PreparedVariant) -> dict[int, Measure]:
+        """Return the percentiles that are shown, see `latency`; none of no model."""
+        unknown = Measure(None, "ms", prepared.failure or "no model")
+        name = prepared.variant.name
+        return {
+            percent: self.latency(name, percent) if prepared.model else unknown
+            for percent in LATENCY_PERCENTILES
+        }
+
+    def latency(self, variant: str, percent: float) -> Measure:
+        """Return a percentile on the device, ms; None without enough samples."""
+        if variant not in self.traces:
+            return Measure(None, "ms", self.reason or "not measured")
+        trace = self.traces[variant]
+        if why := too_few(percent, len(trace.samples_us)):
+            return Measure(None, "ms", why)
+        return Measure(self.scale * trace.percentile_us(percent) / 1e3, "ms")
+
+    def source(
+        self, variant: Variant, condition: Condition, seed: int
+    ) -> LatencySource | None:
+        """Return the latency source of a variant; None if it lacks its trace."""
+        source = condition.source(seed)
+        if not source.lacks_trace:
+            return source
+        if variant.name not in self.traces:
+            return None
+        return source.with_trace(self.traces[variant.name].samples_us, self.scale)
+
+
+def time_all(
+    study: Study,
+    prepared: Sequence[PreparedVariant],
+    workspace: Workspace,
+    listener: Listener,
+) -> Clock:
+    """Load the traces that are given or kept, and measure the others, interleaved.
+
+    Models measured together share their noise. A kept trace must be of the same model,
+    machine, threads and frames, with at least as many samples (studies in one folder
+    share the longest); otherwise it is measured again. Without a kept trace of the
+    baseline, kept traces cannot be compared with new ones, so all are measured again.
+
+    Raises:
+        EvaluationError: A trace cannot be read or written, or the baseline's median,
+            which sets the device scale, is zero.
+    """
+    frames = None if study.held_out is None else CalibrationSet(study.held_out)
+    seen = None if frames is None else frames.fingerprint
+    loaded = {
+        each.variant.name: _kept(study, each, seen, workspace, listener)
+        for each in prepared
+    }
+    traces = {name: trace for name, trace in loaded.items() if trace is not None}
+    reason = "no held-out frames were given"
+    if frames is not None:
+        reason = "not a model"
+        baseline = next(each for each in prepared if each.variant == study.reference)
+        kept_baseline = None if baseline.variant.trace else traces.get(study.baseline)
+        # all are missing, if new traces cannot be compared with old
+        ours = [each for each in prepared if each.model and not each.variant.trace]
+        missing = [each for each in ours if each.variant.name not in traces]
+        if kept_baseline is None and missing:
+            for each in (each for each in ours if each not in missing):
+                listener.on_warning(
+                    f"{workspace.trace(each.variant)}: no trace of the baseline is kept"
+                    " beside it: measured again"
+                )
+            missing = ours
+        found = _measured(study, frames, missing, baseline, kept_baseline, listener)
+        # the baseline last: a kill before leaves none that old ones could stand beside
+        for each in sorted(missing, key=lambda one: one is baseline):
+            trace = replace(found[each.variant.name], frames=seen)
+            trace.save(workspace.trace(each.variant))
+            traces[each.variant.name] = trace
+    # the highest load under which a trace was measured here
+    names = [each.variant.name for each in prepared if not each.variant.trace]
+    loads = [traces[name].others for name in names if name in traces]
+    known = [each for each in loads if each is not None]
+    load = max(known, key=lambda load: load.others, default=None)
+    return Clock(traces, _scale(study, traces), reason, load)
+
+
+def _measured(
+    study: Study,
+    frames: CalibrationSet,
+    missing: Sequence[PreparedVariant],
+    baseline: PreparedVariant,
+    kept: LatencyTrace | None,
+    listener: Listener,
+) -> dict[str, LatencyTrace]:
+    """Measure in turn, always with the baseline.
+
+    If its trace is kept, the others are put on its scale: a machine's speed varies from
+    day to day.
+    """
+    if not missing:
+        return {}
+    timed = missing if kept is None else (baseline, *missing)
+    traces = record_traces(
+        {each.variant.name: each.model for each in timed if each.model is not None},
+        frames,
+        samples=study.timing.samples,
+        threads=study.timing.threads,
+        provider=study.provider,
+        on_sample=partial(listener.on_progress, "latency"),
+    )
+    if kept is None:
+        return traces
+    again = traces.pop(baseline.variant.name)
+    pace = kept.percentile_us(50) / max(1, again.percentile_us(50))
+    return {
+        name: replace(
+            each, samples_us=tuple(round(us * pace) for us in each.samples_us)
+        )
+        for name, each in traces.items()
+    }
+
+
+def _kept(
+    study: Study,
+    each: PreparedVariant,
+    frames: str | None,
+    workspace: Workspace,
+    listener: Listener,
+) -> LatencyTrace | None:
+    """Return the trace that is given or kept, unless it is of something else."""
+    if each.variant.trace is not None:
+        return LatencyTrace.load(each.variant.trace)
+    path = workspace.trace(each.variant)
+    if each.model is None or not path.is_file():
+        return None
+    trace, wanted = LatencyTrace.load(path), study.timing.samples
+    machine = describe_machine(study.timing.threads, study.provider)
+    other = ""
+    if trace.model_sha256 != each.sha256:
+        other = "another model"
+    elif len(trace.samples_us) < wanted:
+        other = f"{len(trace.samples_us)} samples, not {wanted}"
+    # as it was written before 1 was singular
+    elif trace.machine.replace("on 1 threads", "on 1 thread") != machine:
+        other = f"another machine ({trace.machine}; this is {machine})"
+    elif None not in (trace.frames, frames) and trace.frames != frames:
+        other = "other frames"
+    if not other:
+        return trace
+    then = "left out" if study.held_out is None else "measured again"
+    listener.on_warning(f"{path}: of {other}: {then}")
+    return None
+
+
+def _scale(study: Study, traces: Mapping[str, LatencyTrace]) -> float:
+    """Choose the one scale that gives the baseline the requested median."""
+    wanted_s = study.timing.baseline_median_s
+    if wanted_s is None:
+        return 1.0
+    if study.baseline not in traces:
+        raise EvaluationError(
+            f"latency: the device scale needs a median of {wanted_s} s of "
+            f"{study.baseline}, and there is no trace of it"
+        )
+    median_us = traces[study.baseline].percentile_us(50)
+    if not median_us:
+        raise EvaluationError(
+            f"latency: {study.baseline} has a median of 0 us: no scale makes it "
+            f"{wanted_s} s"
+        )
+    return 1e6 * wanted_s / median_us
 
 
 @dataclass(frozen=True)
@@ -51,10 +244,9 @@ class PlanFidelity:
 
 @dataclass(frozen=True)
 class VariantOutcome:
-    """A variant's size (1e6 bytes), latency percentiles and plan, without drives."""
+    """A variant's latency percentiles, plan and size, without drives."""
 
     prepared: PreparedVariant
-    size_mb: Measure
     latency_ms: Mapping[int, Measure]
     fidelity: PlanFidelity
 
@@ -63,22 +255,13 @@ class VariantOutcome:
         """Name of the variant."""
         return self.prepared.variant.name
 
-    @classmethod
-    def of(
-        cls, prepared: PreparedVariant, clock: Clock, fidelity: PlanFidelity
-    ) -> "VariantOutcome":
-        """Collect the findings about a variant."""
-        name, size = prepared.variant.name, prepared.size_bytes
-        why = prepared.failure or "no model"
-        unknown = Measure(None, "ms", why)
-        latency_ms = {
-            percent: clock.latency(name, percent) if prepared.model else unknown
-            for percent in LATENCY_PERCENTILES
-        }
-        size_mb = (
-            Measure(None, "MB", why) if size is None else Measure(size / 1e6, "MB")
-        )
-        return cls(prepared, size_mb, latency_ms, fidelity)
+    @property
+    def size_mb(self) -> Measure:
+        """Size of the model with its weights, 1e6 bytes."""
+        size = self.prepared.size_bytes
+        if size is None:
+            return Measure(None, "MB", self.prepared.failure or "no model")
+        return Measure(size / 1e6, "MB")
 
     def to_json(self) -> dict[str, Any]:
         """Return all facts; everything timed is below the key `latency`."""

@@ -17,10 +17,15 @@ from me2e_compress.study.condition import Condition
 from me2e_compress.study.definition import Study
 from me2e_compress.study.drive_record import Contrast, DriveRecord, apart, chosen_pairs
 from me2e_compress.study.file import load_study
-from me2e_compress.study.outcome import VariantOutcome, judge, this_machine
+from me2e_compress.study.outcome import (
+    Clock,
+    VariantOutcome,
+    judge,
+    this_machine,
+    time_all,
+)
 from me2e_compress.study.prepared import PreparedVariant, prepare_all
 from me2e_compress.study.study_result import StudyResult
-from me2e_compress.study.timing import Clock, time_all
 from me2e_compress.study.workspace import HTML, JSON, MARKDOWN, Workspace
 from me2e_compress.workflows.checks import check_folder, check_ours, writing
 from me2e_compress.workflows.frames import record_frames
@@ -69,19 +74,19 @@ def run_study(
         # plans and drives of every variant are compared with the baseline's
         study, clock = cells.study, cells.clock
         baseline = next(each for each in prepared if each.variant == study.reference)
-        variants = tuple(
-            VariantOutcome.of(each, clock, judge(study, baseline, each, listener))
-            for each in prepared
-        )
+        variants = list[VariantOutcome]()
+        for each in prepared:
+            fidelity = judge(study, baseline, each, listener)
+            variants.append(VariantOutcome(each, clock.latencies(each), fidelity))
         drives = tuple(
             drive
             for condition in study.conditions
             for drive in cells.under(condition, prepared)
         )
         shown = cells.pictures(prepared, drives, pictures)
-        machine, load = this_machine(), clock.load
+        made_by = this_machine(), versions()
         return StudyResult(
-            study, variants, drives, shown, clock.scale, machine, versions(), load
+            *(study, tuple(variants), drives, shown, clock.scale, *made_by, clock.load)
         )
 
 

@@ -13,9 +13,9 @@ from me2e_compress.graph import sha256_of
 from me2e_compress.metrics.measure import Measure
 from me2e_compress.runtime.latency_trace import LatencyTrace
 from me2e_compress.runtime.profile import describe_machine
-from me2e_compress.study import Condition, Listener, Study, Timing, Variant, timing
+from me2e_compress.study import Condition, Listener, Study, Timing, Variant, outcome
+from me2e_compress.study.outcome import Clock, time_all
 from me2e_compress.study.prepared import prepare_variant
-from me2e_compress.study.timing import Clock, time_all
 from me2e_compress.study.workspace import Workspace
 from me2e_compress.workflows.result import SILENT
 from tests.study.conftest import BLIND, IDEAL, Make
@@ -49,7 +49,7 @@ def paced(monkeypatch: pytest.MonkeyPatch) -> list[list[str]]:
             for name, path in models.items()
         }
 
-    monkeypatch.setattr(timing, "record_traces", measured)
+    monkeypatch.setattr(outcome, "record_traces", measured)
     return days
 
 

@@ -117,16 +117,6 @@ def obey(
     return Stop(min(lines, default=None), min(slow, default=None), served)
 
 
-def slowed(top: Floats, stop: Stop) -> Floats:
-    """Return the ceiling lowered before a give-way line, if there is one."""
-    if stop.slow_m is None:
-        return top
-    before = np.maximum(stop.slow_m - np.arange(len(top)), 0.0)
-    slow = np.sqrt(GIVE_WAY_MPS**2 + 2 * EASE_MPS2 * before)
-    past = np.arange(len(top)) > stop.slow_m
-    return np.where(past, top, np.minimum(top, slow))
-
-
 def must_give_way(seen: Forecast, line_m: float, crossing_s: float) -> bool:
     """Return whether priority traffic meets the route when the ego crosses a line."""
     in_reach = (seen.along_m > line_m) & (seen.along_m < line_m + CONFLICT_M)
@@ -191,8 +181,12 @@ def decide(
     seen = forecast(scene, intents, path, s)
     stop = obey(scene, known.phases, seen, s, memory.served)
     options = lateral_targets(path, place, ego, seen)
-    # futures: accelerations times lateral targets
-    future = sample(path, slowed(top, stop), ego, place, options, stop.line_m)
+    # futures: accelerations times lateral targets, slower before a give-way line
+    if stop.slow_m is not None:
+        before = stop.slow_m - np.arange(len(top))
+        slow = np.sqrt(GIVE_WAY_MPS**2 + 2 * EASE_MPS2 * np.maximum(before, 0.0))
+        top = np.where(before < 0, top, np.minimum(top, slow))
+    future = sample(path, top, ego, place, options, stop.line_m)
     # what each costs
     cost = drive_cost(future, ego, place, memory.target_m)
     cost += rule_cost(future, path, ego, place, stop.line_m)
