@@ -14,7 +14,7 @@ from me2e_compress.simulator.routes import load_routes, pick_routes
 from me2e_compress.study.cells import MISSING, measure_cell, number
 from me2e_compress.study.condition import Condition
 from me2e_compress.study.definition import Study, Timing, Variant
-from me2e_compress.study.report.page import Section, StudyFiles, write_study
+from me2e_compress.study.report.page import Section, write_study
 from me2e_compress.study.run import run_study
 from me2e_compress.study.study_result import StudyResult
 from me2e_compress.study.workspace import HTML, JSON, MARKDOWN
@@ -52,8 +52,8 @@ def before_and_after(outcome: StudyResult, name: str) -> Table:
         share = ""
         if old.value and new.value is not None:
             share = f"{new.value / old.value:.0%}"
-        cells = measure_cell(old, form), measure_cell(new, form)
-        rows.append((Cell(what), *cells, Cell(share)))
+        both_cells = measure_cell(old, form), measure_cell(new, form)
+        rows.append((Cell(what), *both_cells, Cell(share)))
     moved = measure_cell(after.fidelity.mean_m, ".3f")
     words = "" if most is None else f"{most:.2f} m at most"
     rows.append((Cell("the plan moves by, m"), Cell(MISSING), moved, Cell(words)))
@@ -105,7 +105,6 @@ class DriveResult(Result):
     """How the driver drives before and after compression."""
 
     study: StudyResult
-    written: StudyFiles
     variant: str
     ending: tuple[str, ...]
 
@@ -253,4 +252,4 @@ class DriverDemo:
             f"  me2e-compress compress {DRIVER} -r {RECIPE} --target"
             f" tensorrt --frames {self._frames} -o {DRIVER}.trt.onnx",
         )
-        return DriveResult(result, written, RECIPE, ending)
+        return DriveResult(result, RECIPE, ending)

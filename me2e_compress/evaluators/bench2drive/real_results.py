@@ -226,20 +226,15 @@ class Bench2DriveResults(Evaluator):
         for paths in (found.recordings, found.decisions):
             paths[:] = {path.resolve(): path for path in paths}.values()
         if not any(file.records for file in found.results):
-            why = "no results of a leaderboard below it"
-            reports = [
-                *(
-                    f"no results of a leaderboard: {path.name}: {reason}"
-                    for path, reason in found.broken.items()
-                ),
-                *(
-                    f"no whole record: {file.path.name}: record {place}: {reason}"
-                    for file in found.results
-                    for place, reason in file.broken.items()
-                ),
-                *(f"no record: {file.path.name} holds none" for file in found.results),
-            ]
-            raise EvaluationError(f"{self.folder}: {[*reports, why][0]}")
+            # the first of what could be the cause
+            none = "no results of a leaderboard"
+            whys = [f"{none}: {path.name}: {why}" for path, why in found.broken.items()]
+            for file in found.results:
+                for place, why in file.broken.items():
+                    record = f"{file.path.name}: record {place}"
+                    whys.append(f"no whole record: {record}: {why}")
+            whys += (f"no record: {e.path.name} holds none" for e in found.results)
+            raise EvaluationError(f"{self.folder}: {[*whys, f'{none} below it'][0]}")
         return CollectedResults.of(found)
 
 

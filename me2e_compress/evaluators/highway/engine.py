@@ -104,10 +104,9 @@ class RouteWorker:
         return self._process, self._heartbeat, self._line
 
     def _cause(self, route: Route, process: SpawnProcess) -> str:
-        code = process.exitcode
-        if code == -signal.SIGKILL or not self._heartbeat or not self._heartbeat[0]:
+        code, killed = process.exitcode, process.exitcode == -signal.SIGKILL
+        if killed or not self._heartbeat or not self._heartbeat[0]:
             self.close()
-            killed = code == -signal.SIGKILL
             how = "was killed (out of memory?)" if killed else f"ended with code {code}"
             raise EvaluationError(f"route {route.id}: its process {how}")
         return f"the policy ended its process with code {code}"
