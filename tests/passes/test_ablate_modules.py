@@ -46,34 +46,27 @@ def test_readers_of_a_dropped_module_read_zeros(stack: ir.Model) -> None:
     assert not provenance.missing(result.model)
 
 
-def test_outputs_go_where_that_was_asked_for(stack: ir.Model) -> None:
-    result = NO_MAP.run(stack, context())
+ZEROS = AblateModules(drop=("map",), fill="zeros", drop_outputs=True)
+MEETS = substitute("*.look", "*.meet")
+
+
+@pytest.mark.parametrize(
+    ("chosen", "substitutes", "plan", "note"),
+    [
+        (NO_MAP, "", [1, 1, 3, 4], "output removed: lanes"),
+        (NO_MAP, MEETS, [0, 0, 4, 6], "*.look replaced by *.meet"),
+        (NO_MAP, substitute("*.look"), [0, 0, 2, 3], "output removed: lanes"),
+        (ZEROS, MEETS, [1, 1, 3, 4], "output removed: lanes"),  # left aside
+    ],
+)
+def test_a_substitute_takes_the_place_of_a_scope(
+    stack: ir.Model, chosen: AblateModules, substitutes: str, plan: list[int], note: str
+) -> None:
+    result = chosen.run(stack, context(substitutes))
 
     assert [value.name for value in result.model.graph.outputs] == ["plan"]
-    assert plan_of(result.model) == [1, 1, 3, 4]
-    assert "output removed: lanes" in result.notes
-
-
-def test_a_substitute_takes_the_place_of_a_scope(stack: ir.Model) -> None:
-    result = NO_MAP.run(stack, context(substitute("*.look", "*.meet")))
-
-    assert ops(result.model) == ["Relu", "Abs", "Sqrt", "Add"]
-    assert plan_of(result.model) == [0, 0, 4, 6]
-    assert "*.look replaced by *.meet" in result.notes
-
-
-def test_a_substitute_without_by_reads_as_zeros(stack: ir.Model) -> None:
-    result = NO_MAP.run(stack, context(substitute("*.look")))
-
-    assert plan_of(result.model) == [0, 0, 2, 3]
-
-
-def test_fill_zeros_leaves_substitutes_aside(stack: ir.Model) -> None:
-    chosen = AblateModules(drop=("map",), fill="zeros", drop_outputs=True)
-
-    result = chosen.run(stack, context(substitute("*.look", "*.meet")))
-
-    assert plan_of(result.model) == [1, 1, 3, 4]
+    assert plan_of(result.model) == plan
+    assert note in result.notes
 
 
 def test_a_substitute_of_the_same_elements_is_reshaped(stack: ir.Model) -> None:

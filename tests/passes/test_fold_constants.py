@@ -12,34 +12,6 @@ from me2e_compress.passes.fold_constants import ENTRY_BYTES, FoldConstants
 from tests.passes.small import apply, compute, ops, preserved, read
 from tests.profiles import scaled
 
-SHAPE_CHAIN = """
-g (float[2,3,4] x) => (float[2,12] y) {
-    shape = Shape(x)
-    first = Gather<axis = 0>(shape, zero)
-    row = Unsqueeze(first, axes)
-    target = Concat<axis = 0>(row, rest)
-    y = Reshape(x, target)
-}
-"""
-
-
-def test_shape_arithmetic_becomes_one_initializer() -> None:
-    model = read(SHAPE_CHAIN, zero=np.int64(0), axes=[0], rest=np.array([-1]))
-    apply(FoldConstants(), model)
-    assert ops(model) == ["Reshape"]
-    assert model.graph.initializers["target"].const_value is not None
-    assert model.graph.initializers["target"].const_value.numpy().tolist() == [2, -1]
-
-
-def test_shape_of_a_dynamic_value_stays() -> None:
-    text = SHAPE_CHAIN.replace("float[2,3,4] x", "float[N,3,4] x").replace(
-        "float[2,12] y", "float[N,12] y"
-    )
-    model = read(text, zero=np.int64(0), axes=[0], rest=np.array([-1]))
-    result = apply(FoldConstants(), model)
-    assert result.changes == 0
-    assert ops(model) == ["Shape", "Gather", "Unsqueeze", "Concat", "Reshape"]
-
 
 def test_a_weight_is_transposed_ahead_and_not_stored_twice() -> None:
     text = """
@@ -55,6 +27,70 @@ def test_a_weight_is_transposed_ahead_and_not_stored_twice() -> None:
     np.testing.assert_array_equal(
         graph.array_of(model.graph.initializers["turned"]), weight.T
     )
+
+
+SHAPE_CHAIN = """
+g (float[2,3,4] x) => (float[2,12] y) {
+    shape = Shape(x)
+    first = Gather<axis = 0>(shape, zero)
+    row = Unsqueeze(first, axes)
+    target = Concat<axis = 0>(row, rest)
+    y = Reshape(x, target)
+}
+"""
+OPEN = SHAPE_CHAIN.replace("[2,3,4] x", "[N,3,4] x").replace("[2,12]", "[N,12]")
+UNKNOWN = """
+<ir_version: 9, opset_import: ["" : 17, "trt" : 1]>
+g (float[2,3] x) => (float[M] y) {
+    mystery = trt.Plugin(x)
+    size = Shape(x)
+    flat = ReduceProd<keepdims = 1>(size)
+    y = Reshape(mystery, flat)
+}
+"""
+ALIKE = """
+g (float[4,4] x) => (float[4,4] y) {
+    one = Transpose(weight)
+    two = Transpose(weight)
+    a = MatMul(x, one)
+    y = MatMul(a, two)
+}
+"""
+BRANCHES = """
+g (bool c, float[2] x) => (float[2] y) {
+    y = If(c) <
+        then_branch = t () => (float[2] a) { s = Add(w, w)  a = Add(x, s) },
+        else_branch = e () => (float[2] b) { b = Identity(x) }
+    >
+}
+"""
+
+
+@pytest.mark.parametrize(
+    ("text", "left", "stored"),
+    [
+        (SHAPE_CHAIN, ["Reshape"], ["target"]),
+        (OPEN, ["Shape", "Gather", "Unsqueeze", "Concat", "Reshape"], None),
+        (UNKNOWN, ["Plugin", "Reshape"], ["flat"]),
+        (ALIKE, ["MatMul", "MatMul"], ["one"]),
+        (BRANCHES, ["If", "Add", "Identity"], None),
+    ],
+)
+def test_what_is_folded(text: str, left: list[str], stored: list[str] | None) -> None:
+    weights: dict[str, Any] = {
+        "zero": np.int64(0),
+        "axes": [0],
+        "rest": np.array([-1]),
+        "weight": np.arange(16, dtype=np.float32).reshape(4, 4),
+        "w": np.ones(2, np.float32),
+    }
+    model = read(text, **weights)
+    apply(FoldConstants(), model)
+    assert [node.op_type for node in model.graph.all_nodes()] == left
+    initializers = model.graph.initializers
+    assert stored is None or list(initializers) == stored
+    if stored == ["target"]:
+        assert graph.array_of(initializers["target"]).tolist() == [2, -1]  # type: ignore[union-attr]
 
 
 PRODUCT = """
@@ -147,50 +183,6 @@ def test_what_the_runtime_cannot_evaluate_stays_and_the_rest_folds() -> None:
     result = apply(FoldConstants(), model)
     assert "good" in model.graph.initializers
     assert any("cannot evaluate" in note for note in result.notes)
-
-
-def test_an_unknown_operator_stops_nothing() -> None:
-    text = """
-    <ir_version: 9, opset_import: ["" : 17, "trt" : 1]>
-    g (float[2,3] x) => (float[M] y) {
-        mystery = trt.Plugin(x)
-        size = Shape(x)
-        flat = ReduceProd<keepdims = 1>(size)
-        y = Reshape(mystery, flat)
-    }
-    """
-    model = read(text)
-    apply(FoldConstants(), model)
-    assert ops(model) == ["Plugin", "Reshape"]
-
-
-def test_equal_expressions_are_stored_once() -> None:
-    text = """
-    g (float[4,4] x) => (float[4,4] y) {
-        one = Transpose(weight)
-        two = Transpose(weight)
-        a = MatMul(x, one)
-        y = MatMul(a, two)
-    }
-    """
-    model = read(text, weight=np.arange(16, dtype=np.float32).reshape(4, 4))
-    apply(FoldConstants(), model)
-    assert list(model.graph.initializers) == ["one"]
-
-
-def test_constants_inside_branches_are_folded() -> None:
-    text = """
-    g (bool c, float[2] x) => (float[2] y) {
-        y = If(c) <
-            then_branch = t () => (float[2] a) { s = Add(w, w)  a = Add(x, s) },
-            else_branch = e () => (float[2] b) { b = Identity(x) }
-        >
-    }
-    """
-    model = read(text, w=np.ones(2, np.float32))
-    apply(FoldConstants(), model)
-    branch = model.graph.node(0).attributes["then_branch"].as_graph()
-    assert [node.op_type for node in branch] == ["Add"]
 
 
 BINARY = ("Add", "Sub", "Mul", "Max", "Min")

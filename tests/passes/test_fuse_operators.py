@@ -135,12 +135,6 @@ g (float[6,4,5,7] image, float[6,9,3,2] grid, float[3] weights)
 }"""
 
 
-def test_a_sum_over_some_of_the_batch() -> None:
-    model = read(SUM_OF_HEADS)
-    fused(model)
-    assert "ReduceSum" not in ops(model)
-
-
 POINTS = """<ir_version: 9, opset_import: ["" : 17]>
 g (float[2,35,4] value, float[2,9,1,2] at, float[1,9,3,2] offsets, float[2,9,3] weights,
    float[2,9,1] mask) => (float[9,4] y) <float two = {2.0}, float one = {1.0},
@@ -170,19 +164,23 @@ def test_reference_points_are_moved_before_they_are_repeated() -> None:
     assert sorted(sizes) == [2 * 9, 2 * 9 * 2, 2 * 9 * 3]
 
 
-def test_a_grid_is_taken_to_positions() -> None:
-    model = plain()
+@pytest.mark.parametrize(
+    "model",
+    [
+        *(
+            plain(weights=weights, keep=1)  # weights are repeated
+            for weights in ("float[6,1,9,3]", "float[1,1,9,3]", "float[3]")
+        ),
+        plain(axes=(2, 3)),  # points in two dimensions
+        plain(),  # a grid is taken to positions
+        read(SUM_OF_HEADS),  # a sum over some of the batch
+    ],
+)
+def test_other_forms_of_it(model: ir.Model) -> None:
+    sums = ops(model).count("ReduceSum")
     fused(model)
-    assert {"Mul", "Add", FUSED} < set(ops(model))
-
-
-@pytest.mark.parametrize("weights", ["float[6,1,9,3]", "float[1,1,9,3]", "float[3]"])
-def test_weights_are_repeated(weights: str) -> None:
-    fused(plain(weights=weights, keep=1))
-
-
-def test_points_in_two_dimensions() -> None:
-    fused(plain(axes=(2, 3)))
+    assert FUSED in ops(model)
+    assert ops(model).count("ReduceSum") < sums
 
 
 APART = """<ir_version: 9, opset_import: ["" : 17]>
@@ -232,18 +230,6 @@ LEFT: dict[str, tuple[Any, str]] = {
 }
 
 
-@pytest.mark.parametrize("case", LEFT)
-def test_what_is_none_is_left_with_the_reason(case: str) -> None:
-    model, reason = LEFT[case]
-    if case == "unknown":
-        model.graph.inputs[0].shape = ir.Shape(["batch", 4, 5, 7])
-    result = apply(FuseOperators(), model)
-    assert result.changes == 0
-    (note,) = result.notes
-    assert note.startswith("left n0: ")
-    assert reason in note
-
-
 JOINED = """<ir_version: 9, opset_import: ["" : 17]>
 g (float[1,4,5,7] image, float[1,9,3,2] grid, float[1,4,9,3] other, float[6] weights)
   => (float[1,4,9] y) <int64[1] last = {-1}> {
@@ -264,20 +250,23 @@ g (float[1,4,5,7] image, float[1,9,3,2] grid, float[3] weights)
     m = Mul(s, weights)
     y = ReduceSum<keepdims = 0>(m, last)
 }"""
+LEFT |= {
+    "joined": (read(JOINED), "joined with something else"),
+    "unsummed": (read(UNSUMMED), "not summed"),
+    "read twice": (read(READ_TWICE), "not summed"),
+}
 
 
-@pytest.mark.parametrize(
-    ("text", "reason"),
-    [
-        (JOINED, "joined with something else"),
-        (UNSUMMED, "not summed"),
-        (READ_TWICE, "not summed"),
-    ],
-)
-def test_a_part_of_one_is_left(text: str, reason: str) -> None:
-    result = apply(FuseOperators(), read(text))
+@pytest.mark.parametrize("case", LEFT)
+def test_what_is_none_is_left_with_the_reason(case: str) -> None:
+    model, reason = LEFT[case]
+    if case == "unknown":
+        model.graph.inputs[0].shape = ir.Shape(["batch", 4, 5, 7])
+    result = apply(FuseOperators(), model)
     assert result.changes == 0
-    assert reason in result.notes[0]
+    (note,) = result.notes
+    assert note.startswith("left n0: ")
+    assert reason in note
 
 
 def test_what_the_body_does_not_agree_with_stays(

@@ -9,7 +9,7 @@ import pytest
 
 from me2e_compress import graph
 from me2e_compress.errors import ModuleMapError
-from me2e_compress.graph import provenance, rewrite
+from me2e_compress.graph import provenance
 from me2e_compress.graph.modules import ModuleMap
 from me2e_compress.passes import Context
 from me2e_compress.passes.import_normalize import (
@@ -23,29 +23,23 @@ from tests.passes.small import EVERYTHING, normalise, settled, unstamped
 from tests.plugins import exported
 
 
-def test_unnamed_and_doubly_named_nodes_get_names_of_their_own() -> None:
+@pytest.mark.parametrize(
+    ("given", "made"),
+    [
+        (("", "/part/Relu", "/part/Relu"), ["Relu_0", "/part/Relu", "/part/Relu_0"]),
+        (("", "Relu_0", "/part/Neg"), ["Relu_1", "Relu_0", "/part/Neg"]),
+    ],
+    ids=["one name twice", "the name of a later node"],
+)
+def test_unnamed_and_doubly_named_nodes_get_names_of_their_own(
+    given: tuple[str, ...], made: list[str]
+) -> None:
     model = unstamped("g (float[2] x) => (float[2] y) { a=Relu(x) b=Relu(a) y=Neg(b) }")
-    for node, name in zip(model.graph, ("", "/part/Relu", "/part/Relu"), strict=True):
+    for node, name in zip(model.graph, given, strict=True):
         node.name = name
     ImportNormalize().run(model, Context(EVERYTHING))
-    assert [n.name for n in model.graph] == ["Relu_0", "/part/Relu", "/part/Relu_0"]
+    assert [n.name for n in model.graph] == made
     assert settled(model)
-
-
-def test_a_new_name_never_takes_that_of_a_later_node() -> None:
-    model = unstamped("g (float[2] x) => (float[2] y) { a=Relu(x) y=Relu(a) }")
-    for node, name in zip(model.graph, ("", "Relu_0"), strict=True):
-        node.name = name
-    ImportNormalize().run(model, Context(_by_parameter(model)))
-    assert [node.name for node in model.graph] == ["Relu_1", "Relu_0"]
-
-
-def _by_parameter(model: ir.Model) -> ModuleMap:
-    weight = rewrite.add_constant(model.graph, np.ones(2, np.float32), "head.weight")
-    model.graph[0].replace_input_with(0, weight)
-    return ModuleMap.parse(
-        '[modules.head]\nrole = "prediction"\npatterns = ["head"]', "head"
-    )
 
 
 def test_every_node_is_told_its_module_and_origin() -> None:
@@ -93,17 +87,12 @@ def test_plugins_of_the_default_domain_move_to_a_private_one(plugin: str) -> Non
 def test_plugins_go_out_under_the_domain_that_they_came_with() -> None:
     model = exported(shapes=True)
     normalise(model)
+    assert not needs_import(model)
     written = with_own_domains(model)
+    assert needs_import(written)
     assert [node.domain for node in written.graph] == [""] * len(written.graph)
     assert PLUGIN_DOMAIN not in written.opset_imports
     assert with_own_domains(written) is written
-
-
-def test_a_graph_that_goes_out_and_comes_in_again_is_imported_again() -> None:
-    model = exported(shapes=True)
-    normalise(model)
-    assert not needs_import(model)
-    assert needs_import(with_own_domains(model))
 
 
 def test_a_plugin_in_a_branch_and_one_in_a_function_move_too() -> None:
