@@ -2,6 +2,7 @@
 
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import onnx_ir as ir
@@ -54,25 +55,21 @@ def grids(path: Path) -> set[ir.DataType]:
 def test_int8_is_for_onnxruntime_unless_somebody_is_named(
     cli: Cli, model: Path
 ) -> None:
-    shown = cli.done(f"{INT8} -o out.onnx").words
+    def report() -> Any:
+        return json.loads((model / "out.report.json").read_text())
 
+    shown = cli.done(f"{INT8} -o out.onnx").words
     assert grids(model / "out.onnx") == {ir.DataType.UINT8}
     assert "out.onnx for onnxruntime: 0 errors, 0 warnings" in shown
     assert "TensorRT's form" not in shown
-    assert json.loads((model / "out.report.json").read_text())["int8"]["slow_here"] is (
-        None
-    )
+    assert report()["int8"]["slow_here"] is None
 
-
-def test_int8_for_tensorrt_is_said_to_be_slow_here(cli: Cli, model: Path) -> None:
     shown = cli.done(f"{INT8} --target tensorrt -o out.onnx").words
-
     assert grids(model / "out.onnx") == {ir.DataType.INT8}
     assert SLOW in shown
     assert FAST in shown
-    report = json.loads((model / "out.report.json").read_text())
-    assert report["int8"]["slow_here"].startswith(SLOW)
-    assert any(SLOW in line for line in report["verdict"])
+    assert report()["int8"]["slow_here"].startswith(SLOW)
+    assert any(SLOW in line for line in report()["verdict"])
 
 
 @pytest.mark.usefixtures("dense")

@@ -40,14 +40,9 @@ def test_external_weights_stay_on_disk_and_are_saved_so(tmp_path: Path) -> None:
     assert (tmp_path / "m.onnx.data").stat().st_size == 64 * 8 * 4 + len(BYTES)
     graph.save(back, tmp_path / "n.onnx")
     assert (tmp_path / "n.onnx.data").exists()
-
-
-def test_saving_inline_reads_external_weights(tmp_path: Path) -> None:
-    model = weighted()
-    graph.save(model, tmp_path / "m.onnx", external=True)
-    graph.save(graph.load(tmp_path / "m.onnx"), tmp_path / "n.onnx", external=False)
+    graph.save(back, tmp_path / "n.onnx", external=False)
     assert not (tmp_path / "n.onnx.data").exists()
-    assert graph.digest(graph.load(tmp_path / "n.onnx")) == graph.digest(model)
+    assert graph.digest(graph.load(tmp_path / "n.onnx")) == graph.digest(weighted())
 
 
 def test_a_failed_save_keeps_the_old_file(
@@ -166,12 +161,6 @@ def test_weights_and_model_are_replaced_as_one(
     assert graph.digest(graph.load(path)) == graph.digest(weighted(128))
     names = sorted(file.name for file in tmp_path.iterdir())
     assert names == ["m.onnx", "m.onnx.1.data"]
-
-
-def test_a_model_without_external_weights_leaves_no_old_ones(tmp_path: Path) -> None:
-    graph.save(weighted(), tmp_path / "m.onnx", external=True)
-    graph.save(weighted(), tmp_path / "m.onnx")
-    assert [file.name for file in tmp_path.iterdir()] == ["m.onnx"]
 
 
 @pytest.mark.parametrize("block", [3, 8, 1 << 22])

@@ -76,20 +76,20 @@ MATRICES = (CAMERAS, 1, 1, 4, 4)
 POINTS = (1, HEIGHTS, CELLS, 4, 1)
 
 
-def test_a_matrix_for_each_camera_times_all_points() -> None:
-    model = read(product(MATRICES, POINTS))
-    result = apply(FlattenMatmul(), model)
-    assert result.notes == ("flattened 1 product",)
-    assert matmul_shapes(model) == [(1, HEIGHTS * CELLS, 4), (CAMERAS, 4, 4)]
-    holds_product(model, MATRICES, POINTS)
-
-
-def test_queries_of_one_row_move_behind_their_heads() -> None:
-    """Agents that attend to the same lanes: all of them at once, for each head."""
-    a, b = (400, 8, 1, 32), (1, 8, 32, 20)
+@pytest.mark.parametrize(
+    ("a", "b", "shapes"),
+    [
+        (MATRICES, POINTS, [(1, HEIGHTS * CELLS, 4), (CAMERAS, 4, 4)]),
+        # agents that attend to the same lanes: all of them at once, for each head
+        ((400, 8, 1, 32), (1, 8, 32, 20), [(8, 400, 32), (8, 32, 20)]),
+    ],
+)
+def test_a_matrix_for_each_camera_times_all_points(
+    a: tuple[int, ...], b: tuple[int, ...], shapes: list[tuple[int, ...]]
+) -> None:
     model = read(product(a, b))
     assert apply(FlattenMatmul(), model).notes == ("flattened 1 product",)
-    assert matmul_shapes(model) == [(8, 400, 32), (8, 32, 20)]
+    assert matmul_shapes(model) == shapes
     holds_product(model, a, b)
 
 

@@ -47,28 +47,19 @@ def run(model: ir.Model, recorded: CalibrationSet | None, **options: Any) -> Rep
 
 
 def test_geometry_is_computed_once(tmp_path: Path) -> None:
-    recorded, model = frames(tmp_path, RIG, RIG), net()
+    recorded, model = frames(tmp_path / "a", RIG, RIG), net()
     result = run(model, recorded).model
+    context = Context(ModuleMap.whole(), recorded)
+    assert FreezeInputs().run(result, context).changes == 0
+    recorded.check(result)
+    with pytest.raises(FramesError, match="lidar2img is not the one"):
+        frames(tmp_path / "b", RIG + 1).check(result)  # of another vehicle
     assert ops(result) == ["Add"]
     assert [value.name for value in result.graph.inputs] == ["x"]
     x = recorded[1].arrays["x"]
     np.testing.assert_allclose(
         compute(result, {"x": x}), compute(model, {"x": x, "lidar2img": RIG}), rtol=1e-6
     )
-
-
-def test_a_second_run_changes_nothing_and_frames_still_fit(tmp_path: Path) -> None:
-    recorded = frames(tmp_path, RIG)
-    result = run(net(), recorded).model
-    context = Context(ModuleMap.whole(), recorded)
-    assert FreezeInputs().run(result, context).changes == 0
-    recorded.check(result)
-
-
-def test_frames_of_another_vehicle_are_refused(tmp_path: Path) -> None:
-    model = run(net(), frames(tmp_path / "a", RIG)).model
-    with pytest.raises(FramesError, match="lidar2img is not the one"):
-        frames(tmp_path / "b", RIG + 1).check(model)
 
 
 REFUSED: dict[str, tuple[Any, dict[str, Any], type[Me2eError], str]] = {
@@ -87,13 +78,10 @@ def test_what_does_not_fit_is_named(case: str, tmp_path: Path) -> None:
         run(net(), frames(tmp_path, *rigs), **options)
 
 
-def test_a_value_that_is_missing_is_named(tmp_path: Path) -> None:
-    recorded = CalibrationSet(record(tmp_path, [{"other": RIG}]))
+def test_neither_frames_nor_inputs(tmp_path: Path) -> None:
+    other = CalibrationSet(record(tmp_path, [{"other": RIG}]))
     with pytest.raises(FramesError, match="frame 0: lidar2img is missing"):
-        run(net(), recorded)
-
-
-def test_neither_frames_nor_inputs() -> None:
+        run(net(), other)
     with pytest.raises(FramesError, match="--frames"):
         run(net(), None)
     assert FreezeInputs().needs_frames

@@ -66,6 +66,10 @@ def test_joules_come_from_a_file(tmp_path: Path) -> None:
     assert found is not None
     assert given is not None
     assert found.to_json() == given.to_json()
+    assert score_eer(FOLDERS, EerOptions()) is None
+    file.write_text("{}")
+    with pytest.raises(EnergyError, match=r"energy\.json: not an energy file"):
+        score_eer(FOLDERS, EerOptions({"fast": file}))
 
 
 def test_weights_are_saved_and_used_again(tmp_path: Path) -> None:
@@ -117,10 +121,6 @@ def test_what_one_real_run_lacks_is_left_out_of_all() -> None:
     assert found.found.scores["runs/slow"].n == 2
 
 
-def test_no_joules_no_score() -> None:
-    assert score_eer(FOLDERS, EerOptions()) is None
-
-
 @pytest.mark.parametrize(
     ("options", "said"),
     [
@@ -133,13 +133,6 @@ def test_no_joules_no_score() -> None:
 def test_what_cannot_be_used_is_named(options: EerOptions, said: str) -> None:
     with pytest.raises(EvaluationError, match=re.escape(said)):
         score_eer(FOLDERS, options)
-
-
-def test_a_file_of_joules_that_is_none_is_named(tmp_path: Path) -> None:
-    (tmp_path / "energy.json").write_text("{}")
-
-    with pytest.raises(EnergyError, match=r"energy\.json: not an energy file"):
-        score_eer(FOLDERS, EerOptions({"fast": tmp_path / "energy.json"}))
 
 
 def test_other_routes_cannot_be_compared() -> None:

@@ -26,7 +26,9 @@ def test_it_is_found_by_name() -> None:
     driver = driver_named("highway")
 
     assert driver.label == "highway"
-    assert driver.fingerprint() == driver_named(str(shipped("highway"))).fingerprint()
+    by_file = driver_named(str(shipped("highway"))).fingerprint()
+    assert driver.fingerprint() == driver_of("highway").fingerprint() == by_file
+    assert image_size_of(driver.open()) == (96, 160)
 
 
 def test_a_study_may_compress_it(tmp_path: Path) -> None:
@@ -36,11 +38,3 @@ def test_a_study_may_compress_it(tmp_path: Path) -> None:
 
     assert Path(half.policy) == shipped("highway")
     assert [each.name for each in half.passes] == ["convert-float16"]
-
-
-def test_evaluate_takes_its_file() -> None:
-    assert driver_of("highway").fingerprint() == driver_named("highway").fingerprint()
-
-
-def test_it_opens() -> None:
-    assert image_size_of(driver_named("highway").open()) == (96, 160)

@@ -12,7 +12,7 @@ from me2e_compress.graph.rewrite import Fusion, fuse, op, var
 from me2e_compress.passes.base import Pass
 from me2e_compress.passes.eliminate_redundant import EliminateRedundant
 from me2e_compress.passes.fuse_basic import FuseBasic
-from tests.passes.small import NO_MODULES, apply, ops, read
+from tests.passes.small import apply, ops, read
 
 HEAD = '<ir_version: 9, opset_import: ["" : 17]>\n'
 
@@ -152,6 +152,4 @@ def models(draw: st.DrawFn) -> ir.Model:
 @pytest.mark.parametrize("current", [EliminateRedundant(), FuseBasic()])
 @given(model=models())
 def test_a_second_run_changes_nothing(current: Pass, model: ir.Model) -> None:
-    once = apply(current, model).model
-
-    assert current.run(once.clone(), NO_MODULES).changes == 0  # as the manager runs it
+    apply(current, model)  # which runs it twice

@@ -109,15 +109,6 @@ def test_powers_are_accurate() -> None:
     assert np.allclose(found[near], (power / (1 + power))[near], rtol=6e-7, atol=0)
 
 
-def test_equal_scores_give_the_mean() -> None:
-    arrays = drawn(1, 3, 513, 8)
-    arrays["query"][:, 1] = 0
-
-    found = ran(arrays, 1)
-
-    assert np.allclose(found[:, 1], arrays["value"].mean(axis=1), atol=1e-6)
-
-
 def test_a_query_that_is_no_number_is_none_afterwards() -> None:
     arrays = drawn(1, 60, 300, 16)
     arrays["query"][0, 7, 3] = np.nan
