@@ -160,20 +160,15 @@ def test_what_passes_made_is_cut_and_joined_again(tmp_path: Path, text: str) -> 
 
 
 def test_names_that_two_parts_have_are_told_apart(tmp_path: Path) -> None:
-    model = JoinedStack.load(write_dense(tmp_path)).model
+    stack = JoinedStack.load(write_dense(tmp_path))
+    model = stack.model
 
+    file = stack.parts["backbone"].model.graph.initializers["w"]  # it is shared
+    assert model.graph.initializers["backbone.w"].const_value is file.const_value
     assert list(model.graph.initializers) == ["backbone.w", "points", "head.w"]
     assert [value.name for value in model.graph.outputs] == [
         *("next_bev", "plan", "feats")
     ]
-
-
-def test_weights_are_shared_with_the_files(tmp_path: Path) -> None:
-    stack = JoinedStack.load(write_dense(tmp_path))
-
-    weight = stack.model.graph.initializers["backbone.w"].const_value
-    file = stack.parts["backbone"].model
-    assert weight is file.graph.initializers["w"].const_value
 
 
 def test_an_older_part_is_written_in_the_opset_of_the_newest(tmp_path: Path) -> None:
@@ -254,23 +249,6 @@ Twice (x) => (y) {{ y = {body} }}
 """
 
 
-def test_functions_of_one_name_that_differ_are_told_apart(tmp_path: Path) -> None:
-    path = write_stack(
-        tmp_path,
-        backbone=CALL.format(
-            name="backbone", taken="img", given="feats", body="Add(x, x)"
-        ),
-        head=CALL.format(name="head", taken="feats", given="plan", body="Mul(x, x)"),
-    )
-
-    made = again(JoinedStack.load(path), tmp_path / "again")
-
-    for each in (path, made):
-        (found,) = replay(joined(each), ones(True))
-        assert found["plan"][0, 0] == 4.0
-    assert len(JoinedStack.load(path).model.functions) == 2
-
-
 BRANCH = """
 <ir_version: 9, opset_import: ["" : 17]>
 {name} (float[1,4] {taken}) => (float[1,4] {given})
@@ -283,11 +261,16 @@ BRANCH = """
 """
 
 
-def test_names_in_bodies_are_told_apart_too(tmp_path: Path) -> None:
+@pytest.mark.parametrize(("text", "functions"), [(CALL, 2), (BRANCH, 0)])
+def test_functions_and_bodies_of_one_name_are_told_apart(
+    tmp_path: Path, text: str, functions: int
+) -> None:
+    backbone = {"name": "backbone", "taken": "img", "given": "feats"}
+    head = {"name": "head", "taken": "feats", "given": "plan"}
     path = write_stack(
         tmp_path,
-        backbone=BRANCH.format(name="backbone", taken="img", given="feats"),
-        head=BRANCH.format(name="head", taken="feats", given="plan"),
+        backbone=text.format(body="Add(x, x)", **backbone),
+        head=text.format(body="Mul(x, x)", **head),
     )
 
     made = again(JoinedStack.load(path), tmp_path / "again")
@@ -295,6 +278,7 @@ def test_names_in_bodies_are_told_apart_too(tmp_path: Path) -> None:
     for each in (path, made):
         (found,) = replay(joined(each), ones(True))
         assert found["plan"][0, 0] == 4.0
+    assert len(JoinedStack.load(path).model.functions) == functions
 
 
 def test_large_weights_stay_on_disk(tmp_path: Path) -> None:

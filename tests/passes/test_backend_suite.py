@@ -143,15 +143,9 @@ def suite(request: pytest.FixtureRequest) -> Suite:
     return found
 
 
-
-
-
-
 def test_every_case_goes_through_the_passes(suite: Suite) -> None:
     """Counted with onnx 1.23 and onnxruntime 1.31; of 1884."""
     assert suite.inside.failed == suite.baked.failed == []
     assert suite.inside.passed == suite.baked.passed == suite.ran
     assert suite.ran > (1700 if suite.kinds is None else 850)
     assert suite.baked.folded >= (1531 if suite.kinds is None else 730)
-
-

@@ -13,7 +13,7 @@ from me2e_compress.passes.convert_float16 import ConvertFloat16
 from me2e_compress.passes.convert_float32 import ConvertFloat32
 from me2e_compress.testing import check_pass
 from tests.nets import MODULES, conv_attention
-from tests.passes.small import apply, bare, casts, ops, read, types_of
+from tests.passes.small import apply, bare, ops, read, types_of
 
 HEAD = '<ir_version: 9, opset_import: ["" : 17, "own" : 1]>\n'
 HALF, FLOAT = ir.DataType.FLOAT16, ir.DataType.FLOAT
@@ -42,21 +42,26 @@ def test_where_nothing_is_to_be_done(text: str) -> None:
     assert apply(ConvertFloat32(), read(HEAD + text)).changes == 0
 
 
-def test_a_cast_casts_to_the_new_type() -> None:
-    text = "g (int32[2] x) => (float16[2] y) { a = Cast<to = 10>(x) y = Relu(a) }"
+@pytest.mark.parametrize(
+    ("x", "body", "left"),
+    [
+        ("int32", "a = Cast<to = 10>(x) y = Relu(a)", ["Relu"]),
+        ("float16", "d = Neg(x) y = Relu(x)", ["Relu"]),
+        ("float16", "a = Relu(x) y = Sigmoid(a)", ["Relu", "Sigmoid"]),
+    ],
+    ids=["a cast", "what is unread goes", "a half interface"],
+)
+def test_a_half_interface_is_cast_to_and_from(
+    x: str, body: str, left: list[str]
+) -> None:
+    text = f"g ({x}[2] x) => (float16[2] y) {{ {body} }}"
 
-    found = apply(ConvertFloat32(), read(HEAD + text)).model.graph
+    model = apply(ConvertFloat32(), read(HEAD + text)).model
 
-    to = [each.attributes.get_int("to") for each in found if each.op_type == "Cast"]
-    assert to == [1, 10]
-
-
-def test_what_is_unread_goes_with_a_change() -> None:
-    text = "g (float16[2] x) => (float16[2] y) { d = Neg(x) y = Relu(x) }"
-
-    assert ops(apply(ConvertFloat32(), read(HEAD + text)).model) == [
-        "Cast", "Relu", "Cast",
-    ]  # fmt: skip
+    casts = [each for each in model.graph if each.op_type == "Cast"]
+    assert ops(model) == ["Cast", *left, "Cast"]
+    assert [each.attributes.get_int("to") for each in casts] == [1, 10]
+    assert set(types_of(model).values()) == {"FLOAT"}
 
 
 @st.composite
@@ -123,11 +128,3 @@ def test_casts_to_other_types_stay_what_they_are() -> None:
     kinds = [value.dtype for value in back.graph.outputs]
 
     assert kinds == [ir.DataType.INT32, HALF]
-
-
-def test_float32_inside_leaves_a_half_interface() -> None:
-    text = "h (float16[4] x) => (float16[4] y) { a = Relu(x)\n y = Sigmoid(a) }"
-    back = check_pass(ConvertFloat32(), bare(HEAD + text, {})).model
-
-    assert types_of(back) == {"Relu": "FLOAT", "Sigmoid": "FLOAT"}
-    assert casts(back) == 2

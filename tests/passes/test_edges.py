@@ -48,26 +48,20 @@ def scene() -> tuple[Numbers, Numbers, Numbers]:
     return bev, ego, (2 * ego + weights()["embedding"][0]).max(0)
 
 
-def test_appended_queries_are_attended_to() -> None:
-    result = AblateModules((), edges=(KEYS,)).run(stack(), context())
+@pytest.mark.parametrize(
+    ("edges", "picks"),
+    [((KEYS,), ["pick"]), ((KEYS, Edge("*.agents", "*.attn")), ["pick", "pair"])],
+)
+def test_appended_queries_are_attended_to(
+    edges: tuple[Edge, ...], picks: list[str]
+) -> None:
+    result = AblateModules((), edges=edges).run(stack(), context())
 
     bev, _, query = scene()
-    lanes = weights()["pick"][0] @ bev
-    plan = answers(result.model)["plan"][0, 0]
-    np.testing.assert_allclose(plan, attended(query, np.vstack([bev, lanes])), 1e-4)
-    told = "*.attn reads lanes [1,3,8] behind bev [1,5,8]"
-    assert told in result.notes
-
-
-def test_several_edges_end_at_one_reader() -> None:
-    both = (KEYS, Edge("*.agents", "*.attn"))
-
-    result = AblateModules((), edges=both).run(stack(), context())
-
-    bev, _, query = scene()
-    more = [weights()[name][0] @ bev for name in ("pick", "pair")]
+    more = [weights()[name][0] @ bev for name in picks]
     plan = answers(result.model)["plan"][0, 0]
     np.testing.assert_allclose(plan, attended(query, np.vstack([bev, *more])), 1e-4)
+    assert "*.attn reads lanes [1,3,8] behind bev [1,5,8]" in result.notes
 
 
 def test_an_added_query_is_repeated_for_every_mode() -> None:
@@ -244,13 +238,6 @@ def test_queries_that_a_reshape_merges_are_refused() -> None:
         AblateModules((), edges=(KEYS,)).run(model, context())
 
 
-def test_a_source_that_is_dropped_is_refused() -> None:
-    chosen = AblateModules(("map",), drop_outputs=True, edges=(KEYS,))
-
-    with pytest.raises(PreconditionError, match="map is dropped too"):
-        chosen.run(stack(), context())
-
-
 @pytest.mark.parametrize(
     ("chosen", "message"),
     [
@@ -258,28 +245,26 @@ def test_a_source_that_is_dropped_is_refused() -> None:
             AblateModules(("backbone",), fill="zeros"),
             "without backbone the plan is cut: plan depends on nothing of backbone",
         ),
+        (
+            AblateModules(("map",), drop_outputs=True, edges=(KEYS,)),
+            "map is dropped too",
+        ),
         (AblateModules(("planner",), drop_outputs=True), "cannot be dropped: .* plan"),
         (AblateModules(("planner",)), "planner cannot be dropped: it makes plan"),
     ],
 )
-def test_an_ablation_that_cuts_the_planner_is_refused(
+def test_an_ablation_that_cuts_the_planner_or_a_source_is_refused(
     chosen: AblateModules, message: str
 ) -> None:
     with pytest.raises(PreconditionError, match=message):
         chosen.run(stack(), context())
 
 
-def test_nothing_to_do_is_refused() -> None:
+def test_what_is_not_said_is_asked_for() -> None:
     with pytest.raises(RecipeError, match="drop is empty, and there are no edges"):
         AblateModules(()).run(stack(), context())
-
-
-def test_an_edge_that_replaces_says_what() -> None:
     with pytest.raises(RecipeError, match="edge a -> b: how=replace needs of=PART"):
         recipe.parse("ablate-modules{drop=[], edges=[{source=a,reader=b,how=replace}]}")
-
-
-def test_a_substitute_for_a_reader_says_by_what() -> None:
     with pytest.raises(ModuleMapError, match="a substitute with a reader needs by="):
         context('substitutes = [{ scope = "motion", reader = "planner" }]')
 

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from me2e_compress.graph import provenance
 from me2e_compress.graph.rewrite import add_constant
 from me2e_compress.passes.eliminate_redundant import EliminateRedundant
-from tests.passes.small import apply, compute, ops, preserved, read
+from tests.passes.small import apply, compute, ops, read
 from tests.profiles import scaled
 
 
@@ -135,26 +135,6 @@ def test_initializers_that_differ_in_the_middle_stay_apart() -> None:
     model = read(text, p=p, q=q)
     apply(EliminateRedundant(), model)
     assert list(model.graph.initializers) == ["p", "q"]
-
-
-BRANCHES = """
-g (float[2] x) => (float[2] y) {
-    a = Relu(x)
-    b = If(c) <
-        then_branch = t () => (float[2] p) { inner = Neg(x)  p = Neg(inner) },
-        else_branch = e () => (float[2] q) { q = Abs(x) }
-    >
-    y = Add(a, b)
-}
-"""
-
-
-@pytest.mark.parametrize(
-    ("taken", "left"), [(True, ["Relu", "Add"]), (False, ["Relu", "Abs", "Add"])]
-)
-def test_the_branch_that_is_taken_replaces_the_if(taken: bool, left: list[str]) -> None:
-    model, _ = preserved(EliminateRedundant(), BRANCHES, c=np.bool_(taken))
-    assert ops(model) == left
 
 
 def test_an_identity_between_input_and_output_stays() -> None:

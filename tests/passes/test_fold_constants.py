@@ -93,6 +93,24 @@ def test_what_is_folded(text: str, left: list[str], stored: list[str] | None) ->
         assert graph.array_of(initializers["target"]).tolist() == [2, -1]  # type: ignore[union-attr]
 
 
+TAKEN = """
+g (float[2] x) => (float[2] y) {
+    a = Relu(x)
+    b = If(c) <
+        then_branch = t () => (float[2] p) { inner = Neg(x)  p = Exp(inner) },
+        else_branch = e () => (float[2] q) { q = Abs(x) }
+    >
+    y = Add(a, b)
+}
+"""
+
+
+@pytest.mark.parametrize(("taken", "left"), [(True, ["Neg", "Exp"]), (False, ["Abs"])])
+def test_the_branch_that_is_taken_replaces_the_if(taken: bool, left: list[str]) -> None:
+    model, _ = preserved(FoldConstants(), TAKEN, c=np.bool_(taken))
+    assert ops(model) == ["Relu", *left, "Add"]
+
+
 PRODUCT = """
 g (float[4,4] x) => (float[4,4] y) {
     product = MatMul(a, b)

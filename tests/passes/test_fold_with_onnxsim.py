@@ -48,23 +48,17 @@ def test_what_depends_on_no_input_is_folded(model: ir.Model, folded: ir.Model) -
     np.testing.assert_array_equal(before, after)
 
 
-def test_names_and_pasts_come_back(folded: ir.Model) -> None:
+def test_names_pasts_and_metadata_come_back(folded: ir.Model) -> None:
     assert [node.name for node in folded.graph] == ["/det/Reshape", "/planner/Add"]
     assert [provenance.read(node) for node in folded.graph] == [
         Provenance("det", ("/det/Reshape",)),
         Provenance("planner", ("/planner/Add",)),
     ]
-
-
-def test_metadata_is_the_model_s_and_no_weight_needs_a_file(folded: ir.Model) -> None:
     assert folded.metadata_props == {"me2e.stack": "vad-tiny"}
     assert folded.producer_name != "onnx-simplifier"
     tensors = [value.const_value for value in folded.graph.initializers.values()]
     assert tensors
     assert not any(isinstance(tensor, ir.ExternalTensor) for tensor in tensors)
-
-
-def test_a_second_run_changes_nothing(folded: ir.Model) -> None:
     again = FoldWithOnnxsim().run(folded, CONTEXT)
     assert again.changes == 0
     assert graph.digest(again.model) == graph.digest(folded)

@@ -101,6 +101,8 @@ def test_compare_knows_the_plan_and_the_state(
 
     assert found.plan is not None
     assert found.plan_output == "waypoints"
+    shown = inspect(mine, InspectOptions(adapter=adapter))
+    assert shown.recurrent == {"memory": "remembered"}
 
 
 def test_calibrate_and_compress_feed_the_state_back(
@@ -127,12 +129,6 @@ def test_profile_feeds_the_state_back(
     assert found.trace.modules_us
 
 
-def test_inspect_shows_the_state(mine: Path, adapter: Path) -> None:
-    assert inspect(mine, InspectOptions(adapter=adapter)).recurrent == {
-        "memory": "remembered"
-    }
-
-
 def test_sensitivity_is_told_in_metres_without_a_drive(
     mine: Path, frames: Path, adapter: Path, tmp_path: Path
 ) -> None:
@@ -144,20 +140,30 @@ def test_sensitivity_is_told_in_metres_without_a_drive(
 
 
 @pytest.mark.parametrize(
-    ("before", "after", "why"),
+    ("of_map", "before", "after", "why"),
     [
-        ("feeds.seen", "feeds.sight", "feeds input sight; there are seen, memory"),
-        ('"waypoints"', '"way"', "no output way"),
-        ('"remembered"', '"kept"', "pairs memory with kept"),
+        (False, "feeds.seen", "feeds.sight", "feeds input sight; there are seen, mem"),
+        (False, '"waypoints"', '"way"', "no output way"),
+        (False, '"remembered"', '"kept"', "pairs memory with kept"),
+        (True, '"waypoints"', '"way"', "no output way, which is named as the plan"),
+        (True, '"remembered"', '"kept"', "pairs memory with kept"),
+        (True, "memory =", "past =", "pairs past with remembered"),
+        (True, '"waypoints"', '"waypoints"\ncommand_input = "turn"', "no input turn"),
+        (True, "output =", "outptu =", "plan.output: Field required"),
+        (True, '"waypoints"', '"waypoints"\nstep_s = -1', "plan.step_s: .* than 0"),
     ],
 )
-def test_an_adapter_of_another_graph_is_refused(
-    mine: Path, adapter: Path, before: str, after: str, why: str
-) -> None:
-    adapter.write_text(ADAPTER.replace(before, after))
+def test_an_adapter_or_a_map_of_another_graph_is_refused(
+    mine: Path, adapter: Path, parts: Path,
+    of_map: bool, before: str, after: str, why: str,
+) -> None:  # fmt: skip
+    file = parts if of_map else adapter
+    file.write_text(file.read_text().replace(before, after))
+    given = (None, parts) if of_map else (adapter,)
 
-    with pytest.raises(EvaluationError, match=rf"a\.toml: .*{why}"):
-        adapted(graph.load(mine), adapter)
+    start = "^map parts:?" if of_map else r"a\.toml:"
+    with pytest.raises(EvaluationError, match=f"{start} .*{why}"):
+        adapted(graph.load(mine), *given)
 
 
 def test_the_command_that_picks_a_mode_has_the_name_of_the_graph() -> None:
@@ -188,26 +194,6 @@ def test_an_adapter_overrides_the_map(mine: Path, adapter: Path, parts: Path) ->
     said = adapted(graph.load(mine), adapter, parts)
 
     assert "step_s" not in said["me2e.plan"]
-
-
-@pytest.mark.parametrize(
-    ("before", "after", "why"),
-    [
-        ('"waypoints"', '"way"', "no output way, which is named as the plan"),
-        ('"remembered"', '"kept"', "pairs memory with kept"),
-        ("memory =", "past =", "pairs past with remembered"),
-        ('"waypoints"', '"waypoints"\ncommand_input = "turn"', "no input turn"),
-        ("output =", "outptu =", "plan.output: Field required"),
-        ('"waypoints"', '"waypoints"\nstep_s = -1', "plan.step_s: .* greater than 0"),
-    ],
-)
-def test_a_map_of_another_graph_is_refused(
-    mine: Path, parts: Path, before: str, after: str, why: str
-) -> None:
-    parts.write_text(parts.read_text().replace(before, after))
-
-    with pytest.raises(EvaluationError, match=f"^map parts:? .*{why}"):
-        adapted(graph.load(mine), None, parts)
 
 
 @pytest.mark.parametrize(
