@@ -21,6 +21,7 @@ from me2e_compress.workflows.listing import KINDS, REGISTRIES
 from me2e_compress.workflows.options import FramesOptions
 from tests.command import Cli, strict
 from tests.docs.documents import faults
+from tests.docs.pages import ROOT
 from tests.installed import install
 from tests.nets import parsed, save_text
 from tests.targets.onnxruntime.lowered import MATMUL_RELU
@@ -34,16 +35,11 @@ TWIST = (
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_every_command_explains_itself(cli: Cli, name: str) -> None:
+def test_every_command_explains_itself_and_is_documented(cli: Cli, name: str) -> None:
     assert name in cli.done(f"{name} --help").out
-
-
-@pytest.mark.parametrize("name", NAMES)
-def test_every_command_is_documented(name: str) -> None:
-    root = Path(__file__).parents[2]
-    page = (root / "docs" / "commands.md").read_text(encoding="utf-8")
+    page = (ROOT / "docs" / "commands.md").read_text(encoding="utf-8")
     assert re.search(rf"^\* `me2e-compress {name}\b", page, re.MULTILINE)
-    assert f"`{name}`" in (root / "README.md").read_text(encoding="utf-8")
+    assert f"`{name}`" in (ROOT / "README.md").read_text(encoding="utf-8")
 
 
 def test_doctor_names_the_versions(cli: Cli) -> None:

@@ -35,16 +35,6 @@ def test_equal_names_are_joined_and_state_runs_by_its_names(tmp_path: Path) -> N
     assert bevs(path, True, False, False, True) == [2.0, 3.0, 3.5, 2.0]
 
 
-def test_edges_name_what_is_called_otherwise(tmp_path: Path) -> None:
-    path = write_stack(
-        tmp_path,
-        TWO_PARTS + '[edges]\n"head.img_feats" = "backbone.feats"\n',
-        head=HEAD.replace("feats", "img_feats"),
-    )
-
-    assert bevs(path, True, False) == [2.0, 3.0]
-
-
 def test_two_outputs_of_one_name_are_called_by_their_parts(tmp_path: Path) -> None:
     path = write_stack(
         tmp_path,
@@ -69,20 +59,17 @@ def test_what_a_frame_holds_is_the_first_value(tmp_path: Path) -> None:
     assert answer["next_bev"][0, 0] == 12.0
 
 
-def test_state_may_be_another_output_than_its_name_says(tmp_path: Path) -> None:
-    path = write_stack(tmp_path, TWO_PARTS + '[state]\nprev_bev = "feats"\n')
+def test_state_metadata_and_edges_are_what_the_toml_says(tmp_path: Path) -> None:
+    state = '[state]\nprev_bev = "feats"\n[metadata]\n'
+    toml = TWO_PARTS + state + '"me2e.plan" = {output = "plan", deltas = true}\n'
+    path = write_stack(tmp_path, toml)
 
     assert bevs(path, True, False, False) == [2.0, 3.0, 3.0]
-
-
-def test_metadata_of_the_toml_wins(tmp_path: Path) -> None:
-    toml = TWO_PARTS + '[metadata]\n"me2e.plan" = {output = "plan", deltas = true}\n'
-
-    stack = JoinedStack.load(write_stack(tmp_path, toml))
-
-    assert (
-        stack.model.metadata_props["me2e.plan"] == '{"output": "plan", "deltas": true}'
-    )
+    metadata = JoinedStack.load(path).model.metadata_props
+    assert metadata["me2e.plan"] == '{"output": "plan", "deltas": true}'
+    toml = TWO_PARTS + '[edges]\n"head.img_feats" = "backbone.feats"\n'
+    path = write_stack(tmp_path, toml, head=HEAD.replace("feats", "img_feats"))
+    assert bevs(path, True, False) == [2.0, 3.0]
 
 
 def again(

@@ -8,17 +8,14 @@ import onnx_ir as ir
 import pytest
 
 from me2e_compress import graph
-from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.calibration.stream import Recording
 from me2e_compress.errors import GraphError, PassError, VerificationError
 from me2e_compress.graph import provenance, shapes
-from me2e_compress.graph.modules import ModuleMap
-from me2e_compress.manager import PassManager, Report, attempt, recipe
+from me2e_compress.manager import PassManager, Report, attempt
 from me2e_compress.passes.base import Context, Pass
 from me2e_compress.passes.eliminate_redundant import EliminateRedundant
 from me2e_compress.passes.fold_constants import FoldConstants
 from me2e_compress.passes.import_normalize import ImportNormalize
-from me2e_compress.shipped.drivers import sample_frames, shipped
 from tests.manager import passes
 
 CHAIN = """
@@ -212,21 +209,6 @@ def test_equal_non_numbers_are_equal(value: float, context: Context) -> None:
     model.graph.initializers["w"].const_value = ir.tensor(data, name="w")
     (check,) = run(model, context, passes.IDLE).verifications
     assert check.errors == {"y": 0.0}, literal
-
-
-def test_the_driver_is_judged_on_the_frames_that_ship() -> None:
-    """On made-up inputs its planner tosses a coin, and the plan goes unjudged."""
-    path = shipped("highway")
-    folder = sample_frames(path)
-    assert folder is not None
-    model, samples = graph.load(path), CalibrationSet(folder)
-    manager = PassManager(recipe.load("exact"), 1, samples=samples)
-
-    (check,) = manager.run(model, Context(ModuleMap.load("highway"))).verifications
-
-    assert check.inputs == "recorded"
-    assert not check.unsteady
-    assert check.errors["plan"] < 1e-5
 
 
 def test_a_pass_s_graph_is_written_once_for_checker_and_inference(

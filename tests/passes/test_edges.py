@@ -1,7 +1,7 @@
 """Edges that the ablation pass adds, those that do not fit, and what grows behind."""
 
 from collections.abc import Mapping
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import onnx_ir as ir
@@ -344,44 +344,36 @@ def test_a_reshape_gets_longer_where_the_axis_stands_in_its_result(
     assert shape_of(model, "b") == longer
 
 
-@pytest.mark.parametrize(
-    ("shape", "axis", "made"),
-    [((1, 6, 8), 1, (1, 48)), ((1, 6, 8), 1, (3, 2, 8)), ((2, 6, 4), 1, (6, 8))],
-)
-def test_a_reshape_that_splits_or_merges_the_axis_is_refused(
-    shape: tuple[int, ...], axis: int, made: tuple[int, ...]
-) -> None:
-    with pytest.raises(PreconditionError, match="the queries are no axis of that"):
-        grown(shape, axis, f"b = Reshape(old, made) {SUM}", made)
+RESHAPED = f"b = Reshape(old, made) {SUM}"
+UNKNOWN = "c = Cast<to = 1>(b)  y = ReduceSum(c)"
 
 
 @pytest.mark.parametrize(
-    ("body", "message"),
+    ("shape", "body", "options", "message"),
     [
-        ("b = own.Plugin(old)", "does not fit n2 "),
-        ("b = Add(old, x)", r"does not fit n2 \(Add\)"),
+        ((1, 6, 8), RESHAPED, {"made": (1, 48)}, "the queries are no axis of that"),
+        ((1, 6, 8), RESHAPED, {"made": (3, 2, 8)}, "the queries are no axis of that"),
+        ((2, 6, 4), RESHAPED, {"made": (6, 8)}, "the queries are no axis of that"),
+        ((1, 6, 8), f"b = own.Plugin(old) {SUM}", {}, "does not fit n2 "),
+        ((1, 6, 8), f"b = Add(old, x) {SUM}", {}, r"does not fit n2 \(Add\)"),
+        (
+            (1, 6, 8),
+            "y = Relu(old)",  # an output of the graph stays as it is
+            {"gives": "float[1,6,8] y"},
+            r"would change y \[1,6,8\]",
+        ),
+        # a size that is not known after, or before
+        (
+            (1, 6, 8),
+            f"b = NonZero(old) {UNKNOWN}",
+            {"b": ir.Shape([3, 48])},
+            "would change b ",
+        ),
+        ((1, 6, 8), f"b = Relu(old) {UNKNOWN}", {"b": None}, "would change b "),
     ],
-    ids=["a plugin", "a sum with what did not grow"],
 )
-def test_what_cannot_read_more_is_named(body: str, message: str) -> None:
-    with pytest.raises(PreconditionError, match=f"more queries {message}"):
-        grown((1, 6, 8), 1, f"{body}  {SUM}")
-
-
-def test_an_output_of_the_graph_stays_as_it_is() -> None:
-    with pytest.raises(
-        PreconditionError, match=r"more queries would change y \[1,6,8\]"
-    ):
-        grown((1, 6, 8), 1, "y = Relu(old)", gives="float[1,6,8] y")
-
-
-@pytest.mark.parametrize(
-    ("body", "before"),
-    [("b = NonZero(old)", ir.Shape([3, 48])), ("b = Relu(old)", None)],
-    ids=["after", "before"],
-)
-def test_a_size_that_is_not_known_before_and_after_is_refused(
-    body: str, before: ir.Shape | None
+def test_what_cannot_read_more_is_refused(
+    shape: tuple[int, ...], body: str, options: dict[str, Any], message: str
 ) -> None:
-    with pytest.raises(PreconditionError, match="more queries would change b "):
-        grown((1, 6, 8), 1, f"{body}  c = Cast<to = 1>(b)  y = ReduceSum(c)", b=before)
+    with pytest.raises(PreconditionError, match=message):
+        grown(shape, 1, body, **options)

@@ -8,8 +8,6 @@ import pytest
 from me2e_compress.passes.eliminate_redundant import EliminateRedundant
 from tests.passes.small import apply, compute, ops, preserved, read
 
-HEAD = '<ir_version: 9, opset_import: ["" : 17]>\n'
-
 MERGES: list[tuple[str, list[str] | None]] = [
     ("b = Transpose<perm = [1, 0]>(a)  c = Reshape(b, s)", None),
     ("b = Transpose<perm = [1, 0]>(a)  c = Transpose<perm = [1, 0]>(b)", []),
@@ -24,9 +22,7 @@ MERGES: list[tuple[str, list[str] | None]] = [
 
 @pytest.mark.parametrize(("body", "middle"), MERGES)
 def test_pairs_are_merged(body: str, middle: list[str] | None) -> None:
-    text = (
-        HEAD + f"g (float[2,3] x) => (float[2,3] y) {{ a = Abs(x) {body} y = Neg(c) }}"
-    )
+    text = f"g (float[2,3] x) => (float[2,3] y) {{ a = Abs(x) {body} y = Neg(c) }}"
     weights: dict[str, Any] = {
         "s": np.array([2, 3]),
         "flat": np.array([6]),
@@ -58,6 +54,34 @@ def test_merged_casts_say_what_happens_beyond_the_range() -> None:
 
 
 @pytest.mark.parametrize(
+    ("text", "left"),
+    [
+        (
+            "(float[4,6] x) => (float[2,3] y)"
+            " { a = Slice(x, one, three, zero) y = Slice(a, one, seven, ones, two) }",
+            "Slice",
+        ),
+        (
+            "(float[1,3] x, float[5,3] z) => (float[5,3] y)"
+            " { wide = Expand(x, whole) y = Add(wide, z) }",
+            "Add",
+        ),
+        (
+            "(float[2] x, float[2] z) => (float[6] y)"
+            " { a = Concat<axis = 0>(x, z) y = Concat<axis = 0>(a, x) }",
+            "Concat",
+        ),
+    ],
+)
+def test_two_in_a_row_become_one(text: str, left: str) -> None:
+    numbers = {"zero": 0, "one": 1, "three": 3, "seven": 7, "ones": 1, "two": 2}
+    weights: dict[str, Any] = {name: np.array([n]) for name, n in numbers.items()}
+    weights["whole"] = np.array([5, 3])
+    model, _ = preserved(EliminateRedundant(), f"g {text}", **weights)
+    assert ops(model) == [left]
+
+
+@pytest.mark.parametrize(
     ("axis", "start", "end", "left"),
     [
         (0, 0, 2, ["Abs", "Neg"]),
@@ -83,49 +107,6 @@ def test_a_slice_that_takes_one_operand_of_a_concat_reads_it(
     }
     model, _ = preserved(EliminateRedundant(), text, **bounds)
     assert ops(model) == left
-
-
-def test_slices_of_different_axes_become_one() -> None:
-    text = """
-    g (float[4,6] x) => (float[2,3] y) {
-        a = Slice(x, one, three, zero)
-        y = Slice(a, one, seven, ones, two)
-    }
-    """
-    numbers = {"zero": 0, "one": 1, "three": 3, "seven": 7, "ones": 1, "two": 2}
-    weights: dict[str, Any] = {
-        name: np.array([number]) for name, number in numbers.items()
-    }
-    model, _ = preserved(EliminateRedundant(), text, **weights)
-    assert ops(model) == ["Slice"]
-
-
-def test_an_expand_before_a_broadcast_goes() -> None:
-    text = """
-    g (float[1,3] x, float[5,3] z) => (float[5,3] y) {
-        wide = Expand(x, s)
-        y = Add(wide, z)
-    }
-    """
-    model = read(text, s=np.array([5, 3]))
-    apply(EliminateRedundant(), model)
-    assert ops(model) == ["Add"]
-
-
-def test_concats_of_one_axis_become_one() -> None:
-    text = """
-    g (float[2] x, float[2] z) => (float[6] y) {
-        a = Concat<axis = 0>(x, z)
-        y = Concat<axis = 0>(a, x)
-    }
-    """
-    model = read(text)
-    apply(EliminateRedundant(), model)
-    assert [value.name for value in model.graph.node(0).inputs if value] == [
-        "x",
-        "z",
-        "x",
-    ]
 
 
 def test_what_a_copied_output_says_of_shapes_is_used_at_once() -> None:

@@ -12,7 +12,6 @@ from me2e_compress.graph.rewrite import remove_dead
 from me2e_compress.passes.fuse_basic import FuseBasic
 from tests.passes.small import apply, compute, ops, preserved, read
 
-HEAD = '<ir_version: 9, opset_import: ["" : 17]>\n'
 RANDOM = np.random.default_rng(5)
 LAYERS = {
     "MatMul": "s = MatMul(x, w)",
@@ -42,7 +41,7 @@ def integers(*values: int) -> Any:
 
 def fused(body: str, ports: str, feeds: dict[str, Any], **weights: Any) -> list[str]:
     """Fuse in float64; outputs are equal to 1e-9 of the largest."""
-    text = f"{HEAD}g {ports} {{ {body} }}"
+    text = f"g {ports} {{ {body} }}"
     model = read(text, **weights)
     (want,) = compute(model, feeds)
     apply(FuseBasic(), model)
@@ -161,7 +160,7 @@ def test_what_must_stay_is_left_alone_and_the_reason_noted(case: str) -> None:
     weights = {name: each.astype(np.float32) for name, each in given.items()}
     layer = "a = MatMul(x, w) s = Add(a, b) v = Reshape(s, split)"
     model = read(
-        f"{HEAD}g (float[1,5,4] x, float[2] size) => (float[A,B,C] y, float[D,E,F] z)"
+        f"g (float[1,5,4] x, float[2] size) => (float[A,B,C] y, float[D,E,F] z)"
         f" {{ {layer if '(s' in body or '(v' in body else ''} {body} }}",
         split=integers(5, 2, 2), flat=integers(5, 4), **weights,
     )  # fmt: skip
@@ -179,7 +178,7 @@ def test_values_between_a_layer_and_its_factor_take_other_names() -> None:
     """Saved ranges, caches and dumps find a value by its name."""
     body = "a = MatMul(x, w) s = Add(b, a) v = Reshape(s, split) y = Mul(v, c)"
     model = read(
-        f"{HEAD}g (float[2,4] x) => (float[2,3,2] y) {{ {body} }}",
+        f"g (float[2,4] x) => (float[2,3,2] y) {{ {body} }}",
         w=normal(4, 6).astype(np.float32),
         b=normal(6).astype(np.float32),
         split=integers(2, 3, 2),
@@ -209,7 +208,6 @@ def test_a_factor_of_zero_stays_behind_its_layer(
 ) -> None:
     call, kind = FACTORED[layer]
     text = (
-        '<ir_version: 9, opset_import: ["" : 17]>\n'
         f"g ({kind} x) => ({kind} y)"
         f" {{ a = {call} c = {factor}(a, z) y = Reciprocal(c) }}"
     )

@@ -19,8 +19,6 @@ from me2e_compress.passes.fold_constants.knowledge import Knowledge
 from me2e_compress.runtime.session import REFUSALS
 from tests.passes.small import NO_MODULES, apply, compute, ops, read
 
-HEAD = '<ir_version: 9, opset_import: ["" : 17]>\n'
-
 
 def attention(tokens: int) -> ir.Model:
     """A self-attention of learned queries: constant, its result larger than they are.
@@ -35,7 +33,7 @@ def attention(tokens: int) -> ir.Model:
             f"{part} = MatMul(queries, {part}_turned)",
         ]
     body = "\n".join(lines)
-    text = HEAD + (
+    text = (
         f"g (float[{tokens},32] x) => (float[{tokens},32] y, float[{tokens},32] z) {{"
         f" queries = Expand(learned, shape) {body}"
         " k_again = Transpose<perm = [1, 0]>(k) scores = MatMul(q, k_again)"
@@ -83,7 +81,7 @@ def _file_bytes(model: ir.Model) -> int:
 
 def test_slices_of_a_packed_weight_are_folded_beside_what_stays_computed() -> None:
     """Together they are no larger than it, whatever the expansion behind them costs."""
-    text = HEAD + (
+    text = (
         "g (float[90000,32] x) => (float[90000,32] y) {"
         " cut = Slice(packed, zero, half, zero) turned = Transpose<perm = [1, 0]>(cut)"
         " rest = Slice(packed, half, end, zero)"
@@ -105,7 +103,6 @@ def test_slices_of_a_packed_weight_are_folded_beside_what_stays_computed() -> No
 
 
 TABLE = """
-<ir_version: 9, opset_import: ["" : 17]>
 g (float[1000,64] x) => (float[1000,64] y) {
     table = Expand(row, shape)
     shifted = Add(table, one)
@@ -152,7 +149,6 @@ def test_two_runs_give_the_same_bytes() -> None:
 
 def test_a_weight_that_only_dead_nodes_share_is_free_to_fold() -> None:
     text = """
-    <ir_version: 9, opset_import: ["" : 17]>
     g (float[2,3] x) => (float[2,3] y) {
         dead = Add(weight, x)
         negated = Neg(weight)
@@ -166,7 +162,6 @@ def test_a_weight_that_only_dead_nodes_share_is_free_to_fold() -> None:
 
 def graph_with(start: Any, limit: Any, delta: Any, kind: str = "int64") -> Any:
     text = f"""
-    <ir_version: 9, opset_import: ["" : 17]>
     g ({kind}[1] x) => ({kind}[N] y) {{ r = Range(a, b, c) y = Add(x, r) }}
     """
     return read(text, a=start, b=limit, c=delta)

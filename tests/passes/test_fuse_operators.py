@@ -123,8 +123,7 @@ def test_images_are_kept_apart_if_asked() -> None:
     assert "ReduceSum" in ops(model)
 
 
-SUM_OF_HEADS = """<ir_version: 9, opset_import: ["" : 17]>
-g (float[6,4,5,7] image, float[6,9,3,2] grid, float[3] weights)
+SUM_OF_HEADS = """g (float[6,4,5,7] image, float[6,9,3,2] grid, float[3] weights)
   => (float[2,4,9] y) <int64[1] last = {-1}, int64[4] apart = {2, 3, 4, 9},
      int64[1] second = {1}> {
     s = GridSample(image, grid)
@@ -243,8 +242,7 @@ g (float[1,4,5,7] image, float[1,9,3,2] grid, float[3] weights) => (float[1,4,9,
     s = GridSample(image, grid)
     y = Mul(s, weights)
 }"""
-READ_TWICE = """<ir_version: 9, opset_import: ["" : 17]>
-g (float[1,4,5,7] image, float[1,9,3,2] grid, float[3] weights)
+READ_TWICE = """g (float[1,4,5,7] image, float[1,9,3,2] grid, float[3] weights)
   => (float[1,4,9] y, float[1,4,9,3] m) <int64[1] last = {-1}> {
     s = GridSample(image, grid)
     m = Mul(s, weights)
@@ -288,8 +286,7 @@ def test_what_the_body_does_not_agree_with_stays(
     assert len(result.notes) == len(Sizes().levels)
 
 
-TWICE = """<ir_version: 9, opset_import: ["" : 17]>
-g (float[1,4,5,7] image, float[1,9,3,2] grid, float[3] weights)
+TWICE = """g (float[1,4,5,7] image, float[1,9,3,2] grid, float[3] weights)
   => (float[1,4,9] y, float[1,4,9] z) <int64[1] last = {-1}> {
     s = GridSample(image, grid)
     m = Mul(s, weights)

@@ -83,12 +83,6 @@ def test_what_needs_an_extra_says_which() -> None:
 
 
 @pytest.mark.usefixtures("others")
-def test_the_rest_works_beside_broken_entries() -> None:
-    assert SHAPES.parse_all("square,point") == (Square(), Point())
-    assert SHAPES.usable() == ("square", "point")
-
-
-@pytest.mark.usefixtures("others")
 def test_every_entry_is_listed_with_its_trouble() -> None:
     entries = {entry.name: entry for entry in describe(SHAPES)}
 
@@ -96,6 +90,8 @@ def test_every_entry_is_listed_with_its_trouble() -> None:
         *("square", "circle", "point"),
         *("broken", "gone", "lacking", "misnamed", "thawed", "twice"),
     ]
+    assert SHAPES.parse_all("square,point") == (Square(), Point())
+    assert SHAPES.usable() == ("square", "point")
     assert entries["square"].error == ""
     assert "RuntimeError" in entries["broken"].error
     assert entries["circle"].source == "me2e-compress and bad-shapes 1.0"

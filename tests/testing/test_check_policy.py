@@ -27,6 +27,7 @@ from me2e_compress.simulator.world import World
 from me2e_compress.testing import check_policy
 from tests.evaluators.highway.drivers import straight_on
 
+DENSE = np.array([0.1, 0.2])
 AHEAD = np.array([[2.0 * k, 0.0] for k in range(1, 7)])
 
 
@@ -70,18 +71,17 @@ class Wrong:
 
     def plan(self, observation: Observation) -> Answer:
         self.asked += 1
-        if self.way == "steers too far":
-            return PedalsAndWheel(0.0, 1.3, 0.0)
-        if self.way == "steers":
-            return PedalsAndWheel(0.3, 0.0, 0.0)
+        answers: dict[str, Answer] = {
+            "steers too far": PedalsAndWheel(0.0, 1.3, 0.0),
+            "steers": PedalsAndWheel(0.3, 0.0, 0.0),
+            "dense": Trajectory(np.array([[0.8, 0.0], [1.6, 0.0]]), DENSE),
+            "shape": AHEAD[:5],
+            "not finite": np.where(AHEAD > 5, np.inf, AHEAD),
+        }
         if self.way == "no time":
             return Trajectory(AHEAD, np.zeros(6))
-        if self.way == "dense":
-            return Trajectory(np.array([[0.8, 0.0], [1.6, 0.0]]), np.array([0.1, 0.2]))
-        if self.way == "shape":
-            return AHEAD[:5]
-        if self.way == "not finite":
-            return np.where(AHEAD > 5, np.inf, AHEAD)
+        if self.way in answers:
+            return answers[self.way]
         if self.way == "raises":
             raise KeyError("lost")
         if self.way == "steps" and isinstance(observation.world, World):

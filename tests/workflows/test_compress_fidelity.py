@@ -1,5 +1,6 @@
 """``compress`` measures what it did, warns, and names the command that finds why."""
 
+import dataclasses
 import json
 from pathlib import Path
 from typing import Any
@@ -108,6 +109,10 @@ def test_lost_quality_is_named_with_the_command_that_finds_where(
     (cameras / "more.toml").write_text(override)
     assert command(*PAPER, "--overrides", "more.toml") == 0
     assert "below the floor" not in capsys.readouterr().out
+    assert command(*PAPER, "--floor", 0) == 0
+    said = capsys.readouterr().out
+    assert "below the floor" not in said
+    assert "the noisiest output is bev" in said
 
 
 def test_the_report_holds_the_measurement_and_the_command(
@@ -140,15 +145,15 @@ def test_the_report_holds_the_measurement_and_the_command(
     (note,) = [n for n in told["steps"][-1]["notes"] if "calibrated" in n]
     assert note.endswith("calibrated on 6 frames")
 
-
-def test_a_lower_floor_warns_of_nothing(
-    command: Command, cameras: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert command(*PAPER, "--floor", 0) == 0
-
-    said = capsys.readouterr().out
-    assert "below the floor" not in said
-    assert "the noisiest output is bev" in said
+    options = dataclasses.replace(options, measure_frames=0)
+    found = me2e.compress("in.onnx", "out.onnx", frames="frames", options=options)
+    assert found.loss is not None
+    assert found.loss.fidelity is None
+    assert any("on 8 frames" in note for note in found.report.steps[-1].notes)
+    found = me2e.compress("in.onnx", "out.onnx", "exact", "frames")
+    assert found.loss is None
+    assert "every output is the same" in found.lines()[0]
+    assert not found.alerts()
 
 
 def test_one_frame_is_calibrated_and_measured_on_and_that_is_said(
@@ -184,18 +189,6 @@ def test_an_output_that_int8_freezes_is_an_alert(
 
     said = capsys.readouterr().out
     assert "\nplan is constant: it moves 0.00% as far as before" in said
-
-
-def test_without_measuring_all_frames_are_calibrated_on(cameras: Path) -> None:
-    options = me2e.CompressOptions(
-        scheme="full", module_map="map.toml", verify_frames=0, measure_frames=0
-    )
-
-    found = me2e.compress("in.onnx", "out.onnx", frames="frames", options=options)
-
-    assert found.loss is not None
-    assert found.loss.fidelity is None
-    assert any("on 8 frames" in note for note in found.report.steps[-1].notes)
 
 
 def test_state_is_fed_forward_on_held_out_frames(tmp_path: Path) -> None:
@@ -260,11 +253,3 @@ def test_an_output_that_is_no_longer_finite_is_not_overlooked(tmp_path: Path) ->
         for each in found.alerts()
     )
     assert found.status == "warning"
-
-
-def test_an_exact_recipe_is_judged_by_its_verification(cameras: Path) -> None:
-    found = me2e.compress("in.onnx", "out.onnx", "exact", "frames")
-
-    assert found.loss is None
-    assert "every output is the same" in found.lines()[0]
-    assert not found.alerts()

@@ -27,33 +27,21 @@ def test_the_metadata_decides() -> None:
     ("scopes", "name"),
     [
         (
-            [
-                "img_backbone",
-                "img_neck",
-                "pts_bbox_head/transformer/encoder",
-                "pts_bbox_head/map_cls_branches.0",
-                "pts_bbox_head/ego_map_decoder",
-            ],
+            "img_backbone img_neck pts_bbox_head/transformer/encoder"
+            " pts_bbox_head/map_cls_branches.0 pts_bbox_head/ego_map_decoder",
             "vad",
         ),
         (
-            [
-                "img_backbone",
-                "img_neck",
-                "encoder/layers.0",
-                "decoder/layers.0",
-                "seg_head",
-                "motion_head",
-                "planning_head",
-            ],
+            "img_backbone img_neck encoder/layers.0 decoder/layers.0 seg_head"
+            " motion_head planning_head",
             "uniad",
         ),
-        (["perception", "measurements", "join_traj", "wp_att"], "tcp"),
-        (["backbone/stem", "neck", "bev_encoder", "map", "planner"], "highway"),
+        ("perception measurements join_traj wp_att", "tcp"),
+        ("backbone/stem neck bev_encoder map planner", "highway"),
     ],
 )
-def test_otherwise_the_names_do(scopes: list[str], name: str) -> None:
-    assert detect(chain(*scopes)).name == name
+def test_otherwise_the_names_do(scopes: str, name: str) -> None:
+    assert detect(chain(*scopes.split())).name == name
 
 
 def test_an_unknown_stack_falls_back_on_names() -> None:

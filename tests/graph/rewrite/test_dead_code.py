@@ -15,22 +15,20 @@ from me2e_compress.passes.fold_constants import FoldConstants
 from me2e_compress.passes.fuse_basic import FuseBasic
 from tests.passes.small import apply, ops, read
 
-HEAD = '<ir_version: 9, opset_import: ["" : 17]>\n'
-
-NESTED = f"""{HEAD}
-g (float[2] x, bool seen) => (float[2] y) <float[2] w = {{1, 2}}> {{
+NESTED = """
+g (float[2] x, bool seen) => (float[2] y) <float[2] w = {1, 2}> {
     y = Relu(x)
     a = Neg(x)
     b = Add(a, w)
     dead = If (seen) <
-        then_branch = t () => (float[2] t) {{
+        then_branch = t () => (float[2] t) {
             c = Abs(b)
-            t = If (seen) <then_branch = u () => (float[2] u) {{ u = Mul(a, c) }},
-                           else_branch = v () => (float[2] v) {{ v = Neg(w) }}>
-        }},
-        else_branch = e () => (float[2] e) {{ e = Neg(b) }}
+            t = If (seen) <then_branch = u () => (float[2] u) { u = Mul(a, c) },
+                           else_branch = v () => (float[2] v) { v = Neg(w) }>
+        },
+        else_branch = e () => (float[2] e) { e = Neg(b) }
     >
-}}
+}
 """
 
 
@@ -52,26 +50,26 @@ def test_a_node_that_is_read_is_not_removed() -> None:
 
 def test_what_only_the_other_branch_read_goes_with_it() -> None:
     model = read(
-        f"""{HEAD}
-        g (float[2] x) => (float[2] y) <bool yes = {{1}}> {{
+        """
+        g (float[2] x) => (float[2] y) <bool yes = {1}> {
             a = Neg(x)
-            y = If (yes) <then_branch = t () => (float[2] t) {{ t = Relu(x) }},
-                          else_branch = e () => (float[2] e) {{ e = Abs(a) }}>
-        }}"""
+            y = If (yes) <then_branch = t () => (float[2] t) { t = Relu(x) },
+                          else_branch = e () => (float[2] e) { e = Abs(a) }>
+        }"""
     )
 
     assert ops(apply(FoldConstants(), model).model) == ["Relu"]
 
 
 def test_a_branch_in_place_of_its_if_knows_its_shapes() -> None:
-    text = f"""{HEAD}
-    g (float[4] x) => (float[2,2] y) <bool yes = {{1}}, int64[2] two = {{2, 2}}> {{
+    text = """
+    g (float[4] x) => (float[2,2] y) <bool yes = {1}, int64[2] two = {2, 2}> {
         a = Reshape(x, two)
-        y = If (yes) <then_branch = t () => (float[2,2] t) {{
+        y = If (yes) <then_branch = t () => (float[2,2] t) {
                           b = Reshape(a, two) t = Relu(b)
-                      }},
-                      else_branch = e () => (float[2,2] e) {{ e = Neg(a) }}>
-    }}"""
+                      },
+                      else_branch = e () => (float[2,2] e) { e = Neg(a) }>
+    }"""
 
     taken = apply(FoldConstants(), read(text)).model
     assert ops(apply(EliminateRedundant(), taken).model) == ["Reshape", "Relu"]
@@ -90,7 +88,7 @@ DROP = Fusion(
 
 def test_a_dead_reader_hides_no_pattern() -> None:
     text = "g (float[2] x) => (float[2] y) { a = Relu(x) y = Relu(a) dead = Neg(a) }"
-    model = read(HEAD + text)
+    model = read(text)
 
     found = fuse(model, [ONCE], by="test")
 
@@ -101,14 +99,14 @@ def test_a_dead_reader_hides_no_pattern() -> None:
 
 def test_what_a_fusion_in_a_body_frees_is_fused_too() -> None:
     model = read(
-        f"""{HEAD}
-        g (float[2] x, bool seen) => (float[2] y) {{
+        """
+        g (float[2] x, bool seen) => (float[2] y) {
             a = Relu(x)
             b = Relu(a)
             n = Neg(a)
-            y = If (seen) <then_branch = t () => (float[2] t) {{ t = Mul(b, n) }},
-                           else_branch = e () => (float[2] e) {{ e = Neg(b) }}>
-        }}"""
+            y = If (seen) <then_branch = t () => (float[2] t) { t = Mul(b, n) },
+                           else_branch = e () => (float[2] e) { e = Neg(b) }>
+        }"""
     )
 
     found = fuse(model, [ONCE, DROP], by="test")
@@ -148,7 +146,7 @@ def models(draw: st.DrawFn) -> ir.Model:
     weight = np.array([[1, 2], [3, 4]], np.float32)
     text = drawn_nodes(draw, ["x"], "y", 0)
     text = f"g (float[2,2] x, bool seen) => (float[2,2] y) {{\n{text}}}"
-    return read(HEAD + text, w=weight, yes=np.array(True))
+    return read(text, w=weight, yes=np.array(True))
 
 
 @pytest.mark.parametrize("current", [EliminateRedundant(), FuseBasic()])

@@ -82,7 +82,6 @@ def test_what_others_read_is_not_inner_unless_it_is_shared() -> None:
 
 def test_what_a_body_reads_is_made_elsewhere() -> None:
     text = """
-    <ir_version: 9, opset_import: ["" : 17]>
     g (float[2] x, bool seen) => (float[2] y) {
         a = Relu(x)
         y = If (seen) <then_branch = then () => (float[2] t) { t = Relu(a) },
@@ -226,7 +225,6 @@ def test_a_fusion_may_complete_another() -> None:
 
 def test_bodies_are_fused_too() -> None:
     text = """
-    <ir_version: 9, opset_import: ["" : 17]>
     g (float[2] x, bool seen) => (float[2] y) {
         y = If (seen) <
             then_branch = then () => (float[2] t) { a = Relu(x) t = Relu(a) },
