@@ -12,7 +12,6 @@ from me2e_compress.calibration.dataset import CalibrationSet, PixelInput
 from me2e_compress.calibration.recording import LOGS, Begin, DriveLog, LogRequest
 from me2e_compress.driving.shipped_adapters import adapter_file
 from me2e_compress.runtime.frames import Array, Frame
-from me2e_compress.testing import check_form
 from tests.command import Cli
 from tests.installed import install
 from tests.nets import save_text
@@ -69,10 +68,6 @@ def test_a_log_is_told_what_is_asked_for(cli: Cli, tmp_path: Path) -> None:
     assert Rides.requests[-1] == LogRequest(
         Path("m.onnx"), 2, 1, adapter_file(Path("vad-tiny"))
     )
-
-
-def test_the_text_of_a_log_makes_it_again() -> None:
-    check_form(Rides(Path("log")), LOGS)
 
 
 @pytest.mark.parametrize(

@@ -69,14 +69,6 @@ def test_the_data_file_of_the_model_itself_is_not_overwritten(tmp_path: Path) ->
         graph.save(model, tmp_path / "m.onnx")
 
 
-def test_initializers_listed_as_inputs_stop_being_inputs(tmp_path: Path) -> None:
-    model = weighted()
-    model.graph.inputs.append(model.graph.initializers["w"])
-    graph.save(model, tmp_path / "m.onnx")
-    inputs, _ = graph.interface(graph.load(tmp_path / "m.onnx"))
-    assert [port.name for port in inputs] == ["x"]
-
-
 CUT = onnx.helper.make_model(
     onnx.helper.make_graph([], "g", [], []), producer_name="x" * 99
 ).SerializeToString()[:50]

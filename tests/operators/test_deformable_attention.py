@@ -249,24 +249,20 @@ def test_weights_of_no_softmax_have_no_raw_form() -> None:
         ("trt.plugins", "2", "tensorrt-v2"),
         ("anything", "1", "tensorrt"),
         ("me2e.plugin", "1", "tensorrt"),
+        (None, "", "dl4agx-uniad"),  # the type of the sizes tells the patched library
     ],
 )
 def test_the_domain_and_the_version_tell_the_dialect(
-    domain: str, version: str, name: str
+    domain: str | None, version: str, name: str
 ) -> None:
-    node = node_of("tensorrt")
-    node.domain = domain
-    node.attributes["plugin_version"] = ir.AttrString("plugin_version", version)
+    node = node_of("derryhub", spatial_shapes=np.array([[2, 3], [1, 2]]))
+    if domain is not None:
+        node = node_of("tensorrt")
+        node.domain = domain
+        node.attributes["plugin_version"] = ir.AttrString("plugin_version", version)
     found = find(node)
     assert found is not None
     assert found[1].name == name
-
-
-def test_sizes_tell_the_patched_library_and_a_standard_operator_is_none() -> None:
-    node = node_of("derryhub", spatial_shapes=np.array([[2, 3], [1, 2]]))
-    found = find(node)
-    assert found is not None
-    assert found[1].name == "dl4agx-uniad"
     assert find(ir.node("GridSample", [])) is None
 
 

@@ -118,9 +118,19 @@ def test_schemes_and_modules_choose(
     assert chosen.run(conv_attention(), context).changes == changes
 
 
-def test_without_frames_there_is_no_calibration() -> None:
+def test_frames_and_graphs_that_do_not_fit_are_refused(
+    context: Context, tmp_path: Path
+) -> None:
+    bare, model = Context(MODULES), conv_attention()
     with pytest.raises(FramesError, match=r"needs recorded frames .* never made up"):
-        QuantizeInt8(rules="paper").run(conv_attention(), Context(MODULES))
+        QuantizeInt8(rules="paper").run(model, bare)
+    other = CalibrationSet(record(tmp_path, [{"lidar": np.zeros(3, np.float32)}]))
+    with pytest.raises(FramesError, match=r"input image is missing.*lidar"):
+        QuantizeInt8(rules="paper").run(model, Context(MODULES, other))
+    with pytest.raises(PreconditionError, match="no quantized activation"):
+        LowerInt8().run(model, context)
+    with pytest.raises(FramesError, match=r"lower-int8 needs recorded .* never made"):
+        LowerInt8().run(PAPER.run(model, context).model, bare)
 
 
 def test_what_is_quantized_while_it_runs_is_not_lowered(context: Context) -> None:
@@ -227,13 +237,6 @@ def test_ranges_of_another_graph_are_refused(
 
     with pytest.raises(FramesError, match=r"r\.json: stale: of graph"):
         QuantizeInt8(rules="paper", ranges=path).run(conv_attention(), Context(MODULES))
-
-
-def test_frames_of_another_model_are_refused(tmp_path: Path) -> None:
-    other = CalibrationSet(record(tmp_path, [{"lidar": np.zeros(3, np.float32)}]))
-
-    with pytest.raises(FramesError, match=r"input image is missing.*lidar"):
-        QuantizeInt8(rules="paper").run(conv_attention(), Context(MODULES, other))
 
 
 def test_what_the_target_keeps_in_float_is_not_counted_as_int8(
@@ -357,18 +360,6 @@ def test_saved_ranges_lower_to_the_same_graph_without_frames(
     read = LowerInt8(ranges=path).run(placed, Context(MODULES)).model
 
     assert graph.digest(read) == graph.digest(measured)
-
-
-def test_without_frames_nothing_is_lowered(context: Context) -> None:
-    placed = PAPER.run(conv_attention(), context).model
-
-    with pytest.raises(FramesError, match=r"lower-int8 needs recorded .* never made"):
-        LowerInt8().run(placed, Context(MODULES))
-
-
-def test_a_float_graph_is_refused(context: Context) -> None:
-    with pytest.raises(PreconditionError, match="no quantized activation"):
-        LowerInt8().run(conv_attention(), context)
 
 
 BATCHED = """

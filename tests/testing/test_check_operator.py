@@ -26,15 +26,6 @@ def matrices(dialect: Dialect, random: np.random.Generator) -> DrawnCall:
     return DrawnCall({"matrix": matrix.astype(np.float32)})
 
 
-@pytest.mark.parametrize("name", ["select-and-pad", "multi-head-attention"])
-def test_our_operators_hold(name: str) -> None:
-    check_operator(OPERATORS.build(name, {}), calls=2)
-
-
-def test_inputs_may_be_given() -> None:
-    check_operator(OPERATORS.build("inverse", {}), matrices, calls=1)
-
-
 def _plugin(name: str, op_type: str, domain: str) -> Dialect:
     gain = (Attribute("gain", 2),)
     return Dialect(name, op_type, domain, (Operand("x"),), "test", gain)
@@ -65,8 +56,11 @@ class Gain(Operator):
         return None
 
 
-def test_an_operator_that_is_not_installed_holds_too() -> None:
-    check_operator(Gain(), calls=1)
+def test_what_is_right_holds() -> None:
+    for name in ("select-and-pad", "multi-head-attention"):
+        check_operator(OPERATORS.build(name, {}), calls=2)
+    check_operator(OPERATORS.build("inverse", {}), matrices, calls=1)
+    check_operator(Gain(), calls=1)  # which is not installed
 
 
 @dataclasses.dataclass(frozen=True)

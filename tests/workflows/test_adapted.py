@@ -105,7 +105,7 @@ def test_compare_knows_the_plan_and_the_state(
     assert shown.recurrent == {"memory": "remembered"}
 
 
-def test_calibrate_and_compress_feed_the_state_back(
+def test_all_that_run_a_graph_feed_the_state_back(
     mine: Path, frames: Path, adapter: Path, tmp_path: Path
 ) -> None:
     ranges, small = tmp_path / "ranges.json", tmp_path / "small.onnx"
@@ -116,27 +116,13 @@ def test_calibrate_and_compress_feed_the_state_back(
     found = compare(small, small, frames).fidelity  # it says so itself now
     assert found.plan_output == "waypoints"
     assert json.loads(ranges.read_text())["frames"] == 4
-
-
-def test_profile_feeds_the_state_back(
-    mine: Path, frames: Path, adapter: Path, tmp_path: Path
-) -> None:
-    options = ProfileOptions(by_module=True, adapter=adapter)
-
-    found = profile(mine, frames, tmp_path / "trace.json", options)
-
-    assert len(found.trace.samples_us) == 4
-    assert found.trace.modules_us
-
-
-def test_sensitivity_is_told_in_metres_without_a_drive(
-    mine: Path, frames: Path, adapter: Path, tmp_path: Path
-) -> None:
+    by_module = ProfileOptions(by_module=True, adapter=adapter)
+    timed = profile(mine, frames, tmp_path / "trace.json", by_module)
+    assert len(timed.trace.samples_us) == 4
+    assert timed.trace.modules_us
     options = SensitivityOptions(adapter=adapter, node_trials=0)
-
-    found = measure_sensitivity(mine, frames, tmp_path / "int8.toml", options)
-
-    assert found.found.together.unit == "m"
+    cost = measure_sensitivity(mine, frames, tmp_path / "int8.toml", options)
+    assert cost.found.together.unit == "m"  # without a drive
 
 
 @pytest.mark.parametrize(

@@ -26,12 +26,6 @@ def test_a_result_is_one_line() -> None:
     assert repr(Found()) == "<Found: 2 <names>>"
 
 
-def test_markdown_keeps_its_columns() -> None:
-    (made,) = Found(("a|b",)).tables()
-
-    assert "| a\\|b | 3 |" in made.markdown()
-
-
 NASTY = "a\x1b[31m[red]|<b>\n\u202eb\udcff"
 
 
