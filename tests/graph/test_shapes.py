@@ -38,7 +38,5 @@ def test_shape_arithmetic_behind_an_output_with_a_symbol_is_folded() -> None:
     model = ir.from_onnx_text(CHAIN.replace("BATCH", "1"))
     report = PassManager(recipe.load("exact")).run(model, Context(ModuleMap.whole()))
     assert [node.op_type for node in report.model.graph] == ["Add", "Reshape"]
-    assert [str(value.shape) for value in report.model.graph.outputs] == [
-        "[1,6,8]",
-        "[1,48]",
-    ]
+    shapes = [str(value.shape) for value in report.model.graph.outputs]
+    assert shapes == ["[1,6,8]", "[1,48]"]

@@ -107,9 +107,5 @@ def test_ours_holds(tmp_path: Path) -> None:
     )
 
     assert episode.route == "exit"
-
-
-def test_a_third_one_holds(tmp_path: Path) -> None:
-    assert (
-        len(check_evaluator(Lanes(), OnnxDriver(straight_on(tmp_path / "m.onnx")))) == 4
-    )
+    driver = OnnxDriver(straight_on(tmp_path / "m.onnx"))
+    assert len(check_evaluator(Lanes(), driver)) == 4

@@ -122,14 +122,11 @@ def test_what_does_not_fit(tmp_path: Path, old: str, new: str, message: str) -> 
     assert message.replace("\\", "") in problem
 
 
-def test_a_policy_that_is_no_graph_is_opened() -> None:
-    assert not check_model("blind:6").problems
-    with pytest.raises(EvaluationError, match="No module named 'nowhere_at_all'"):
-        check_model("nowhere_at_all:make")
-
-
-def test_no_such_file_or_adapter(tmp_path: Path) -> None:
+def test_what_is_no_graph_is_opened_or_named(tmp_path: Path) -> None:
     with pytest.raises(EvaluationError, match="no such file"):
         check_model(tmp_path / "no.onnx")
     with pytest.raises(EvaluationError, match="No such file"):
         check_model(tcp_like(tmp_path / "m.onnx"), tmp_path / "no.toml")
+    assert not check_model("blind:6").problems
+    with pytest.raises(EvaluationError, match="No module named 'nowhere_at_all'"):
+        check_model("nowhere_at_all:make")

@@ -57,6 +57,8 @@ def test_on_a_tie_the_one_written_out_wins_then_the_earlier() -> None:
 
 
 def test_names_come_in_the_order_of_the_file(read: ModuleMap) -> None:
+    assert read.match("head") == "head"
+    assert read == ModuleMap.parse(TEXT, "mine")
     assert read.names() == ("head", "planner", "backbone")
     assert read.names("feature") == ("backbone",)
     assert read.names("prediction") == ("head", "planner")
@@ -69,11 +71,6 @@ def test_a_module_is_found_by_name(read: ModuleMap) -> None:
     )
     with pytest.raises(ModuleMapError, match="occ: no such module in map mine; it has"):
         read.module("occ")
-
-
-def test_equal_files_are_equal_maps(read: ModuleMap) -> None:
-    read.match("head")
-    assert read == ModuleMap.parse(TEXT, "mine")
 
 
 def test_a_file_is_named_after_itself(tmp_path: Path) -> None:
@@ -116,13 +113,10 @@ def test_a_missing_file_and_an_unknown_preset_are_told_apart(tmp_path: Path) -> 
 
 
 def test_every_preset_reads() -> None:
+    assert ModuleMap.load("whole") == ModuleMap.whole()
     assert presets() == ("highway", "tcp", "uniad", "vad")
     for name in presets():
         read = ModuleMap.load(name)
         assert read.name == name
         assert read.names("feature")[0] == "backbone"
         assert read.required() == []
-
-
-def test_a_graph_of_no_stack_has_a_map_by_name_too() -> None:
-    assert ModuleMap.load("whole") == ModuleMap.whole()
