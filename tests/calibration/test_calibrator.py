@@ -158,10 +158,6 @@ def test_stale_ranges_are_refused(
         )
 
 
-def test_fresh_ranges_are_taken(ranges: Ranges) -> None:
-    ranges.check(model=graph.digest(conv_attention()), tensors=("a",), method="max-min")
-
-
 @pytest.mark.parametrize("content", ["[", "{}", '{"tensors": 1}'])
 def test_a_file_that_holds_no_ranges_is_refused(tmp_path: Path, content: str) -> None:
     path = tmp_path / "r.json"

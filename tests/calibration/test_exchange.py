@@ -57,15 +57,6 @@ def test_a_cache_that_came_in_goes_out_as_it_was(tmp_path: Path, method: str) ->
     assert (tmp_path / "again").read_bytes() == (tmp_path / "c").read_bytes()
 
 
-def test_what_came_from_a_table_is_of_extremes(tmp_path: Path) -> None:
-    write_onnxruntime_table(ranges(), tmp_path)
-    found = read_cache(tmp_path / "calibration.cache")
-
-    write_tensorrt_cache(found, tmp_path / "c")
-
-    assert "-MinMaxCalibration\n" in (tmp_path / "c").read_text()
-
-
 @settings(max_examples=scaled(20))
 @given(reach=st.floats(1e-30, 1e30))
 def test_scales_survive_the_way_through_a_cache(

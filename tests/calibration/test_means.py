@@ -92,14 +92,6 @@ def test_the_type_stays(tmp_path: Path) -> None:
     assert means["half"].tolist() == [[1.5, 2.0, 2.5, 3.0]]
 
 
-def test_the_graph_stays_as_it_is() -> None:
-    model = kinds()
-    before = graph.digest(model)
-    token_means(model, rows([1, 2, 3, 4]), ["half"])
-
-    assert graph.digest(model) == before
-
-
 def test_nothing_asked_nothing_run() -> None:
     assert token_means(kinds(), rows(), []) == {}
 

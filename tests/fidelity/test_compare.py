@@ -8,7 +8,6 @@ import pytest
 from me2e_compress import graph
 from me2e_compress.errors import EvaluationError, GraphError
 from me2e_compress.fidelity.compare import (
-    Displacement,
     Fidelity,
     OutputFidelity,
     Tally,
@@ -226,10 +225,3 @@ def test_outputs_that_went_are_listed_and_a_lost_plan_has_a_reason() -> None:
     assert found.missing == ("modes",)
     assert found.plan is None
     assert found.plan_reason == "the second model has no output modes"
-
-
-def test_displacement_of_equal_plans_is_zero_not_unknown() -> None:
-    still = planner(0, output="modes", default_mode=0)
-    found = compare(still, still, [modes()])
-
-    assert found.plan == Displacement(0.0, 0.0)

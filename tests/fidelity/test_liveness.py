@@ -183,14 +183,6 @@ def test_compare_exits_with_1_if_an_output_is_dead(
     assert ("Liveness" in said.out) == bool(code)
 
 
-def test_compare_finds_a_graph_alive_beside_itself(
-    command: Command, files: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert command("compare", "a.onnx", "a.onnx", "frames") == 0
-
-    assert "every output is alive" in capsys.readouterr().out
-
-
 @pytest.mark.parametrize("share", ["-0.1", "1.5", "nan", "inf"])
 def test_a_share_beyond_0_to_1_is_refused(
     share: str, command: Command, files: Path, capsys: pytest.CaptureFixture[str]

@@ -157,13 +157,6 @@ def test_a_scored_plan_is_compared_by_the_candidate_that_is_chosen() -> None:
     assert found.plan.max_m == pytest.approx(math.sqrt(2.0))
 
 
-def test_scores_and_a_command_cannot_both_choose() -> None:
-    text = json.dumps({"output": "plan", "scores": "s", "command_input": "c"})
-
-    with pytest.raises(GraphError, match="not a plan adapter"):
-        PlanAdapter.of({"me2e.plan": text}, ["plan", "s"])
-
-
 def test_scores_that_are_not_there_are_named() -> None:
     text = json.dumps({"output": "plan", "scores": "votes"})
 

@@ -212,19 +212,6 @@ def test_what_is_wrong_is_one_line(
     assert "\n" not in str(caught.value)
 
 
-def test_no_routes_at_all(models: Path) -> None:
-    (models / "none.json").write_text("[]")
-    path = write(models, GOOD.replace("routes = 3", 'routes = "none.json"'))
-
-    with pytest.raises(StudyError, match="no route to drive"):
-        load_study(path)
-
-
-def test_no_such_file(tmp_path: Path) -> None:
-    with pytest.raises(StudyError, match=r"^no study .*none\.toml: no such file"):
-        load_study(tmp_path / "none.toml")
-
-
 @pytest.mark.parametrize(
     ("name", "message"),
     [

@@ -63,15 +63,6 @@ def without_latency(record: dict[str, Any]) -> dict[str, Any]:
     return record
 
 
-def test_every_variant_under_every_condition(found: StudyResult) -> None:
-    assert [(each.variant, each.condition) for each in found.drives] == [
-        (variant, condition)
-        for condition in ("ideal", "slow")
-        for variant in ("blind", "slow", "again", "fast")
-    ]
-    assert all(len(each.routes) == 2 for each in found.drives)
-
-
 def test_the_scores_are_those_of_the_results(found: StudyResult) -> None:
     folder = found.contrasts[0].picture.parents[1] / "results" / "fast.slow"
     episodes = tuple(ResultsFolder.open(folder).episodes().values())
@@ -175,15 +166,6 @@ def test_a_study_is_silent_and_its_file_is_taken_as_it_is(
 
     assert capfd.readouterr() == ("", "")
     assert found.study == load_study(toml)
-
-
-def test_a_study_shows_itself(found: StudyResult) -> None:
-    titles = [each.title for each in found.tables()]
-
-    assert any("Scoreboard, ideal: decisions cost no time" in t for t in titles)
-    assert repr(found) == (
-        "<StudyResult: Slow & <fast>: 4 variants under 2 conditions on 2 of 220 routes>"
-    )
 
 
 def test_studies_share_what_they_have_in_common(make: Make, tmp_path: Path) -> None:

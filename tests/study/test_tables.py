@@ -3,7 +3,6 @@ import dataclasses
 import pytest
 
 from me2e_compress.display import Cell, Table
-from me2e_compress.metrics.measure import Estimate, Measure
 from me2e_compress.study import StudyResult
 from me2e_compress.study.cells import (
     INFINITE,
@@ -144,12 +143,6 @@ def test_markdown() -> None:
 )
 def test_numbers(value: float, form: str, text: str) -> None:
     assert number(value, form) == text
-
-
-def test_what_was_not_measured_is_never_zero() -> None:
-    cell = estimate_cell(Estimate(Measure(None, "%", "no route"), None, None, 0))
-
-    assert cell == Cell(MISSING, reason="no route")
 
 
 def test_near_misses_of_every_drive(found: StudyResult) -> None:
