@@ -1,7 +1,7 @@
 import dataclasses
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import pytest
@@ -10,10 +10,13 @@ from onnxruntime.quantization import calibrate as peer
 from me2e_compress import graph
 from me2e_compress.calibration.calibrator import Calibrator
 from me2e_compress.calibration.dataset import CalibrationSet
+from me2e_compress.calibration.observers import OBSERVERS
 from me2e_compress.calibration.ranges import Ranges
 from me2e_compress.calibration.sample import FrameSubset
+from me2e_compress.calibration.statistics import Statistics
 from me2e_compress.errors import FramesError, GraphError, RecipeError
-from me2e_compress.runtime.frames import Array
+from me2e_compress.runtime.frames import Array, Frame
+from me2e_compress.runtime.providers import CPU, CpuProvider, Provider
 from me2e_compress.runtime.session import Session, replay
 from tests.frames import record
 from tests.nets import conv_attention, image, parsed
@@ -172,3 +175,161 @@ def test_a_file_that_holds_no_ranges_is_refused(tmp_path: Path, content: str) ->
 def test_no_frames_are_an_error(frames: CalibrationSet) -> None:
     with pytest.raises(FramesError, match="no frames to calibrate on"):
         Calibrator(threads=1).run(conv_attention(), ["a"], FrameSubset(frames, ()))
+
+
+FOUR = ("image", "a", "seen", "mixed")
+
+
+class Killed(CalibrationSet):
+    """A recording whose reader dies at the n-th frame it reads."""
+
+    def __init__(self, folder: Path, after: int) -> None:
+        super().__init__(folder)
+        self.left = after
+
+    def __getitem__(self, index: int) -> Frame:
+        if not self.left:
+            raise KeyboardInterrupt
+        self.left -= 1
+        return super().__getitem__(index)
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    return record(tmp_path / "frames", [image(seed) for seed in range(6)], (0, 4))
+
+
+@pytest.mark.parametrize("after", [1, 4, 6, 7, 11])
+def test_a_killed_calibration_goes_on_where_it_was(
+    folder: Path, tmp_path: Path, after: int
+) -> None:
+    path = tmp_path / "standing.npz"
+    calibrator = Calibrator("mse", threads=1, checkpoint=path, every=2)
+    model = conv_attention()
+    with pytest.raises(KeyboardInterrupt):
+        calibrator.collect(model, FOUR, Killed(folder, after))
+
+    rest = Killed(folder, 12 - after + after % 2)
+    seen = calibrator.collect(model, FOUR, rest)
+
+    whole = Calibrator("mse", threads=1).collect(model, FOUR, CalibrationSet(folder))
+    np.testing.assert_array_equal(seen.measured, whole.measured)
+    np.testing.assert_array_equal(seen.checksums, whole.checksums)
+    np.testing.assert_array_equal(seen.counted(), whole.counted())
+    assert rest.left == 0
+    assert not path.exists()
+
+
+@dataclasses.dataclass(frozen=True)
+class Elsewhere(CpuProvider):
+    """The same kernels under another name."""
+
+    name: ClassVar[str] = "elsewhere"
+
+
+@dataclasses.dataclass(frozen=True)
+class Other:
+    """What a later calibration differs in from the one that was killed."""
+
+    tensors: tuple[str, ...] = FOUR
+    method: str = "mse"
+    optimize: bool = True
+    provider: Provider = CPU
+    model: int = 0
+    first_image: int = 0
+    last_frames: int = 6
+
+
+@pytest.mark.parametrize(
+    ("other", "message"),
+    [
+        (Other(tensors=FOUR[:1]), "another list of tensors"),
+        (Other(method="max-min"), "another kind of statistics"),
+        (Other(optimize=False), "another optimization level"),
+        (Other(provider=Elsewhere()), "another provider"),
+        (Other(model=1), "another model"),
+        (Other(first_image=1), "another recording"),
+        (Other(last_frames=2), "another choice of frames"),
+    ],
+)
+def test_the_checkpoint_of_another_calibration_is_refused(
+    folder: Path, tmp_path: Path, other: Other, message: str
+) -> None:
+    path = tmp_path / "standing.npz"
+    with pytest.raises(KeyboardInterrupt):
+        Calibrator("mse", threads=1, checkpoint=path, every=1).collect(
+            conv_attention(), FOUR, Killed(folder, 2)
+        )
+    images = [image(seed + other.first_image) for seed in range(6)]
+    whole = CalibrationSet(record(tmp_path / "other", images, (0, 4)))
+    frames = FrameSubset(whole, tuple(range(6))[-other.last_frames :])
+
+    with pytest.raises(FramesError, match=f"stale: a checkpoint of {message};"):
+        Calibrator(
+            other.method, threads=1, optimize=other.optimize, checkpoint=path,
+            provider=other.provider,
+        ).collect(conv_attention(other.model), other.tensors, frames)  # fmt: skip
+
+
+def test_a_file_that_is_no_checkpoint_is_refused(folder: Path, tmp_path: Path) -> None:
+    path = tmp_path / "standing.npz"
+    path.write_bytes(b"PK")
+
+    with pytest.raises(FramesError, match="not a checkpoint"):
+        Calibrator(threads=1, checkpoint=path).collect(
+            conv_attention(), FOUR, CalibrationSet(folder)
+        )
+
+
+# A tensor that has no element on some frames, as what is detected often has.
+
+
+FOUND = """
+found (float[8] scores) => (float[N] kept)
+<float none = {0.0}> {
+    sure = Greater(scores, none)
+    kept = Compress(scores, sure)
+}
+"""
+NOTHING = -np.ones(8, np.float32)
+
+
+def frames_of(folder: Path, *scores: np.ndarray) -> CalibrationSet:
+    frames = [{"scores": each} for each in scores]
+    return CalibrationSet(record(folder, frames, (0,)))
+
+
+@pytest.mark.parametrize("method", OBSERVERS.names())
+def test_frames_without_elements_change_no_range(method: str, tmp_path: Path) -> None:
+    random = np.random.default_rng(11)
+    some = [random.uniform(-1, 1, 8).astype(np.float32) for _ in range(3)]
+    model = parsed(FOUND)
+    calibrator = Calibrator(method, threads=1)
+    whole = calibrator.run(model, ["kept"], frames_of(tmp_path / "a", *some))
+
+    apart = frames_of(tmp_path / "b", NOTHING, some[0], NOTHING, *some[1:])
+    found = calibrator.run(model, ["kept"], apart)
+
+    assert found.tensors["kept"] == whole.tensors["kept"]
+
+
+def test_what_never_has_an_element_is_dead(tmp_path: Path) -> None:
+    model = parsed(FOUND)
+    frames = frames_of(tmp_path / "f", NOTHING, NOTHING)
+
+    found = Calibrator(threads=1).run(model, ["scores", "kept"], frames)
+
+    assert found.tensors["kept"] == (0.0, 0.0)
+    assert found.dead == ("kept",)
+
+
+def test_gaps_are_filled_from_before_or_else_from_behind() -> None:
+    gap = (np.inf, -np.inf, 0.0)
+    measured = np.array([[gap], [(1, 2, 3)], [gap], [gap], [(4, 5, 6)]], np.float32)
+
+    seen = Statistics("", "", ("t",), (0, 1, 2, 3, 4), measured)
+
+    assert seen.lows[:, 0].tolist() == [1, 1, 1, 1, 4]
+    assert seen.highs[:, 0].tolist() == [2, 2, 2, 2, 5]
+    assert seen.mean_squares[:, 0].tolist() == [3, 3, 3, 3, 6]
+    assert seen.reach.tolist() == [5]

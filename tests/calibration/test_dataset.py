@@ -1,12 +1,16 @@
+import zipfile
 from pathlib import Path
 
 import numpy as np
 import onnx_ir as ir
 import pytest
 
-from me2e_compress.calibration.dataset import CalibrationSet, synthetic
+from me2e_compress.calibration import dataset
+from me2e_compress.calibration.dataset import CalibrationSet, load_arrays, synthetic
+from me2e_compress.calibration.sample import draw, hold_out
 from me2e_compress.errors import FramesError, PreconditionError
 from tests.frames import record
+from tests.fuzz.frames import archive, broken_frames, member
 from tests.nets import parsed
 
 MODEL = """
@@ -139,3 +143,115 @@ def test_open_shapes_have_no_synthetic_frames() -> None:
 
     with pytest.raises(PreconditionError, match=r"input x is .*\[n,2\].*give frames"):
         synthetic(model, seed=0, count=1)
+
+
+# Sizes are looked at before anything is read.
+
+
+@pytest.fixture
+def unread(monkeypatch: pytest.MonkeyPatch) -> None:
+    def read(*_: object, **__: object) -> None:
+        raise AssertionError("an array was read")
+
+    monkeypatch.setattr(np, "load", read)
+
+
+@pytest.mark.usefixtures("unread")
+def test_a_zip_bomb_is_not_unpacked(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(dataset, "LARGEST_BYTES", 1_000_000)
+    bomb = archive({"x.npy": member("(1000000,)", more=4_000_000)})
+    assert len(bomb) < 5_000
+    (tmp_path / "bomb.npz").write_bytes(bomb)
+    with pytest.raises(FramesError, match="arrays have 4,000,000 bytes, more than"):
+        load_arrays(tmp_path / "bomb.npz")
+
+
+FRAMES = dict(broken_frames())
+READABLE = ("extra", "extra-markup", "missing", "double", "half-float", "complex",
+            "words", "dates", "fields", "void", "bytes", "flat", "scalar",
+            "no-elements", "other-shape", "nan", "infinite", "largest",
+            "path", "no-member")  # fmt: skip
+"""Archives that are whole, whatever a model says of them."""
+
+
+@pytest.mark.parametrize("name", FRAMES)
+def test_an_archive_that_lies_is_refused(tmp_path: Path, name: str) -> None:
+    (tmp_path / "x.npz").write_bytes(FRAMES[name])
+    if name in READABLE:
+        load_arrays(tmp_path / "x.npz")
+        return
+    with pytest.raises(FramesError, match=r"x\.npz: not a readable \.npz") as caught:
+        load_arrays(tmp_path / "x.npz")
+    assert "\n" not in str(caught.value)
+
+
+def test_an_archive_that_breaks_without_a_word_is_told_by_the_error(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def broken(*given: object) -> None:
+        raise EOFError
+
+    (tmp_path / "x.npz").write_bytes(b"")
+    monkeypatch.setattr(zipfile, "ZipFile", broken)
+
+    with pytest.raises(FramesError, match=r"not a readable \.npz \(EOFError\)$"):
+        load_arrays(tmp_path / "x.npz")
+
+
+def recording(folder: Path, count: int, scenes: tuple[int, ...]) -> CalibrationSet:
+    frames = [{"x": np.full(1, at, np.float32)} for at in range(count)]
+    return CalibrationSet(record(folder / "frames", frames, scenes))
+
+
+@pytest.mark.parametrize(
+    ("count", "scenes", "calibrated", "measured"),
+    [
+        (2, (0,), [0], [1]),
+        (6, (0,), [0, 1, 2, 3, 4], [5]),
+        (32, (0,), list(range(28)), [28, 29, 30, 31]),
+        # Whole scenes, where that leaves half of the frames.
+        (12, (0, 4, 8), list(range(8)), [8, 9, 10]),
+        (8, (0, 2, 4, 6), [0, 1, 2, 3, 4, 5], [6, 7]),
+        # The scene is longer than half of the recording.
+        (8, (0, 2), [0, 1, 2, 3, 4, 5], [6, 7]),
+        # One frame is all there is.
+        (1, (0,), [0], [0]),
+    ],
+)
+def test_the_last_frames_are_held_out(
+    tmp_path: Path,
+    count: int,
+    scenes: tuple[int, ...],
+    calibrated: list[int],
+    measured: list[int],
+) -> None:
+    seen, kept = hold_out(recording(tmp_path, count, scenes), 4)
+
+    assert [frame.index for frame in seen] == calibrated
+    assert [frame.index for frame in kept] == measured
+
+
+def test_state_begins_anew_where_a_scene_is_cut(tmp_path: Path) -> None:
+    _, kept = hold_out(recording(tmp_path, 8, (0,)), 4)
+
+    assert [frame.starts_scene for frame in kept] == [True, False]
+
+
+def test_frames_are_drawn_by_seed_in_whole_scenes(tmp_path: Path) -> None:
+    scenes = (0, 2, 3, 5)
+    frames = recording(tmp_path, 7, scenes)
+
+    drawn = [draw(frames, 4, seed).places for seed in range(20)]
+
+    assert draw(frames, 4, 7).places == drawn[7]
+    assert len(set(drawn)) > 5
+    for places in drawn:
+        assert list(places) == sorted(set(places))
+        assert len(places) == 4
+        for place in places:
+            assert place in scenes or place - 1 in places
+    assert draw(frames, 99, 3).places == tuple(range(7))
+    with pytest.raises(FramesError, match="0 frames were asked for"):
+        draw(frames, 0, 0)

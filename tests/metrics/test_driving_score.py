@@ -1,9 +1,19 @@
+import dataclasses
 import math
 
 import pytest
 
-from me2e_compress.metrics.episode import PENALTY, Ending, InfractionKind
+from me2e_compress.metrics.bench2drive import ability_rates, mastered, successes
+from me2e_compress.metrics.episode import (
+    PENALTY,
+    Ending,
+    Episode,
+    Given,
+    Infraction,
+    InfractionKind,
+)
 from me2e_compress.metrics.route_scores import RouteScore, route_score
+from me2e_compress.metrics.scores import leaderboard_scores
 from tests.metrics.drives import drive, infraction
 
 # Bench2Drive, statistics_manager.py; give way is ours.
@@ -66,3 +76,115 @@ def test_an_unfinished_route_is_no_success() -> None:
 @pytest.mark.parametrize("ending", [e for e in Ending if e is not Ending.COMPLETED])
 def test_a_whole_route_that_ended_otherwise_is_no_success(ending: Ending) -> None:
     assert not drive(ending=ending).succeeded
+
+
+SIGNS = ("Merging", "Traffic_Signs")
+CRASH = infraction(InfractionKind.COLLISION_VEHICLE)
+
+
+def test_a_success_counts_under_every_ability_of_the_route() -> None:
+    counted = successes([drive(abilities=SIGNS)])
+
+    assert counted["Merging"] == counted["Traffic_Signs"] == (True,)
+    assert counted["Overtaking"] == ()
+
+
+@pytest.mark.parametrize(("completion", "obeyed"), [(48.0, False), (48.1, True)])
+def test_signs_are_mastered_eight_metres_into_the_junction(
+    completion: float, obeyed: bool
+) -> None:
+    crashed_later = drive(
+        CRASH, completion=completion, abilities=SIGNS, junction_m=40.0
+    )
+
+    assert mastered(crashed_later, "Traffic_Signs") is obeyed
+    assert not mastered(crashed_later, "Merging")
+
+
+@pytest.mark.parametrize(
+    ("broken", "junction_m"),
+    [
+        (infraction(InfractionKind.STOP), 10.0),
+        (infraction(InfractionKind.RED_LIGHT), 10.0),
+        (CRASH, None),
+    ],
+)
+def test_a_broken_sign_is_not_mastered_nor_without_a_junction_anything_but_success(
+    broken: Infraction, junction_m: float | None
+) -> None:
+    ran_it = drive(broken, abilities=SIGNS, junction_m=junction_m)
+
+    assert not mastered(ran_it, "Traffic_Signs")
+
+
+RAMMED = infraction(InfractionKind.COLLISION_VEHICLE)
+RAN_STOP = infraction(InfractionKind.STOP)
+SLOW = infraction(InfractionKind.MIN_SPEED, percent=50.0)
+
+
+def given(episode: Episode, status: str, composed: float) -> Episode:
+    said = Given(status, episode.completion_percent, 1.0, composed)
+    return dataclasses.replace(episode, given=said)
+
+
+ROUTES = (
+    given(drive(SLOW, route="a"), "Completed", 100.0),
+    given(drive(RAMMED, route="b"), "Completed", 59.9),
+    given(
+        drive(route="c", completion=30.0, ending=Ending.BLOCKED),
+        "Failed - Agent got blocked",
+        30.0,
+    ),
+)
+
+
+def test_both_quotients_of_what_was_given_and_computed() -> None:
+    found = leaderboard_scores(ROUTES)
+
+    for quotients, total in (
+        (found.given_score, 189.9),
+        (found.score, 190.0),
+        (found.success_rate, 100.0),
+    ):
+        assert quotients.over_set.value == pytest.approx(total / 220)
+        assert quotients.over_driven.value == pytest.approx(total / 3)
+
+
+def test_no_record_has_no_score_and_another_status_is_no_success() -> None:
+    odd = given(drive(), "Failed - TickRuntime", 100.0)
+
+    assert leaderboard_scores(()).score.over_set.reason == "there is no record"
+    assert leaderboard_scores([odd]).success_rate.over_driven.value == 0.0
+
+
+TESTED = (
+    drive(route="clean", abilities=SIGNS),
+    drive(RAN_STOP, route="ran", abilities=SIGNS, completion=90.0),
+)
+
+
+def test_traffic_signs_are_rated_where_no_junction_decides() -> None:
+    rates = ability_rates(TESTED)
+
+    assert rates["Traffic_Signs"].value == rates["Merging"].value == 50.0
+    # the others were not driven, so there is no mean of five
+    assert rates["mean"].measure.reason == "Overtaking: no such route was driven"
+
+
+def test_where_a_junction_decides_there_is_no_rate() -> None:
+    rammed = drive(RAMMED, route="rammed", abilities=SIGNS, completion=80.0)
+
+    rates = ability_rates((*TESTED, rammed))
+
+    signs = rates["Traffic_Signs"].measure
+    assert signs.reason == "where the junction is on rammed is not known"
+    assert rates["Merging"].value == pytest.approx(100 / 3)
+
+
+def test_the_mean_is_that_of_five() -> None:
+    others = ("Overtaking", "Emergency_Brake", "Give_Way")
+    routes = (*TESTED, *(drive(route=each, abilities=(each,)) for each in others))
+
+    mean = ability_rates(routes)["mean"]
+
+    assert mean.value == (100 + 50 + 100 + 100 + 50) / 5

@@ -1,12 +1,29 @@
+from pathlib import Path
+
 import numpy as np
 import onnx_ir as ir
 import pytest
 
+from me2e_compress import graph
 from me2e_compress.errors import ModuleMapError, RecipeError
-from me2e_compress.quantization.plan import Decision, make_plan, tensors_of
+from me2e_compress.graph.modules import Module, ModuleMap
+from me2e_compress.passes import Context
+from me2e_compress.passes.quantize_int8 import QuantizeInt8
+from me2e_compress.quantization.plan import (
+    Decision,
+    Overrides,
+    differences,
+    load_plan,
+    make_plan,
+    plan_of,
+    save_plan,
+    stamp_plan,
+    tensors_of,
+)
 from me2e_compress.quantization.rules import RuleSet
 from me2e_compress.quantization.rules.rule_sets import PaperRules, SafeRules
 from me2e_compress.quantization.scheme import QuantScheme
+from me2e_compress.workflows.int8_outcome import FloatWeight, float_weights
 from tests.calls import calls
 from tests.nets import MODULES, PAPER, conv_attention, net
 
@@ -258,3 +275,141 @@ def test_an_open_batch_changes_no_decision(
     plan = make_plan(net(OPEN % sizes, {}), HEAD, PAPER)
 
     assert [each.rule for each in plan.decisions if each.op == "MatMul"] == [rule] * 2
+
+
+# Plans on disk, in a model, and side by side.
+
+
+FULL = QuantScheme.named("full", MODULES)
+
+
+def test_a_saved_plan_reads_back_the_same(tmp_path: Path) -> None:
+    plan = make_plan(conv_attention(), FULL, PAPER)
+
+    save_plan(plan, tmp_path / "plan.json")
+
+    assert load_plan(tmp_path / "plan.json") == plan
+
+
+def test_a_model_carries_its_plan_through_a_file(tmp_path: Path) -> None:
+    model = conv_attention()
+    plan = make_plan(model, FULL, PAPER)
+
+    stamp_plan(model, plan)
+    graph.save(model, tmp_path / "m.onnx")
+
+    assert plan_of(graph.load(tmp_path / "m.onnx")) == plan
+
+
+def test_a_model_without_a_plan_has_none() -> None:
+    assert plan_of(conv_attention()) is None
+
+
+def test_differences_name_what_changed_and_by_which_rule() -> None:
+    model = conv_attention()
+    overrides = Overrides.parse('[[override]]\nop = "Conv"\ndtype = "float"')
+    old = make_plan(model, FULL, PAPER)
+    new = make_plan(model, FULL, PaperRules(attention_limit=8), overrides)
+
+    assert [str(each) for each in differences(old, new)] == [
+        "/backbone/Conv: int8 (layer) -> float (override)",
+        "/head/QK: int8 (attention) -> float (attention-length)",
+        "/head/AV: int8 (attention) -> float (attention-length)",
+    ]
+    assert not list(differences(old, old))
+
+
+def test_nodes_that_only_one_plan_has_are_differences() -> None:
+    model = conv_attention()
+    old = make_plan(model, FULL, PAPER)
+    model.graph[0].outputs[0].name = "renamed"
+    new = make_plan(model, FULL, PAPER)
+
+    assert [str(each) for each in differences(old, new)] == [
+        "/backbone/Conv: none -> int8 (layer)",
+        "/backbone/Conv: int8 (layer) -> none",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("{}", "not a plan: scheme: Field required"),
+        ("no", "not a plan: the file: Invalid"),
+    ],
+)
+def test_not_a_plan(tmp_path: Path, text: str, message: str) -> None:
+    (tmp_path / "plan.json").write_text(text)
+
+    with pytest.raises(RecipeError, match=message):
+        load_plan(tmp_path / "plan.json")
+
+
+def test_no_such_plan(tmp_path: Path) -> None:
+    with pytest.raises(RecipeError, match=r"none\.json: no such plan"):
+        load_plan(tmp_path / "none.json")
+
+
+# A scheme of a part of the graph needs a map that tells the parts apart.
+
+
+@pytest.mark.parametrize("scheme", ["feature-ext", "prediction"])
+def test_a_part_of_a_graph_without_parts_is_refused(scheme: str) -> None:
+    with pytest.raises(ModuleMapError, match=f"{scheme} is of a part .* map whole"):
+        QuantScheme.named(scheme, ModuleMap.whole())
+
+    assert QuantScheme.named("full", ModuleMap.whole()).modules == ("model",)
+
+
+@pytest.mark.parametrize("scheme", ["feature-ext", "prediction"])
+def test_so_it_is_of_a_map_of_predictions_alone(scheme: str) -> None:
+    heads = ModuleMap("heads", (Module("planner", "prediction", ("head",)),))
+
+    with pytest.raises(ModuleMapError, match="no module of role feature"):
+        QuantScheme.named(scheme, heads)
+
+
+TEXT = """
+net (float[1,32,32] x, int64[4] ids, float[32,64] layer, float[64,64] table,
+     float[1,256,64] recurrent, float[1,256,64] step, float[8] small)
+    => (float[1,32,64] y, float[4,64] rows, float[32,1,1,64] state) {
+    ["/backbone/MatMul"] y = MatMul(x, layer)
+    ["/head/Gather"] rows = Gather(table, ids)
+    ["/head/Transpose"] t = Transpose<perm=[1,0,2]>(y)
+    ["/head/LSTM"] state = LSTM<hidden_size=64>(t, recurrent, step)
+    ["/head/Add"] unused = Add(small, small)
+}
+"""
+
+
+@pytest.fixture(scope="module")
+def model() -> ir.Model:
+    shapes = {
+        "layer": (32, 64),
+        "table": (64, 64),
+        "recurrent": (1, 256, 64),
+        "step": (1, 256, 64),
+        "small": (8,),
+    }
+    return net(TEXT, {name: np.ones(shape) for name, shape in shapes.items()})
+
+
+def left(model: ir.Model, modules: tuple[str, ...]) -> tuple[FloatWeight, ...]:
+    quantizer = QuantizeInt8(modules=modules, rules="paper")
+    return float_weights(model, quantizer.plan(model, Context(MODULES)))
+
+
+def test_the_largest_weights_that_stay_float_come_first(model: ir.Model) -> None:
+    found = left(model, ("backbone", "head"))
+
+    assert [each.name for each in found] == ["recurrent", "step", "table"]
+    assert found[0].bytes == 4 * 256 * 64
+    assert (found[0].op, found[0].module, found[0].rule) == ("LSTM", "head", "operator")
+    assert found[0].reason == "LSTM is not a weighted layer"
+
+
+def test_a_layer_outside_the_scheme_is_named_with_its_rule(model: ir.Model) -> None:
+    (layer,) = [each for each in left(model, ("head",)) if each.name == "layer"]
+
+    assert layer.rule == "module"
+    assert layer.node == "/backbone/MatMul"

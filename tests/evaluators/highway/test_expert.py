@@ -1,4 +1,4 @@
-"""The expert on hand-made scenes, driven with lag through the controller."""
+"""Forecasts, speed ceilings and gaps, one at a time."""
 
 import math
 
@@ -8,12 +8,34 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from me2e_compress.evaluators.highway.expert.expert_policy import (
+    LATERAL_MPS2,
     ExpertDecision,
     Memory,
     ceiling,
     decide,
+    must_give_way,
 )
-from me2e_compress.simulator.scene import ActorKind, Scene, SignalKind, SignalState
+from me2e_compress.evaluators.highway.expert.forecast import NOW_S, Forecast, forecast
+from me2e_compress.evaluators.highway.expert.futures import (
+    BESIDE_M,
+    headway_cost,
+    sample,
+)
+from me2e_compress.evaluators.highway.expert.lateral_targets import (
+    Options,
+    Place,
+    blocked_stretch,
+    lateral_targets,
+)
+from me2e_compress.simulator.plane_geometry import RoutePath
+from me2e_compress.simulator.scene import (
+    Actor,
+    ActorKind,
+    Scene,
+    SignalKind,
+    SignalState,
+)
+from me2e_compress.simulator.world import Intent
 from tests.evaluators.highway.tiny_world import (
     TinyWorld,
     actor,
@@ -24,6 +46,142 @@ from tests.evaluators.highway.tiny_world import (
     straight,
 )
 from tests.profiles import scaled
+
+
+def look(path: RoutePath, *actors: Actor, intents: tuple[Intent, ...] = ()) -> Forecast:
+    scene = Scene(0, ego_at(), actors, ())
+    return forecast(scene, {i.actor_id: i for i in intents}, path, 5.0)
+
+
+def place(speed: float = 8.0, lateral: float = 0.0) -> Place:
+    return Place(5.0, lateral, 0.0, speed, 0.0, 12.0)
+
+
+def test_without_an_intent_an_actor_keeps_course_and_speed() -> None:
+    seen = look(straight(), actor(20.0, 3.0, 4.0, math.pi))
+    np.testing.assert_allclose(seen.x[0], 20.0 - 4.0 * NOW_S)
+    np.testing.assert_allclose(seen.y[0], 3.0, atol=1e-9)
+    assert not seen.yields[0]
+
+
+def test_an_intent_is_followed_around_the_corner() -> None:
+    corner = np.array([[20.0, 0.0], [40.0, 0.0], [40.0, 40.0]])
+    intent = Intent(1, corner, 8.0, 0.0, True)
+    seen = look(straight(), actor(20.0, speed=8.0), intents=(intent,))
+    assert (seen.x[0, -1], seen.y[0, -1]) == pytest.approx((40.0, 28.0))
+    assert seen.heading[0, -1] == pytest.approx(math.pi / 2)
+    assert seen.yields[0]
+
+
+def test_a_heading_passes_half_a_turn_the_short_way() -> None:
+    turned = np.array([3.0, 3.1, 3.2, 3.3])
+    steps = 10.0 * np.stack([np.cos(turned), np.sin(turned)], axis=1)
+    line = np.array([60.0, 0.0]) + np.cumsum(np.vstack([[0.0, 0.0], steps]), axis=0)
+    intent = Intent(1, line, 8.0, 0.0, True)
+    seen = look(straight(), actor(60.0, 0.0, 8.0, 3.0), intents=(intent,))
+    assert seen.heading[0].min() >= 3.0 - 1e-9
+    assert seen.heading[0].max() <= 3.3 + 1e-9
+
+
+def test_a_braking_actor_stops_and_stays() -> None:
+    line = np.array([[20.0, 0.0], [90.0, 0.0]])
+    intent = Intent(1, line, 0.0, -4.0, True)
+    seen = look(straight(), actor(20.0, speed=8.0), intents=(intent,))
+    assert seen.x[0, -1] == pytest.approx(28.0, abs=0.6)
+    assert seen.speed_mps[0, -1] == 0.0
+
+
+def test_who_crawls_in_a_queue_is_not_expected_to_leap() -> None:
+    line = np.array([[20.0, 0.0], [150.0, 0.0]])
+    intent = Intent(1, line, 9.0, 0.1, True)
+    seen = look(straight(), actor(20.0, speed=2.0), intents=(intent,))
+    assert seen.speed_mps[0, -1] < 4.5
+
+
+def test_a_walker_sets_off_at_once() -> None:
+    line = np.array([[40.0, -6.0], [40.0, 6.0]])
+    intent = Intent(1, line, 1.5, 0.0, False)
+    walker = actor(40.0, -6.0, 0.0, math.pi / 2, ActorKind.PEDESTRIAN)
+    seen = look(straight(), walker, intents=(intent,))
+    assert seen.y[0, 4] == pytest.approx(-6.0 + 1.5 * 1.0, abs=0.4)
+
+
+def test_the_route_frame_has_left_positive() -> None:
+    seen = look(circle(20.0, 2.0), actor(15.0, 2.5))
+    assert seen.along_m[0, 0] == pytest.approx(15.0, abs=1e-3)
+    assert seen.lateral_m[0, 0] == pytest.approx(2.5, abs=1e-3)
+
+
+def test_the_ceiling_is_low_in_the_bend_and_reached_by_easy_braking() -> None:
+    top = ceiling(circle(20.0, 2.0, run_in_m=60.0))
+    assert top[75] == pytest.approx(math.sqrt(LATERAL_MPS2 * 20.0), rel=0.05)
+    assert top[10] == 12.0
+    assert (np.diff(top**2) / 2 > -1.81).all()
+
+
+@pytest.mark.parametrize("aside_m", [-0.05, 0.05])
+def test_who_is_passed_with_too_little_room_is_a_leader(aside_m: float) -> None:
+    path, ego = straight(), ego_at()
+    leader = actor(20.0, 0.0, 8.0)
+    reach_m = leader.width / 2 + ego.width / 2 + BESIDE_M
+    seen = look(path, actor(20.0, reach_m + aside_m, 8.0))
+    kept = Options(np.zeros(1), np.zeros(1, bool), False)
+    future = sample(path, ceiling(path), ego, place(), kept, None)
+    paid = headway_cost(future, seen, ego, place(), False)
+    assert (paid > 0).any() == (aside_m < 0)
+
+
+def test_neighbours_in_a_row_are_one_block() -> None:
+    row = (actor(40.0), actor(50.0, number=2), actor(90.0, number=3))
+    block = blocked_stretch(place(), ego_at(), look(straight(), *row))
+    assert block is not None
+    assert block.start_m == pytest.approx(40.0 - 2.3 - 5.0)
+    assert block.end_m == pytest.approx(50.0 + 2.3 - 5.0)
+
+
+@pytest.mark.parametrize(
+    "other",
+    [
+        actor(40.0, speed=6.0),
+        actor(40.0, 3.5),
+        actor(40.0, -2.0, 1.4, math.pi / 2, ActorKind.PEDESTRIAN),
+    ],
+    ids=["drives", "beside", "walks"],
+)
+def test_what_moves_or_stands_aside_blocks_nothing(other: Actor) -> None:
+    assert blocked_stretch(place(), ego_at(), look(straight(), other)) is None
+
+
+def test_the_oncoming_lane_is_offered_only_with_a_gap() -> None:
+    path = straight(oncoming_m=5.25)
+    parked = actor(30.0, kind=ActorKind.PARKED)
+    free = lateral_targets(path, place(), ego_at(), look(path, parked))
+    assert free.oncoming.any()
+    near = actor(75.0, 3.5, 8.0, math.pi, number=2)
+    shut = lateral_targets(path, place(), ego_at(), look(path, parked, near))
+    assert not shut.oncoming.any()
+    inside = lateral_targets(path, place(lateral=3.0), ego_at(), look(path, near))
+    assert inside.oncoming.any()
+
+
+def test_targets_stay_on_the_road() -> None:
+    path = straight(left_m=5.25, right_m=1.75)
+    options = lateral_targets(path, place(), ego_at(), look(path))
+    assert options.target_m[0] == 0.0
+    assert options.target_m.max() <= 5.25 - 1.0
+    assert options.target_m.min() >= -1.75 + 1.0
+
+
+def test_who_crosses_soon_has_priority_and_who_leads_has_not() -> None:
+    path = straight()
+    crossing = look(path, actor(45.0, -16.0, 8.0, math.pi / 2))
+    assert must_give_way(crossing, 40.0, 1.0)
+    assert not must_give_way(crossing, 40.0, 4.5)
+    assert not must_give_way(look(path, actor(45.0, 0.0, 8.0)), 40.0, 1.0)
+
+
+# The expert on hand-made scenes, driven with lag through the controller.
+
 
 RED = SignalState.RED
 

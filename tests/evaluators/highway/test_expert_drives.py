@@ -4,7 +4,9 @@ import numpy as np
 import pytest
 
 from me2e_compress.driving.realtime import HeldControl
+from me2e_compress.evaluators import Drive
 from me2e_compress.evaluators.highway.controller import AnchoredPlan
+from me2e_compress.evaluators.highway.drivers import OnnxDriver
 from me2e_compress.evaluators.highway.expert.expert_policy import (
     Expert,
     Memory,
@@ -12,8 +14,17 @@ from me2e_compress.evaluators.highway.expert.expert_policy import (
     decide,
 )
 from me2e_compress.evaluators.highway.generate import dry_run
+from me2e_compress.evaluators.highway.runner import drive
+from me2e_compress.metrics.episode import Ending
+from me2e_compress.metrics.route_scores import route_score
+from me2e_compress.shipped.drivers import shipped
 from me2e_compress.simulator.plane_geometry import Floats
-from me2e_compress.simulator.routes import SCENARIO_ABILITIES, Route
+from me2e_compress.simulator.routes import (
+    SCENARIO_ABILITIES,
+    Route,
+    load_routes,
+    pick_routes,
+)
 from me2e_compress.simulator.scene import INFRACTIONS, Control
 from me2e_compress.simulator.world import World
 
@@ -76,3 +87,17 @@ def test_a_decision_that_takes_long_drives_worse() -> None:
         world.step(held.advance())
     wrong = [event.kind for event in world.events if event.kind in INFRACTIONS]
     assert wrong or not world.done
+
+
+# The weights that ship, in closed loop; five CPU seconds.
+
+
+def test_the_shipped_driver_passes_a_parked_car() -> None:
+    """A route that nobody passes blindly, and one of the shortest."""
+    (route,) = pick_routes(load_routes(), "ParkedObstacle_R2_0")
+    policy = OnnxDriver(shipped("highway")).open()
+
+    episode = drive(route, policy, Drive())
+
+    assert (episode.ending, episode.infractions) == (Ending.COMPLETED, ())
+    assert route_score(episode).composed == 100.0

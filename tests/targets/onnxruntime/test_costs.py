@@ -1,14 +1,20 @@
 """What onnxruntime's CPU is faster with, by its cost model."""
 
+from collections import Counter
+from collections.abc import Callable
+
 import numpy as np
 import onnx_ir as ir
 import pytest
 
+from me2e_compress.operators import kernels
 from me2e_compress.quantization.plan import QuantPlan, make_plan
 from me2e_compress.quantization.rules import RULE_SETS
 from me2e_compress.quantization.scheme import QuantScheme
+from me2e_compress.runtime.optimized import optimized
 from me2e_compress.targets.onnxruntime import OnnxRuntime
 from tests.nets import MODULES, net
+from tests.targets.onnxruntime.lowered import FULL, Feeds, feeds, measured, ran, sqnr_db
 
 HEAD = QuantScheme.of(("head",), MODULES)
 
@@ -134,3 +140,126 @@ def test_what_is_read_as_float(outputs: str, reader: str, as_float: bool) -> Non
     (between,) = (each for each in borders if each.makers == {layers[0]})
     assert between.readers == {layers[1]}
     assert between.read_as_float is as_float
+
+
+# Feature maps that fused operators sample: uint8 where the plan says so.
+
+
+compiled = pytest.mark.skipif(
+    kernels.why_not() is not None, reason=str(kernels.why_not())
+)
+ALL = "paper{without=[fused-operator]}"
+PRICED = "paper{without=[fused-operator], extra=[cost]}"
+ATTENTION = """
+<ir_version: 9, opset_import: ["" : 17, "me2e" : 1]>
+net (float[1,ROWS,24] x, float[24,24] w, float[24] b, float[1,QUERIES,3,2,4,2] at,
+     float[1,QUERIES,3,2,4] shares) => (float[1,QUERIES,3,8] y)
+<int64[4] heads = {1, ROWS, 3, 8}, int32[2,2] sizes = {5, 11, 2, 4},
+ int32[2] starts = {0, 55}> {
+    ["/head/product"] p = MatMul(x, w)
+    ["/head/bias"] s = Add(p, b)
+    ["/head/heads"] value = Reshape(s, heads)
+    ["/head/sampled"] y =
+        me2e.MultiScaleDeformableAttention(value, sizes, starts, at, shares)
+}
+"""
+AGGREGATION = """
+<ir_version: 9, opset_import: ["" : 17, "me2e" : 1]>
+net (float[1,3,4,6] x, float[12,3,3,3] w1, float[12,12,3,3] w2, float[1,50,5,1,2] at,
+     float[1,50,5,1,2,3] shares) => (float[1,50,12] y)
+<int64[3] flat = {1, 12, -1}, int32[1,2,2] sizes = {4, 6, 2, 3},
+ int32[1,2] starts = {0, 24}> {
+    ["/backbone/one"] c1 = Conv<pads=[1,1,1,1]>(x, w1)
+    ["/backbone/two"] c2 = Conv<pads=[1,1,1,1], strides=[2,2]>(c1, w2)
+    f1 = Reshape(c1, flat)  t1 = Transpose<perm=[0,2,1]>(f1)
+    f2 = Reshape(c2, flat)  t2 = Transpose<perm=[0,2,1]>(f2)
+    ["/head/maps"] maps = Concat<axis=1>(t1, t2)
+    ["/head/sampled"] y = me2e.DeformableAggregation(maps, sizes, starts, at, shares)
+}
+"""
+
+
+def attention(rows: int = 63, queries: int = 50) -> ir.Model:
+    text = ATTENTION.replace("ROWS", str(rows)).replace("QUERIES", str(queries))
+    random = np.random.default_rng(0)
+    return net(text, {"w": random.normal(size=(24, 24)), "b": random.normal(size=24)})
+
+
+def aggregation() -> ir.Model:
+    random = np.random.default_rng(0)
+    shapes = {"w1": (12, 3, 3, 3), "w2": (12, 12, 3, 3)}
+    return net(AGGREGATION, {n: random.normal(size=s) for n, s in shapes.items()})
+
+
+def drawn(model: ir.Model) -> Feeds:
+    shapes = {
+        str(value.name): tuple(value.shape.numpy())
+        for value in model.graph.inputs
+        if value.shape is not None
+    }
+    found = dict(feeds(1, **shapes))
+    places = np.random.default_rng(2).uniform(0.1, 0.9, shapes["at"])
+    found["at"] = places.astype(np.float32)
+    return found
+
+
+def priced(model: ir.Model, rules: str) -> QuantPlan:
+    target = OnnxRuntime()
+    chosen = RULE_SETS.parse(rules)
+    return make_plan(
+        model, FULL, chosen, costs=target.costs, fused=target.fused_objection
+    )
+
+
+def quantized(model: ir.Model) -> ir.Model:
+    plan = priced(model, ALL)
+    ranges = measured(model, OnnxRuntime().tensors(plan, model), drawn(model))
+    return OnnxRuntime().place(model, plan, ranges)
+
+
+@compiled
+@pytest.mark.parametrize("make", [attention, aggregation])
+def test_the_kernel_for_uint8_samples_it(make: Callable[[], ir.Model]) -> None:
+    model = make()
+    found = Counter(node.op_type for node in optimized(quantized(model)).graph)
+
+    assert found["MultiScaleDeformableAttentionUint8"] == 1
+    assert found["QGemm"] == 0  # it is slower at writing uint8
+    assert found["DequantizeLinear"] == 0
+
+
+@compiled
+def test_maps_of_convolutions_are_joined_and_sampled_without_becoming_float() -> None:
+    found = Counter(node.op_type for node in optimized(quantized(aggregation())).graph)
+
+    assert found["QLinearConcat"] == 1
+    assert found["QuantizeLinear"] == 1  # of the image
+
+
+@pytest.mark.parametrize("make", [attention, aggregation])
+def test_positions_and_weights_stay_float(make: Callable[[], ir.Model]) -> None:
+    model = make()
+    small = quantized(model)
+    node = next(each for each in small.graph if each.domain == "me2e")
+    fed = drawn(model)
+
+    want, got = ran(model, fed), ran(small, fed)
+
+    assert [str(v.name) for v in node.inputs[3:] if v] == ["at", "shares"]
+    assert sqnr_db(want["y"], got["y"]) > 25
+
+
+@pytest.mark.parametrize(("rows", "rule"), [(30_000, "sampled"), (4_000, "cost")])
+def test_a_product_is_sampled_as_uint8_where_it_exceeds_the_cache(
+    rows: int, rule: str
+) -> None:
+    # so few queries that they would not pay for another pass over the rows
+    plan = priced(attention(rows=rows, queries=3_000), PRICED)
+
+    assert plan.decisions[-1].rule == rule
+
+
+def test_maps_that_are_uint8_already_do() -> None:
+    plan = priced(aggregation(), PRICED)
+
+    assert plan.decisions[-1].rule == "sampled"

@@ -6,12 +6,19 @@ import numpy as np
 import onnx_ir as ir
 import pytest
 
+from me2e_compress import graph
 from me2e_compress.calibration.ranges import Ranges
-from me2e_compress.errors import MissingExtraError, RecipeError
+from me2e_compress.errors import MissingExtraError, PreconditionError, RecipeError
 from me2e_compress.quantization.plan import make_plan, stamp_plan, tensors_of
 from me2e_compress.quantization.scheme import QuantScheme
 from me2e_compress.targets.tensorrt import TensorRT
-from me2e_compress.targets.tensorrt.rtx_check import check
+from me2e_compress.targets.tensorrt.rtx_check import (
+    Kernel,
+    check,
+    cut,
+    read_kernels,
+    without_int8,
+)
 from tests.nets import MODULES, PAPER, conv_attention, net, parsed
 from tests.targets.tensorrt.layers import layers
 
@@ -109,3 +116,111 @@ def test_without_the_extra_it_says_what_to_install(
 
     with pytest.raises(MissingExtraError, match=r"me2e-compress\[trt-check\]"):
         check(conv_attention())
+
+
+HEAD = '<ir_version: 9, opset_import: ["" : 17, "trt" : 1]>'
+ROTATED = (
+    HEAD + "m (float[2,4,4] x, float[1] a) => (float[2,4,4] y)"
+    " <float[2] c = {1.0, 1.0}> { e = Relu(x) b = Neg(a)"
+    ' ["/Rotate"] r = trt.RotateTRT<interpolation=1>(e, b, c) y = Exp(r) }'
+)
+
+
+def typed(text: str) -> ir.Model:
+    """Read a graph; what plugins give has the shape of their first input."""
+    model = ir.from_onnx_text(text)
+    graph.infer_shapes(model)
+    for node in model.graph:
+        if node.domain == "trt" and node.inputs[0] is not None:
+            node.outputs[0].shape = node.inputs[0].shape
+            node.outputs[0].type = node.inputs[0].type
+    return model
+
+
+def test_what_a_plugin_reads_and_gives_become_outputs_and_inputs() -> None:
+    part, gone = cut(typed(ROTATED))
+
+    assert gone == ("/Rotate",)
+    assert [node.op_type for node in part.graph] == ["Relu", "Neg", "Exp"]
+    assert [value.name for value in part.graph.inputs] == ["x", "a", "r"]
+    assert [value.name for value in part.graph.outputs] == ["y", "e", "b"]
+
+
+def test_the_source_stays_whole() -> None:
+    model = typed(ROTATED)
+    before = graph.digest(model)
+
+    cut(model)
+
+    assert graph.digest(model) == before
+
+
+def test_a_plugin_at_the_end_takes_its_output_along() -> None:
+    model = typed(
+        HEAD + "m (float[2,4,4] x) => (float[2,4,4] y)"
+        " { e = Relu(x) y = trt.InverseTRT(e) }"
+    )
+    part, _ = cut(model)
+
+    assert [value.name for value in part.graph.outputs] == ["e"]
+
+
+def test_operators_that_only_tensorrt_has_are_cut_too() -> None:
+    model = typed(
+        HEAD.replace("17", "19")
+        + "m (float[1,2,4,4] x, float[1,2,1,1] w, float[1,2,4,4] o) =>"
+        " (float[1,1,4,4] y) { c = DeformConv(x, w, o) y = Relu(c) }"
+    )
+    _, gone = cut(model)
+
+    assert gone == ("c",)
+
+
+def test_a_local_function_is_no_plugin() -> None:
+    text = """
+    <ir_version: 9, opset_import: ["" : 17, "own" : 1]>
+    m (float[2] x) => (float[2] y) { y = own.Twice(x) }
+    <domain: "own", opset_import: ["" : 17]>
+    Twice (x) => (y) { y = Add(x, x) }
+    """
+    part, gone = cut(ir.from_onnx_text(text))
+
+    assert gone == ()
+    assert len(part.functions) == 1
+
+
+def test_a_plugin_of_unknown_result_cannot_be_cut_at() -> None:
+    with pytest.raises(PreconditionError, match="output r is not known"):
+        cut(ir.from_onnx_text(ROTATED))
+
+
+def test_a_plugin_without_a_domain_is_cut_out_too() -> None:
+    _, gone = cut(typed(ROTATED.replace("trt.Rotate", "Rotate")))
+    assert gone == ("/Rotate",)
+
+
+PLAN = (
+    b'\x00\x01 t={ name="in" shape={ 1 3 } type=int8 } t={ name="w" type=int8 }'
+    b' t={ name="f" type=float }'
+    b' corrltn={ name="/a/Conv" output={"o" } input={"in" "w" } pad={ 1 } }'
+    b' fully_connected={ name="/q/MatMul+/k/MatMul" output={"o" } input={"f" "w" } }'
+    b' corrltn={ name="/b/Conv" output={"o" } input={"lost" "w" } }\xff'
+)
+
+
+def test_kernels_are_read_off_the_text_of_a_plan() -> None:
+    assert read_kernels(PLAN) == (
+        Kernel("convolution", ("/a/Conv",), ("int8", "int8")),
+        Kernel("product", ("/q/MatMul", "/k/MatMul"), ("float", "int8")),
+        Kernel("convolution", ("/b/Conv",), ("?", "int8")),
+    )
+
+
+def test_nodes_without_an_int8_kernel_are_named() -> None:
+    nodes = ("/a/Conv", "/b/Conv", "/k/MatMul", "/c/Conv")
+
+    assert without_int8(nodes, read_kernels(PLAN)) == (
+        "/b/Conv",
+        "/k/MatMul",
+        "/c/Conv",
+    )

@@ -1,10 +1,13 @@
 import math
 from dataclasses import replace
 
+import numpy as np
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from me2e_compress.evaluators.highway.observe import RANGE_M, seen
+from me2e_compress.evaluators.highway.observe import APART_M, RANGE_M, RouteNodes, seen
+from me2e_compress.simulator.plane_geometry import RoutePath
 from me2e_compress.simulator.scene import (
     DIMENSIONS,
     Actor,
@@ -93,3 +96,45 @@ def test_one_more_hides_others_and_never_shows_them(
 
 def test_nobody_is_no_problem() -> None:
     assert shown() == []
+
+
+def path_of(commands: list[int]) -> RoutePath:
+    """Straight to the north, a point every metre."""
+    n = len(commands)
+    column, zero = np.ones(n), np.zeros(n)
+    points = np.stack([zero, np.arange(n, dtype=float)], axis=1)
+    numbers = np.array(commands)
+    heading = np.full(n, math.pi / 2)
+    return RoutePath(
+        points, heading, column, column, numbers, n - 1.0, column, column, column
+    )
+
+
+def ego_at(y: float) -> Ego:
+    return Ego(1.0, y, math.pi / 2, 5.0, 0.0, 0.0, 0.0, 0.0, 4.6, 1.9)
+
+
+NODES = RouteNodes.along(path_of([3] * 70 + [0] * 20 + [3] * 71))
+
+
+def test_nodes_stand_where_the_command_changes_and_never_far_apart() -> None:
+    assert {0.0, 70.0, 90.0, 160.0} <= set(NODES.stations_m)
+    assert max(np.diff(NODES.stations_m)) <= APART_M
+
+
+@pytest.mark.parametrize(
+    ("y", "ahead"), [(0.0, (35, 70)), (60.0, (10, 30)), (67.0, (23, 58))]
+)
+def test_the_next_node_lies_at_least_four_metres_ahead(
+    y: float, ahead: tuple[float, float]
+) -> None:
+    """One metre to the left, since the ego is to the right of the path."""
+    found = NODES.ahead(y, ego_at(y))
+
+    np.testing.assert_allclose(found, [[each, 1.0] for each in ahead], atol=1e-5)
+
+
+def test_at_the_end_both_are_the_last_one() -> None:
+    found = NODES.ahead(158.0, ego_at(158.0))
+
+    np.testing.assert_allclose(found, [[2.0, 1.0]] * 2, atol=1e-5)
