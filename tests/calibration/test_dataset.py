@@ -30,15 +30,6 @@ def model() -> ir.Model:
     return parsed(MODEL)
 
 
-def test_frames_come_in_order_and_know_their_scene(tmp_path: Path) -> None:
-    frames = CalibrationSet(record(tmp_path, [frame(i) for i in range(4)], (0, 2)))
-
-    read = [(each.index, each.starts_scene, each.arrays["x"][0, 0]) for each in frames]
-
-    assert len(frames) == 4
-    assert read == [(0, True, 0), (1, False, 1), (2, True, 2), (3, False, 3)]
-
-
 @pytest.mark.parametrize(
     ("change", "message"),
     [

@@ -11,7 +11,6 @@ from hypothesis import strategies as st
 from me2e_compress.calibration.observers import (
     OBSERVERS,
     Bounds,
-    MaxMin,
     MeanSquaredError,
     Observer,
     Percentile,
@@ -66,12 +65,6 @@ def test_what_is_no_number_has_no_step(end: float) -> None:
         scale_of(-end, 1.0)
     with pytest.raises(FramesError, match="has no int8 step"):
         scale_of(-1.0, end)
-
-
-def test_max_min_is_static() -> None:
-    lows, highs = MaxMin().ranges(extremes((-1, 2), (-3, 1), (0, 0)))
-
-    assert (lows.tolist(), highs.tolist()) == ([-3], [2])
 
 
 @settings(max_examples=scaled(25))

@@ -14,7 +14,6 @@ from me2e_compress.calibration.recording import Begin, Source, write_recording
 from me2e_compress.errors import FramesError
 from me2e_compress.registry.drafts import IN_JSON
 from me2e_compress.runtime.frames import Frame
-from me2e_compress.runtime.session import Session, replay
 from tests.frames import record
 from tests.nets import parsed
 
@@ -60,13 +59,6 @@ def test_the_index_says_where_the_frames_are_from(tmp_path: Path) -> None:
         "seed": 4,
         "count": 3,
     }
-
-
-def test_same_frames_same_bytes(tmp_path: Path) -> None:
-    one = write_recording(tmp_path / "one", source(3), {})
-    two = write_recording(tmp_path / "two", source(3), {})
-
-    assert files(one) == files(two)
 
 
 def test_an_earlier_recording_is_replaced(tmp_path: Path) -> None:
@@ -218,20 +210,6 @@ def test_bytes_stay_bytes_on_disk(tmp_path: Path) -> None:
     with np.load(recording.files[0]) as held:
         assert held["img"].dtype == np.uint8
         np.testing.assert_array_equal(held["img"], pictures()[0])
-
-
-def test_bytes_and_floats_give_the_same_outputs(
-    tmp_path: Path, model: ir.Model
-) -> None:
-    answers = [
-        [
-            each["y"]
-            for each in replay(Session(model), written(tmp_path / str(k), as_bytes=k))
-        ]
-        for k in (True, False)
-    ]
-
-    np.testing.assert_array_equal(answers[0], answers[1])
 
 
 def test_the_check_knows_the_shape_that_is_fed(tmp_path: Path, model: ir.Model) -> None:

@@ -82,7 +82,6 @@ def test_the_gradient_is_that_of_the_cost() -> None:
         ("collision-optimizer{radius_m=0}", "radius_m 0 is not a positive number"),
         ("collision-optimizer{threshold=1}", "threshold 1: from 0 to below 1"),
         ("collision-optimizer{solver=IPOPT}", "solver: Input should be 'SLSQP'"),
-        ("smoother", "no host stage 'smoother'; there are collision-optimizer"),
     ],
 )
 def test_options_that_it_refuses(text: str, words: str) -> None:

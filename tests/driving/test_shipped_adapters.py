@@ -8,7 +8,7 @@ import pytest
 from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.driving.adapter import Adapter
 from me2e_compress.driving.adapter.inputs import ModelInputs
-from me2e_compress.driving.contract import Answer, Trajectory, checked
+from me2e_compress.driving.contract import Trajectory, checked
 from me2e_compress.driving.onnx_policy import OnnxPolicy
 from me2e_compress.driving.shipped_adapters import adapter_file, shipped_adapters
 from me2e_compress.errors import EvaluationError
@@ -42,22 +42,6 @@ def tcp(tmp_path: Path) -> Path:
     )
 
 
-def answer(model: Path, adapter: str) -> Answer:
-    """Ask at rest; the target point lies 20 m ahead, 5 m to the left."""
-    policy = OnnxDriver(model, Path(adapter)).open()
-    pictures = np.zeros((6, 288, 512, 3), np.uint8)
-    policy.reset(EXIT)
-    still = motion(0.0, 0.0, 0.0, speed=0.0)
-    return checked(policy.plan(observation(still, images=pictures)))
-
-
-def test_the_trajectory_head(tcp: Path) -> None:
-    found = answer(tcp, "tcp")
-
-    assert isinstance(found, Trajectory)
-    assert found.times_s.tolist() == [0.5, 1.0, 1.5, 2.0]
-
-
 def test_tcp_sees_its_strip_and_its_state(tcp: Path, tmp_path: Path) -> None:
     options = FramesOptions(count=2, seed=1, adapter=Path("tcp"), scene_length=2)
 
@@ -79,6 +63,12 @@ def test_tcps_waypoints_are_turned_to_ours(tcp: Path) -> None:
     assert isinstance(policy, OnnxPolicy)
     assert policy.image_size == (288, 512)
     assert policy.adapter.to_ego(np.array([[8.0, 3.0]])).tolist() == [[8.0, -3.0]]
+    pictures = np.zeros((6, 288, 512, 3), np.uint8)
+    policy.reset(EXIT)
+    still = motion(0.0, 0.0, 0.0, speed=0.0)
+    found = checked(policy.plan(observation(still, images=pictures)))
+    assert isinstance(found, Trajectory)
+    assert found.times_s.tolist() == [0.5, 1.0, 1.5, 2.0]
 
 
 def test_vad_tiny_is_fed_as_nuscenes_feeds_it(tmp_path: Path) -> None:

@@ -57,10 +57,6 @@ def test_penalties_multiply_and_are_rounded_to_six_digits() -> None:
     assert scored.composed == round(33.33 * 0.65**3, 6)
 
 
-def test_a_clean_route_scores_its_completion() -> None:
-    assert route_score(drive(completion=61.5)) == RouteScore(61.5, 1.0, 61.5)
-
-
 @pytest.mark.parametrize("kind", InfractionKind)
 def test_any_infraction_but_a_low_speed_spoils_success(kind: InfractionKind) -> None:
     percent = 0.1 if kind is InfractionKind.OUTSIDE_ROUTE_LANES else None

@@ -274,14 +274,3 @@ def test_neither_the_order_of_rows_nor_a_sign_nor_an_offset_matters(
         assert found == pytest.approx(other, abs=1e-6)
         assert found.sum() == pytest.approx(1.0)
         assert (found >= 0.0).all()
-
-
-@given(tables, st.floats(0.1, 100.0))
-def test_one_scale_for_all_measures_does_not_matter(
-    rows: np.ndarray, factor: float
-) -> None:
-    found, other = weights_of(rows), weights_of(factor * rows)
-
-    assert (found is None) == (other is None)
-    if found is not None:
-        assert found == pytest.approx(other, abs=1e-6)

@@ -95,14 +95,6 @@ def test_short_attention_becomes_int8_on_both_sides(variant: str) -> None:
     assert all(each.activations == (0, 1) and each.weight is None for each in found)
 
 
-def test_the_limit_is_an_option() -> None:
-    model = net(ATTENTION % {"q": 65, "k": 16, "body": VARIANTS["plain"]}, {})
-
-    plan = make_plan(model, HEAD, PaperRules(attention_limit=64))
-
-    assert plan.counts() == {"attention-length": 2}
-
-
 def test_a_product_without_softmax_is_no_layer() -> None:
     body = "s = MatMul(q, k) y = MatMul(s, v)"
     found = products(net(ATTENTION % {"q": 16, "k": 16, "body": body}, {}))
@@ -220,14 +212,6 @@ def test_unknown_schemes_and_modules_are_errors() -> None:
         QuantScheme.named("int4", MODULES)
     with pytest.raises(ModuleMapError, match=r"occ: .*backbone, head"):
         QuantScheme.of(("occ",), MODULES)
-
-
-def test_a_rule_can_be_switched_off() -> None:
-    model = net(LINEAR % ("1,64", "64,32", "1,32"), {"w": np.ones((64, 32))})
-
-    plan = make_plan(model, HEAD, PaperRules(without=("gemv",)))
-
-    assert plan.counts() == {"layer": 1}
 
 
 def diamonds(count: int) -> ir.Model:

@@ -10,7 +10,7 @@ from me2e_compress.errors import FramesError, GraphError
 from me2e_compress.graph.nodes import constant_values
 from me2e_compress.runtime.frames import Array, Frame
 from me2e_compress.runtime.runnable import endless, unsupported
-from me2e_compress.runtime.session import Session, replay, run_once
+from me2e_compress.runtime.session import Session, replay
 from me2e_compress.targets.weights import evaluate_constants
 from tests.nets import parsed
 
@@ -119,30 +119,6 @@ def test_a_wrong_shape_is_an_error_of_the_frame(counter: ir.Model) -> None:
 
     with pytest.raises(FramesError, match="Got: 3 Expected: 2"):
         Session(counter).run(wrong)
-
-
-def test_a_file_and_the_graph_in_memory_run_alike(
-    counter: ir.Model, tmp_path: Path
-) -> None:
-    path = tmp_path / "counter.onnx"
-    graph.save(counter, path)
-    feeds = {name: np.ones((1, 2), np.float32) for name in ("x", "memory")}
-
-    np.testing.assert_array_equal(
-        Session(path).run(feeds)["y"], Session(counter).run(feeds)["y"]
-    )
-
-
-def test_a_graph_with_weights_on_disk_runs(tmp_path: Path) -> None:
-    text = """
-    add (float[2] x) => (float[2] y) <float[2] w = {1.0, 2.0}> { y = Add(x, w) }
-    """
-    path = tmp_path / "add.onnx"
-    graph.save(parsed(text), path, external=True)
-
-    y = run_once(graph.load(path), {"x": np.zeros(2, np.float32)})["y"]
-
-    np.testing.assert_array_equal(y, [1, 2])
 
 
 def test_what_no_input_changes_is_constant_and_can_be_computed() -> None:

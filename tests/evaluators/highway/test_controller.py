@@ -21,7 +21,6 @@ from me2e_compress.simulator.bicycle import (
     advance,
     curvature_of,
     slip_of,
-    steering_of,
     steering_through,
 )
 from me2e_compress.simulator.plane_geometry import RoutePath
@@ -92,11 +91,6 @@ def test_the_steering_through_a_point_reaches_it(
     assert steering_through(forward, left, LENGTH_M) == pytest.approx(
         steering, abs=2e-3
     )
-
-
-@given(st.floats(-2.0, 2.0))
-def test_steering_never_exceeds_the_wheels(slip: float) -> None:
-    assert abs(steering_of(slip)) <= MAX_STEERING_RAD
 
 
 @given(st.floats(0.1, 30.0), st.floats(-30.0, 30.0))

@@ -347,13 +347,6 @@ def test_it_returns_from_off_the_route(y: float, heading: float) -> None:
     assert abs(offsets(world, drive(world, 6.0))[-1]) < 0.2
 
 
-def test_the_same_question_has_the_same_answer() -> None:
-    world = TinyWorld(straight(left_m=5.25), ego_at(), (actor(40.0, speed=3.0),))
-    first, second = decide_in(world), decide_in(world)
-    assert first.waypoints.tobytes() == second.waypoints.tobytes()
-    assert first.memory == second.memory
-
-
 def test_it_keeps_the_lane_that_it_has_chosen() -> None:
     world = TinyWorld(straight(left_m=5.25), ego_at(), (actor(60.0, speed=4.0),))
     chosen = decide_in(world, Memory(target_m=3.5))

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from me2e_compress.driving.adapter import Adapter
-from me2e_compress.driving.contract import Observation, Plan, RouteInfo
 from me2e_compress.driving.onnx_policy import OnnxPolicy
 from me2e_compress.errors import EvaluationError
 from me2e_compress.evaluators import Drive
@@ -221,23 +220,6 @@ CLOCK = {
 }
 
 
-@dataclasses.dataclass
-class Listening:
-    """Stands still, and writes down what the model answers."""
-
-    model: OnnxPolicy
-    heard: list[float] = dataclasses.field(default_factory=list)
-    needs_images: bool = False
-    privileged: bool = False
-
-    def reset(self, route: RouteInfo) -> None:
-        self.model.reset(route)
-
-    def plan(self, observation: Observation) -> Plan:
-        self.heard.append(float(planned(self.model, observation)[0, 0]))
-        return np.zeros((6, 2))
-
-
 @pytest.mark.parametrize("name", ["timestamp", "seconds"])
 def test_a_recurrent_model_knows_how_far_apart_its_frames_are(
     tmp_path: Path, name: str
@@ -253,21 +235,6 @@ def test_a_recurrent_model_knows_how_far_apart_its_frames_are(
             elapsed.append(planned(policy, seen)[0, 0])
 
     assert elapsed == pytest.approx([0.0, 0.35, 0.05] * 2)
-
-
-def test_the_clock_starts_with_the_route(tmp_path: Path) -> None:
-    """A plan of as many metres as seconds: the first decision is told 0."""
-    body = "plan = Add (zero, timestamp)"
-    clock = {**CLOCK, "inputs": "float[1] timestamp", "body": body}
-    clock["outputs"] = "float[1, 6, 2] plan"
-    model = straight_on(tmp_path / "m.onnx", **clock)  # type: ignore[arg-type]
-    policy = Listening(OnnxPolicy.open(model))
-
-    episode = drive(EXIT, policy, Drive())
-
-    decided = [decision.time_us / 1e6 for decision in episode.decisions]
-    assert policy.heard == pytest.approx(decided)
-    assert policy.heard[0] == 0.0
 
 
 def test_an_adapter_names_the_recurrent_pair(tmp_path: Path) -> None:

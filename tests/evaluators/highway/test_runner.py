@@ -11,7 +11,6 @@ import pytest
 
 from me2e_compress.driving.contract import Observation, PedalsAndWheel, RouteInfo
 from me2e_compress.driving.latency import FixedLatency, parse_latency
-from me2e_compress.errors import EvaluationError
 from me2e_compress.evaluators import Drive
 from me2e_compress.evaluators.highway.blind import Blind
 from me2e_compress.evaluators.highway.expert.expert_policy import Expert
@@ -195,11 +194,6 @@ def test_the_layout_of_the_can_bus() -> None:
     expected[17] = np.degrees(-0.5 + 0.1)
     assert bus.dtype == np.float32
     assert bus == pytest.approx(expected, abs=1e-4)
-
-
-def test_a_step_must_divide_50_ms() -> None:
-    with pytest.raises(EvaluationError, match="a step of 30 ms"):
-        Drive(dt_us=30_000)
 
 
 @dataclass
