@@ -113,29 +113,6 @@ def test_modes_that_nothing_picks_from_name_the_file(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("command_input", "default", "mode"), [("command", 0, 2), (None, 1, 1)]
-)
-def test_the_command_picks_the_mode(
-    command_input: str | None, default: int, mode: int
-) -> None:
-    adapter = PlanAdapter(
-        output="modes", command_input=command_input, default_mode=default
-    )
-    value = np.arange(36, dtype=np.float32).reshape(1, 3, 6, 2)
-
-    plan = adapter.plan({"modes": value}, {"command": np.array([2])})
-
-    np.testing.assert_array_equal(plan, value[0, mode])
-
-
-def test_a_mode_that_is_not_there_is_an_error() -> None:
-    adapter = PlanAdapter(output="modes", default_mode=3)
-
-    with pytest.raises(GraphError, match="mode 3 of modes: it has 3"):
-        adapter.plan({"modes": np.zeros((1, 3, 6, 2))}, {})
-
-
-@pytest.mark.parametrize(
     ("text", "message"),
     [
         ("{", "is not a plan"),

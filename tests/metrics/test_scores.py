@@ -1,14 +1,36 @@
 import dataclasses
 import math
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
+from me2e_compress.errors import EvaluationError
 from me2e_compress.metrics.bench2drive import ABILITIES
-from me2e_compress.metrics.episode import Ending, InfractionKind
-from me2e_compress.metrics.measure import Measure
+from me2e_compress.metrics.deadlines import charged, deadlines, deadlines_table
+from me2e_compress.metrics.episode import (
+    ConflictRecord,
+    Encounter,
+    Ending,
+    Episode,
+    InferenceRecord,
+    Infraction,
+    InfractionKind,
+)
+from me2e_compress.metrics.measure import Measure, percentile, too_few
+from me2e_compress.metrics.route_scores import (
+    at_fault_collision,
+    room_kept,
+    smallest_distance,
+    smallest_pet,
+    smallest_ttc,
+    ttc_exposure,
+)
+from me2e_compress.metrics.route_summary import RouteSummary
 from me2e_compress.metrics.scores import score
 from me2e_compress.workflows.evaluate import EvaluateResult
+from me2e_compress.workflows.options import check_budget
 from me2e_compress.workflows.result import Result
 from me2e_compress.workflows.score import ScoreResult, scores_table
 from tests.metrics.drives import cruise, drive, infraction
@@ -119,3 +141,173 @@ def test_both_commands_warn_of_failures(kind: type[Result]) -> None:
 
     assert found.status == "warning"
     assert "simulator failed (r1)" in found.alerts()[0]
+
+
+def encounter(pet_s: float, angle_deg: float) -> Encounter:
+    return Encounter(1, "car", 0, pet_s, math.radians(angle_deg), ego_first=True)
+
+
+def crash(at_fault: bool | None) -> Infraction:
+    found = infraction(InfractionKind.COLLISION_VEHICLE)
+    return dataclasses.replace(found, at_fault=at_fault)
+
+
+NEAR_MISS = drive(
+    conflicts=ConflictRecord(
+        nearest_m=(9.0, 3.5, None, 4.0),
+        ttc_s=(None, 1.5, 1.49, 0.8),
+        encounters=(encounter(0.4, 29.0), encounter(2.5, 90.0), encounter(3.0, 31.0)),
+    )
+)
+ALONE = drive(conflicts=ConflictRecord((None,), (None,), ()))
+
+
+def test_two_of_four_frames_were_a_conflict_and_the_smallest_of_a_route() -> None:
+    assert ttc_exposure(NEAR_MISS) == Measure(50.0, "%")
+    assert ttc_exposure(ALONE) == Measure(0.0, "%")
+    assert smallest_ttc(NEAR_MISS) == Measure(0.8, "s")
+    assert smallest_distance(NEAR_MISS) == Measure(3.5, "m")
+    assert smallest_pet(NEAR_MISS) == Measure(2.5, "s")
+    assert smallest_ttc(ALONE).reason == "no contact was ever within 10 s"
+    assert smallest_distance(ALONE).reason == "nobody else was there"
+    assert smallest_pet(ALONE).reason == "no paths crossed within 5 s"
+
+
+def test_room_is_kept_by_who_comes_near_nobody() -> None:
+    assert NEAR_MISS.conflicts is not None
+    close = dataclasses.replace(
+        NEAR_MISS.conflicts, encounters=(encounter(0.3, 60.0), encounter(2.0, 90.0))
+    )
+    found = [
+        room_kept(drive(*faults, conflicts=conflicts)).value
+        for faults, conflicts in (
+            ((), NEAR_MISS.conflicts),
+            ((), close),
+            ((crash(False),), close),
+            ((crash(True),), close),
+            ((), ALONE.conflicts),
+        )
+    ]
+
+    assert found == pytest.approx([50.0, 10.0, 10.0, 0.0, 100.0])
+    for faults in ((), (crash(True),), (crash(None),)):
+        episode = drive(*faults, conflicts=close)
+        assert RouteSummary.of(episode).room_kept == room_kept(episode).value
+    unknown = room_kept(drive(crash(None), conflicts=close))
+    assert unknown == Measure(None, "%", "whose fault a collision was is not known")
+
+
+@pytest.mark.parametrize(
+    "measure", [room_kept, ttc_exposure, smallest_ttc, smallest_distance, smallest_pet]
+)
+def test_what_was_not_recorded_is_not_measured(
+    measure: Callable[[Episode], Measure],
+) -> None:
+    assert measure(drive()).reason == "nobody recorded the distances to others"
+
+
+@pytest.mark.parametrize(
+    ("faults", "answer"),
+    [((), False), ((False,), False), ((None,), None), ((None, True), True)],
+)
+def test_whether_a_collision_was_the_egos_fault(
+    faults: tuple[bool | None, ...], answer: bool | None
+) -> None:
+    assert at_fault_collision(drive(*map(crash, faults))) is answer
+
+
+def test_the_rate_of_collisions_at_fault_and_none_of_one_unknown_fault() -> None:
+    found = score([drive(), drive(crash(False)), drive(crash(True)), drive()]).safety
+    unknown = score([drive(), drive(crash(None))]).safety
+
+    assert found.at_fault_collisions.value == 25.0
+    assert found.at_fault_collisions.n == 4
+    reason = "whose fault 1 collisions were is not known"
+    assert unknown.at_fault_collisions.measure == Measure(None, "%", reason)
+
+
+def test_percentiles_and_the_share_over_budget() -> None:
+    found = deadlines([1_000 * ms for ms in range(1, 1001)], 50.0)
+
+    assert found.to_json() == {
+        "budget_ms": 50.0,
+        "decisions": 1000,
+        "p50_ms": 500.0,
+        "p99_ms": 990.0,
+        "p99.9_ms": 999.0,
+        "mean_ms": 500.5,
+        "max_ms": 1000.0,
+        "over_budget_percent": 95.0,
+        "critical_mean_ms": None,
+        "other_mean_ms": None,
+    }
+
+
+def test_exactly_the_budget_is_in_time() -> None:
+    assert deadlines([50_000, 50_001]).over_percent.value == 50.0
+
+
+def test_a_percentile_of_too_few_is_not_measured() -> None:
+    found = deadlines([40_000] * 150)
+
+    assert found.percentiles_ms[99.0].value == 40.0
+    assert found.percentiles_ms[99.9].reason == "needs 1,000 samples, has 150"
+    shown = deadlines_table("trace", found)
+    assert [cell.text for cell in shown.rows[2]][:2] == ["p99.9", "-"]
+    assert "needs 1,000 samples, has 150" in shown.note
+
+
+def test_decisions_drawn_from_a_trace_tell_no_more_than_it() -> None:
+    found = deadlines([40_000] * 2478, measured=16)
+
+    assert found.count == 2478
+    assert found.percentiles_ms[50.0].value == 40.0
+    assert found.percentiles_ms[99.0].reason == "needs 100 samples, has 16"
+    assert found.percentiles_ms[99.9].reason == "needs 1,000 samples, has 16"
+
+
+@pytest.mark.parametrize(("percent", "least"), [(50, 2), (90, 10), (99, 100)])
+def test_one_sample_lies_beyond_a_percentile(percent: int, least: int) -> None:
+    assert too_few(percent, least - 1)
+    assert not too_few(percent, least)
+    assert percentile(range(least), percent) == least - 2
+
+
+def test_nothing_decided_is_not_zero() -> None:
+    found = deadlines([])
+
+    assert found.count == 0
+    assert found.over_percent.value is None
+    assert set(found.to_json().values()) == {50.0, 0, None}
+
+
+@pytest.mark.parametrize("budget_ms", [0.0, -1.0, float("nan"), float("inf")])
+def test_a_budget_is_positive(budget_ms: float) -> None:
+    with pytest.raises(EvaluationError, match="--budget-ms"):
+        check_budget(budget_ms)
+
+
+def test_a_tail_in_critical_frames_shows() -> None:
+    looked = ConflictRecord((None,) * 4, (None, 1.4, 1.5, 0.2), ())
+    taken = [(0, 100_000), (50_000, 250_000), (100_000, 100_000), (150_000, 350_000)]
+    episode = replace(
+        drive(conflicts=looked),
+        decisions=tuple(InferenceRecord(*each) for each in taken),
+    )
+
+    found = charged([episode, replace(episode, conflicts=None)])
+
+    assert found is not None
+    assert found.count == 8
+    assert found.critical_ms.value == 300.0
+    assert found.other_ms.value == 100.0
+    assert [row[0].text for row in deadlines_table("r", found).rows][-2:] == [
+        "mean, TTC below 1.5 s",
+        "mean, other frames",
+    ]
+
+
+def test_decisions_that_cost_nothing_have_no_deadlines() -> None:
+    free = replace(drive(), decisions=(InferenceRecord(0, 0),))
+
+    assert charged([free]) is None

@@ -7,11 +7,13 @@ import pytest
 
 from me2e_compress.errors import EvaluationError, StudyError
 from me2e_compress.evaluators.highway.engine import LocalEngine
-from me2e_compress.study import StudyResult, load_study
+from me2e_compress.runtime.profile import describe_machine
+from me2e_compress.runtime.providers import CpuProvider
+from me2e_compress.study import Study, StudyResult, Timing, load_study, run_study
 from me2e_compress.study.report.page import write_study
-from me2e_compress.study.run import run_study
 from me2e_compress.study.workload import PlannedDrive, Workload, workload
 from tests.evaluators.lanes import DRIVEN, install_lanes
+from tests.study.conftest import IDEAL, ROUTES, Here, Make
 
 TEXT = """
 title = "Lanes"
@@ -107,3 +109,45 @@ def test_a_short_study_takes_seconds_not_0_0_hours() -> None:
         "1 drive, 1 route, 0 of them driven; about 20 s on 1 worker" in ahead.headline
     )
     assert ahead.tables()[0].rows[0][-1].text == "20 s"
+
+
+# Whatever a study runs, it runs on its provider.
+
+
+@pytest.fixture
+def provided(make: Make, tmp_path: Path) -> Study:
+    """Two models on one route, with a library of operators."""
+    library = tmp_path / "operators.so"
+    library.touch()
+    return make(
+        variants=make().variants[1:3],
+        conditions=(IDEAL,),
+        routes=ROUTES[:1],
+        timing=Timing(1),
+        provider=CpuProvider(plugins=(library,)),
+    )
+
+
+@pytest.fixture
+def opened(monkeypatch: pytest.MonkeyPatch) -> list[tuple[Path, ...]]:
+    """The libraries of every session that is opened; none is loaded."""
+    found: list[tuple[Path, ...]] = []
+    monkeypatch.setattr(
+        CpuProvider, "attach", lambda self, options: found.append(self.plugins)
+    )
+    return found
+
+
+def test_every_session_of_a_study_is_on_its_provider(
+    provided: Study, opened: list[tuple[Path, ...]], tmp_path: Path
+) -> None:
+    folder = tmp_path / "out"
+
+    result = run_study(provided, folder, Here(), pictures=0)
+
+    assert set(opened) == {provided.provider.plugins}
+    (trace,) = (folder / "traces").glob("slow*")
+    machine = describe_machine(1, provided.provider)
+    assert json.loads(trace.read_text())["machine"] == machine
+    assert "operators.so" in machine
+    assert "operators.so" in result.to_json()["provider"]

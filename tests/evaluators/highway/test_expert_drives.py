@@ -1,10 +1,14 @@
 """The expert, through the controller, on the real world."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from me2e_compress.driving.realtime import HeldControl
+from me2e_compress.errors import EvaluationError
 from me2e_compress.evaluators import Drive
+from me2e_compress.evaluators.highway import generate as room
 from me2e_compress.evaluators.highway.controller import AnchoredPlan
 from me2e_compress.evaluators.highway.drivers import OnnxDriver
 from me2e_compress.evaluators.highway.expert.expert_policy import (
@@ -13,9 +17,18 @@ from me2e_compress.evaluators.highway.expert.expert_policy import (
     ceiling,
     decide,
 )
-from me2e_compress.evaluators.highway.generate import dry_run
+from me2e_compress.evaluators.highway.generate import (
+    Admission,
+    DryRun,
+    admitted_routes,
+    dry_run,
+    examine,
+    generate,
+    propose,
+    seed_of,
+)
 from me2e_compress.evaluators.highway.runner import drive
-from me2e_compress.metrics.episode import Ending
+from me2e_compress.metrics.episode import Ending, InfractionKind
 from me2e_compress.metrics.route_scores import route_score
 from me2e_compress.shipped.drivers import shipped
 from me2e_compress.simulator.plane_geometry import Floats
@@ -27,6 +40,7 @@ from me2e_compress.simulator.routes import (
 )
 from me2e_compress.simulator.scene import INFRACTIONS, Control
 from me2e_compress.simulator.world import World
+from tests.simulator.world.driving import route_of
 
 SEED = 77_001
 
@@ -101,3 +115,105 @@ def test_the_shipped_driver_passes_a_parked_car() -> None:
 
     assert (episode.ending, episode.infractions) == (Ending.COMPLETED, ())
     assert route_score(episode).composed == 100.0
+
+
+SAMPLE = pick_routes(load_routes(), "11")
+HIT = (InfractionKind.COLLISION_VEHICLE,)
+SOLVED = DryRun((), Ending.COMPLETED, True, False, 20.0)
+FAILED = DryRun(HIT, Ending.COLLISION, True, False, 9.0)
+UNMET = replace(SOLVED, triggered=False)
+LATE = DryRun((), Ending.BLOCKED, True, False, 75.0)
+BROKEN = DryRun((), Ending.POLICY_FAILED, True, False, 1.0, "ValueError: no")
+
+
+@pytest.mark.parametrize(
+    "route",
+    [
+        pytest.param(route, id=route.id, marks=pytest.mark.slow if index % 3 else ())
+        for index, route in enumerate(SAMPLE)
+    ],
+)
+def test_what_ships_is_admitted(route: object) -> None:
+    verdict = examine(next(one for one in SAMPLE if one is route))
+
+    assert verdict.refusal is None
+    assert len(verdict.blind) >= 2
+
+
+def test_a_route_without_its_event_is_refused() -> None:
+    verdict = examine(route_of("VehicleOpensDoorTwoWays", 1, door_m=1000.0))
+
+    assert "the scenario's event never happened" in str(verdict.refusal)
+
+
+def test_a_proposal_writes_out_every_parameter() -> None:
+    route = propose("EnterActorFlow", 5, "mine")
+
+    assert route.parameters == World(route).parameters
+    assert route.parameters == World(replace(route, seed=99)).parameters
+
+
+def test_a_proposal_of_an_unknown_type() -> None:
+    with pytest.raises(EvaluationError, match="no scenario 'Flying'; there are"):
+        propose("Flying", 0, "mine")
+
+
+def test_a_harvest_is_the_same_each_time_and_for_any_workers() -> None:
+    names = ("DynamicObjectCrossing", "ParkedObstacle")
+    once = [admitted_routes(name, 3, 1) for name in names]
+
+    assert list(generate(3, names, 1, workers=2)) == once
+    assert once[0].routes[0].id == "DynamicObjectCrossing_R2_0"
+    assert once[0].tried == 1 + len(once[0].refusals)
+
+
+def test_every_type_and_attempt_has_a_seed_of_its_own() -> None:
+    seeds = {seed_of(0, name, k) for name in ("Accident", "T_Junction") for k in (0, 1)}
+
+    assert len(seeds) == 4
+    assert seed_of(1, "Accident", 0) not in seeds
+
+
+@pytest.mark.parametrize(
+    ("expert", "blind", "again", "words"),
+    [
+        (FAILED, (FAILED,) * 3, None, "the expert commits: collisions_vehicle"),
+        (LATE, (FAILED,) * 3, None, "ends after 75 s: blocked"),
+        (BROKEN, (FAILED,) * 3, None, "ends after 1 s: ValueError: no"),
+        (replace(SOLVED, actors_crashed=True), (FAILED,) * 3, None, "two actors coll"),
+        (SOLVED, (SOLVED, FAILED, FAILED), SOLVED, None),
+        (None, (SOLVED, LATE), None, "no infraction at 8 and 12 m/s"),
+        (SOLVED, (FAILED,) * 3, FAILED, "with other traffic the expert commits"),
+        (SOLVED, (FAILED,) * 3, LATE, "with other traffic the expert ends after 75 s"),
+        (UNMET, (replace(FAILED, triggered=False),) * 2, UNMET, "never happened"),
+        (UNMET, (FAILED,) * 2, UNMET, None),
+        (None, (replace(FAILED, actors_crashed=True),), None, "two actors collide"),
+    ],
+)
+def test_why_a_route_is_admitted_or_refused(
+    expert: DryRun | None,
+    blind: tuple[DryRun, ...],
+    again: DryRun | None,
+    words: str | None,
+) -> None:
+    verdict = Admission(route_of(), expert, blind, again)
+
+    assert verdict.admitted == (words is None)
+    assert str(words) in str(verdict.refusal)
+
+
+def test_the_gate_drives_as_little_as_it_must(monkeypatch: pytest.MonkeyPatch) -> None:
+    driven = list[tuple[str, object]]()
+    outcomes = [SOLVED, FAILED, SOLVED, FAILED, FAILED, SOLVED, FAILED]
+
+    def drive(route: Route, policy: object) -> DryRun:
+        driven.append((type(policy).__name__, route.parameters.get("traffic")))
+        assert getattr(policy, "cameras_only", True)
+        return outcomes[len(driven) - 1]
+
+    monkeypatch.setattr(room, "dry_run", drive)
+
+    assert "blind" in str(examine(route_of()).refusal)
+    assert "with other traffic" in str(examine(route_of()).refusal)
+    assert [name for name, _ in driven] == ["Blind"] * 5 + ["Expert"] * 2
+    assert driven[-1][1] != driven[-2][1]
