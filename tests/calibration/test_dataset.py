@@ -33,10 +33,7 @@ def model() -> ir.Model:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (
-            {"y": np.zeros(1, np.float32)},
-            "000001.npz: y is not an input of the model; .*x, command",
-        ),
+        ({"y": np.zeros(1, np.float32)}, "000001.npz: y is not an input of the model"),
         (
             {"x": np.zeros((1, 3), np.float32)},
             r"x has shape \[1, 3\], expected \[1,2\]",

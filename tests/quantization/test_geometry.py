@@ -1,8 +1,10 @@
 """Geometry stays float, however its products are batched, and ends where it ends."""
 
+import re
 from collections.abc import Mapping
 
 import numpy as np
+import onnx_ir as ir
 import pytest
 
 from me2e_compress.quantization.plan import QuantPlan, make_plan
@@ -22,75 +24,65 @@ def planned(text: str, shapes: Mapping[str, tuple[int, ...]], rules: str) -> Qua
     return make_plan(net(OPSETS + text, weights), HEAD, RULE_SETS.parse(rules))
 
 
-PROJECTIONS: dict[str, tuple[str, dict[str, tuple[int, ...]]]] = {
-    "batched": (
-        "c (float[6,4,4] lidar2img, float[6,4,200] points) => (float[6,4,200] p)"
-        " { p = MatMul(lidar2img, points) }",
-        {"points": (6, 4, 200)},
-    ),
+PRODUCT = "p = MatMul(lidar2img, points)"
+PROJECTIONS = {
+    "batched": ("float[6,4,4] lidar2img, float[6,4,200] points", PRODUCT),
     "one column a point": (
-        "c (float[1,6,1,4,4] lidar2img, float[50,4,1] points)"
-        " => (float[1,6,50,4,1] p) { p = MatMul(lidar2img, points) }",
-        {"points": (50, 4, 1)},
+        "float[1,6,1,4,4] lidar2img, float[50,4,1] points",
+        PRODUCT,
     ),
     "expanded": (
-        "c (float[1,6,4,4] lidar2img, float[1,6,50,4,1] points)"
-        " => (float[1,6,50,4,1] p)"
-        " <int64[1] two = {2}, int64[5] all = {1, 6, 50, 4, 4}> {"
-        " u = Unsqueeze(lidar2img, two) e = Expand(u, all) p = MatMul(e, points) }",
-        {"points": (1, 6, 50, 4, 1)},
+        "float[1,6,4,4] lidar2img, float[1,6,50,4,1] points",
+        "u = Unsqueeze(lidar2img, two) e = Expand(u, all) p = MatMul(e, points)",
     ),
     "cameras stacked in rows": (
-        "c (float[1,6,4,4] lidar2img, float[4,200] points) => (float[24,200] p)"
-        " <int64[2] flat = {24, 4}> { m = Reshape(lidar2img, flat)"
-        " p = MatMul(m, points) }",
-        {"points": (4, 200)},
+        "float[1,6,4,4] lidar2img, float[4,200] points",
+        "m = Reshape(lidar2img, flat) p = MatMul(m, points)",
     ),
     "transposed": (
-        "c (float[6,4,4] lidar2img, float[6,4,4] ego) => (float[6,4,4] p) {"
-        " t = Transpose<perm = [0,2,1]>(lidar2img) p = MatMul(t, ego) }",
-        {"ego": (6, 4, 4)},
+        "float[6,4,4] lidar2img, float[6,4,4] ego",
+        "t = Transpose<perm = [0,2,1]>(lidar2img) p = MatMul(t, ego)",
     ),
-    "of many points": (
-        "c (float[6,4,4] lidar2img, float[4,40000] points) => (float[6,4,40000] p)"
-        " { p = MatMul(lidar2img, points) }",
-        {"points": (4, 40000)},
-    ),
+    "of many points": ("float[6,4,4] lidar2img, float[4,40000] points", PRODUCT),
     "as Gemm": (
-        "c (float[4,4] ego_pose, float[200,4] points) => (float[4,200] p)"
-        " { p = Gemm<transB = 1>(ego_pose, points) }",
-        {"points": (200, 4)},
+        "float[4,4] ego_pose, float[200,4] points",
+        "p = Gemm<transB = 1>(ego_pose, points)",
     ),
     "of an open number of cameras": (
-        "c (float[C,4,4] lidar2img, float[4,200] points) => (float[C,4,200] p)"
-        " { p = MatMul(lidar2img, points) }",
-        {"points": (4, 200)},
+        "float[C,4,4] lidar2img, float[4,200] points",
+        PRODUCT,
     ),
-    "of an unknown shape": (
-        "c (float lidar2img, float[4,200] points) => (float p)"
-        " { p = MatMul(lidar2img, points) }",
-        {"points": (4, 200)},
-    ),
+    "of an unknown shape": ("float lidar2img, float[4,200] points", PRODUCT),
     "inverted": (
-        "c (float[6,4,4] lidar2img, float[4,200] points) => (float p)"
-        " { i = trt.InverseTRT(lidar2img) p = MatMul(i, points) }",
-        {"points": (4, 200)},
+        "float[6,4,4] lidar2img, float[4,200] points",
+        "i = trt.InverseTRT(lidar2img) p = MatMul(i, points)",
     ),
     "after an Einsum": (
-        "c (float[6,4,4] lidar2img, float[4,4] ego, float[4,200] points) => (float p)"
-        ' { e = Einsum<equation = "nij,jk->nik">(lidar2img, ego)'
-        " p = MatMul(e, points) }",
-        {"ego": (4, 4), "points": (4, 200)},
+        "float[6,4,4] lidar2img, float[4,4] ego, float[4,200] points",
+        'e = Einsum<equation = "nij,jk->nik">(lidar2img, ego) p = MatMul(e, points)',
     ),
 }
 
 
+def projection(case: str) -> ir.Model:
+    """Build it; the points, and where the ego is, are weights."""
+    inputs, body = PROJECTIONS[case]
+    weights = {
+        name: np.ones([int(side) for side in sides.split(",")])
+        for sides, name in re.findall(r"float\[([\d,]+)\] (points|ego)\b", inputs)
+    }
+    constants = (
+        "int64[1] two = {2}, int64[5] all = {1,6,50,4,4}, int64[2] flat = {24,4}"
+    )
+    return net(f"{OPSETS}c ({inputs}) => (float p) <{constants}> {{ {body} }}", weights)
+
+
 @pytest.mark.parametrize("case", PROJECTIONS)
 def test_a_projection_stays_float_however_it_is_batched(case: str) -> None:
-    text, shapes = PROJECTIONS[case]
-
-    before = by_output(planned(text, shapes, "paper{without=[gemv]}"))["p"]
-    found = by_output(planned(text, shapes, ALONE))["p"]
+    before, found = (
+        by_output(make_plan(projection(case), HEAD, RULE_SETS.parse(rules)))["p"]
+        for rules in ("paper{without=[gemv]}", ALONE)
+    )
 
     assert before.dtype == "int8"
     assert (found.dtype, found.rule) == ("float", "geometry")
@@ -193,7 +185,5 @@ def test_the_default_keeps_geometry_in_float() -> None:
     rules = RULE_SETS.parse("safe").rules()
 
     assert Geometry() in rules
-    text, shapes = PROJECTIONS["batched"]
-    weights = {name: np.ones(shape) for name, shape in shapes.items()}
-    plan = make_plan(net(OPSETS + text, weights), HEAD)
+    plan = make_plan(projection("batched"), HEAD)
     assert (plan.rules, by_output(plan)["p"].rule) == ("safe", "geometry")

@@ -79,22 +79,13 @@ def test_names_of_the_source_file_match_too() -> None:
             '[[override]]\nnodes = "/planner/*"\ndtype = "float"',
             r"override nodes '/planner/\*' matches none of 10 nodes",
         ),
-        (
-            '[[concat]]\nnodes = "*"\nscale = "own"',
-            r"override concat '\*' matches none of 10 nodes",
-        ),
+        ('[[concat]]\nnodes = "*"\nscale = "own"', r"override concat '\*' matches non"),
         (
             '[[override]]\nop = "Softmax"\ndtype = "int8"',
             "override op 'Softmax': /head/Softmax cannot be int8: Softmax in|is no",
         ),
-        (
-            '[[override]]\ndtype = "float"',
-            "none of nodes, module, op and reads is given",
-        ),
-        (
-            '[[override]]\nop = "Conv"\ndtype = "fp8"',
-            "dtype fp8: only int8 and float are",
-        ),
+        ('[[override]]\ndtype = "float"', "none of nodes, module, op and reads is giv"),
+        ('[[override]]\nop = "Conv"\ndtype = "fp8"', "dtype fp8: only int8 and float"),
         ('[[override]]\nop = "Conv"\ndtype = "int4"', "dtype int4: only int8 and"),
         ('[[overide]]\nop = "Conv"\ndtype = "int8"', "overide: Extra inputs"),
         ("[[override", "not TOML"),

@@ -27,10 +27,7 @@ from tests.study.conftest import BLIND, FASTER, IDEAL, ROUTES, SLOW, Here, Make
         ({"baseline": "quick"}, "'quick' is not a variant; there are blind, slow"),
         ({"routes": ()}, "no route to drive"),
         ({"seed": -1}, "seed -1: must be 0 or more"),
-        (
-            {"pairs": (("slow.ideal", "slow.fog"),)},
-            r"pair: 'slow.fog' is no VARIANT.CONDITION",
-        ),
+        ({"pairs": (("slow.ideal", "slow.fog"),)}, r"pair: 'slow.fog' is no VARIANT.C"),
         (
             {"conditions": (Condition("device", "trace"),), "held_out": None},
             "condition device: the latency of slow is measured on held-out frames",
@@ -135,10 +132,7 @@ def test_options_that_do_not_go_together(options: dict[str, Any], words: str) ->
     [
         (Condition("even", mean_of="blind.later"), "mean_of 'blind.later' is no VARI"),
         (Condition("even", mean_of="nobody.ideal"), "mean_of 'nobody.ideal' is no"),
-        (
-            Condition("fog", "none", against="fog"),
-            "against 'fog' is not another condit",
-        ),
+        (Condition("fog", "none", against="fog"), "against 'fog' is not another condi"),
         (Condition("fog", "none", against="day"), "there are ideal, fog, later"),
     ],
 )

@@ -139,10 +139,7 @@ def test_a_model_that_breaks_the_contract_never_drives(
     ("text", "words"),
     [
         ("[inputs]\npicture = 'img'", "adapter inputs.picture"),
-        (
-            "[plan]\noutput = 'way'",
-            "no output way, which is named as the plan; there are plan",
-        ),
+        ("[plan]\noutput = 'way'", "no output way, which is named as the plan; there"),
         ("[inputs]\nimg = 'image'", "the adapter names input image; there are command"),
         ("[recurrent]\ncommand = 'x'", "the adapter names output x; there are plan"),
         ("axes = 'up'", "adapter axes"),
