@@ -44,7 +44,7 @@ def test_the_public_names_of_a_room_are_those_of_the_list(room: str) -> None:
 def test_completion_offers_every_public_name_and_room() -> None:
     offered = dir(me2e_compress)
 
-    assert set(me2e_compress.__all__) <= set(offered)
+    assert set(vars(me2e_compress)["__all__"]) <= set(offered)
     assert {"passes", "errors", "testing", "__doc__", "__file__"} <= set(offered)
     assert all(getattr(me2e_compress, name) is not None for name in offered if name)
 
@@ -63,8 +63,10 @@ def test_the_package_page_tells_the_function_of_every_command() -> None:
     without = set(re.findall(r"`(\w+)`", others))
 
     assert {*names, *without} >= COMMANDS.keys()
-    assert names - {"frames", "sensitivity", "study"} <= set(me2e_compress.__all__)
-    assert not without & set(me2e_compress.__all__)
+    assert names - {"frames", "sensitivity", "study"} <= set(
+        vars(me2e_compress)["__all__"]
+    )
+    assert not without & public
 
 
 @pytest.mark.parametrize("name", PASSES.names())

@@ -1,4 +1,9 @@
 import json
+import os
+import signal
+import subprocess
+import sys
+import time
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -200,6 +205,45 @@ def test_frames_that_are_none_are_named_before_anything_runs(
     with pytest.raises(StudyError, match=rf"^{which}: \S+/gone: no such folder"):
         run_study(asked, tmp_path / "out")
     assert not (tmp_path / "out").exists()
+
+
+ROOT = Path(__file__).parents[2]
+KILLED = """
+import sys
+from pathlib import Path
+from me2e_compress.study import load_study, run_study
+from tests.study.conftest import Here
+
+run_study(load_study(Path(sys.argv[1])), Path(sys.argv[2]), Here(), pictures=0)
+"""
+
+
+def test_a_study_that_was_killed_goes_on(tmp_path: Path) -> None:
+    toml = tmp_path / "study.toml"
+    toml.write_text(STUDY)
+    out, whole = tmp_path / "out", tmp_path / "whole"
+    words = [sys.executable, "-c", KILLED, str(toml), str(out)]
+    with subprocess.Popen(words, start_new_session=True, cwd=ROOT) as running:
+        limit = time.monotonic() + 300.0
+        while len(list(out.glob("results/*/routes/*.json"))) < 3:
+            assert running.poll() is None
+            assert time.monotonic() < limit
+            time.sleep(0.02)
+        os.killpg(running.pid, signal.SIGKILL)
+    done = {
+        (path.parts[-3].removesuffix(".ideal"), path.stem)
+        for path in out.glob("results/*/routes/*.json")
+    }
+    engine = Here()
+    names = {"blind": "blind", "blind:12": "faster"}
+
+    resumed = run_study(load_study(toml), out, engine, pictures=0)
+    driven = {(names[name], route) for name, route in engine.driven}
+
+    assert len(done) < 16
+    assert len(done) + len(engine.driven) == 16
+    assert not done & driven
+    assert resumed == run_study(load_study(toml), whole, Here(), pictures=0)
 
 
 def test_who_listens_hears_every_stage(make: Make, tmp_path: Path) -> None:

@@ -256,7 +256,7 @@ def test_recordings_are_found_by_the_name_of_the_drive(
     found = collect(tmp_path)
 
     assert len(found.episodes[0].frames) == 40
-    assert found.unrecorded == ()
+    assert found.unrecorded == []
 
 
 def test_the_recording_of_another_drive_is_not_taken(tmp_path: Path) -> None:
@@ -264,14 +264,14 @@ def test_the_recording_of_another_drive_is_not_taken(tmp_path: Path) -> None:
     earlier = GOOD["save_name"].replace("_36", "_11")
     write(tmp_path / earlier / "metric_info.json", recording())
 
-    assert collect(tmp_path).unrecorded == ("RouteScenario_1711_rep0",)
+    assert collect(tmp_path).unrecorded == ["RouteScenario_1711_rep0"]
 
 
 def test_a_recording_of_no_record_is_named(tmp_path: Path) -> None:
     write(tmp_path / "r.json", checkpoint(GOOD))
     stray = write(tmp_path / "saved" / "7" / "metric_info.json", recording())
 
-    assert collect(tmp_path).notes == (f"{stray}: of no record",)
+    assert collect(tmp_path).notes == [f"{stray}: of no record"]
 
 
 def test_of_two_recordings_one_counts_and_is_named(tmp_path: Path) -> None:
@@ -279,7 +279,7 @@ def test_of_two_recordings_one_counts_and_is_named(tmp_path: Path) -> None:
     first = write(tmp_path / "a" / GOOD["save_name"] / "m.json", recording(30))
     write(tmp_path / "b" / GOOD["save_name"] / "m.json", recording(40))
 
-    assert collect(tmp_path).notes == (f"{first}: one of 2 of the same drive",)
+    assert collect(tmp_path).notes == [f"{first}: one of 2 of the same drive"]
 
 
 def test_a_whole_recording_stands_in_for_a_broken_one(tmp_path: Path) -> None:
@@ -332,9 +332,9 @@ def test_steps_out_of_order_are_named(tmp_path: Path) -> None:
     as_text = {step: steps[step] for step in sorted(steps)}
     file = write(tmp_path / GOOD["save_name"] / "metric_info.json", as_text)
 
-    assert collect(tmp_path).notes == (
+    assert collect(tmp_path).notes == [
         f"{file}: steps out of order: comfort is of no drive",
-    )
+    ]
 
 
 def test_a_byte_order_mark_hides_nothing(tmp_path: Path) -> None:

@@ -18,14 +18,12 @@ from me2e_compress.evaluators.highway.expert.expert_policy import (
 from me2e_compress.evaluators.highway.expert.forecast import NOW_S, Forecast, forecast
 from me2e_compress.evaluators.highway.expert.futures import (
     BESIDE_M,
-    headway_cost,
-    sample,
-)
-from me2e_compress.evaluators.highway.expert.lateral_targets import (
     Options,
     Place,
     blocked_stretch,
+    headway_cost,
     lateral_targets,
+    sample,
 )
 from me2e_compress.simulator.plane_geometry import RoutePath
 from me2e_compress.simulator.scene import (

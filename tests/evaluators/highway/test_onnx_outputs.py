@@ -15,7 +15,7 @@ from me2e_compress.errors import EvaluationError
 from me2e_compress.evaluators.highway.drivers import OnnxDriver
 from me2e_compress.runtime.frames import Array
 from me2e_compress.runtime.plan_adapter import Floats, PlanAdapter
-from me2e_compress.workflows.check_model import check_model
+from me2e_compress.workflows.evaluate import check_model
 from tests.evaluators.highway.asked import observation
 from tests.evaluators.highway.drivers import EXIT, straight_on
 
