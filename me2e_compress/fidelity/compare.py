@@ -281,8 +281,11 @@ class Tally:
         sqnr, by_frame = decibels(self.signal, self.noise), self.frames_db
         spread = (min(by_frame), max(by_frame)) if len(by_frame) > 1 else (None, None)
         stray = self.strays / self.count if self.count else 0.0
-        more = (*spread, stray, *self._small())
-        return OutputFidelity(self.name, sqnr, error, self.discrete, *more)
+        small, small_db = self._small()
+        least, most = spread
+        return OutputFidelity(
+            self.name, sqnr, error, self.discrete, least, most, stray, small, small_db
+        )
 
     def _small(self) -> tuple[str, float | None]:
         """Return the channels below the first gap of sizes, and their SQNR."""

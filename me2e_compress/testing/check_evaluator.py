@@ -5,9 +5,8 @@ import json
 import tempfile
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import NamedTuple
 
 from me2e_compress.driving.latency import FixedLatency
 from me2e_compress.driving.policies import Driver
@@ -22,7 +21,8 @@ LATENCY_US = 250_000
 """What every decision is charged where an evaluator declares that it takes latency."""
 
 
-class _Silent(NamedTuple):
+@dataclass(frozen=True)
+class _Silent:
     on_progress: Callable[[str, int, int, str], None] = lambda *_: None
     on_warning: Callable[[str], None] = lambda _: None
 

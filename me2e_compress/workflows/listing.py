@@ -113,8 +113,14 @@ REGISTRIES: Mapping[str, Registry[Any]] = {
     "operators": OPERATORS,
 }
 """Registries to which other packages add."""
+
+
+def _described(kind: str) -> tuple[Entry, ...]:
+    return describe(REGISTRIES[kind])
+
+
 KINDS: Mapping[str, Callable[[], tuple[Entry, ...]]] = {
-    **{kind: partial(describe, each) for kind, each in REGISTRIES.items()},
+    **{kind: partial(_described, kind) for kind in REGISTRIES},
     "recipes": lambda: tuple(
         _file(path)
         for path in sorted(

@@ -149,7 +149,8 @@ class RealRun:
             *("crashed", "missing", "foreign", "repeated", "rerun"),
             *("contradictory", "unrecorded"),
         )
-        return {n: getattr(self.collected, n) for n in names} | {"stood": self.stood}
+        named: dict[str, Sequence[str]] = {n: getattr(self.collected, n) for n in names}
+        return {**named, "stood": self.stood}
 
     def _stated(self) -> Iterator[str]:
         """Yield where merged files contradict their own records."""

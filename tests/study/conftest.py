@@ -11,7 +11,7 @@ import pytest
 from me2e_compress.driving.policies import Driver
 from me2e_compress.evaluators import Drive
 from me2e_compress.evaluators.contract import Driven
-from me2e_compress.evaluators.highway.runner import drive
+from me2e_compress.evaluators.highway import runner
 from me2e_compress.simulator.routes import Route
 from me2e_compress.study import (
     Condition,
@@ -40,11 +40,11 @@ class Here:
     driven: list[tuple[str, str]] = field(default_factory=list)
 
     def drive(
-        self, policy: Driver, asked: Drive, routes: Sequence[Route]
+        self, policy: Driver, drive: Drive, routes: Sequence[Route]
     ) -> Iterator[Driven]:
         for route in routes:
             self.driven.append((policy.label, route.id))
-            yield Driven(drive(route, policy.open(), asked), 0.0, 0)
+            yield Driven(runner.drive(route, policy.open(), drive), 0.0, 0)
 
 
 @pytest.fixture(scope="session")

@@ -141,7 +141,7 @@ def test_results_of_another_evaluation_are_not_mixed(
     before = contents(results)
 
     with pytest.raises(EvaluationError, match=f"another evaluation: its {key}"):
-        driven(results, **{"routes": TWO} | changed)
+        driven(results, **dict[str, Any](routes=TWO) | changed)
     assert contents(results) == before
 
 

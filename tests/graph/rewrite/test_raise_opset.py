@@ -74,7 +74,9 @@ def test_a_graph_of_an_old_opset_answers_the_same(op: str) -> None:
     onnx.checker.check_model(raised, full_check=True)
     answers = ort.InferenceSession(raised.SerializeToString()).run(None, {"x": x})
     for one, other in zip(expected, answers, strict=True):
-        np.testing.assert_allclose(one, other, rtol=1e-6, atol=1e-6)
+        np.testing.assert_allclose(
+            np.asarray(one), np.asarray(other), rtol=1e-6, atol=1e-6
+        )
     assert all(provenance.read(node) is not None for node in nodes_of(model))
 
 
