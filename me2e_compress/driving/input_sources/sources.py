@@ -64,6 +64,7 @@ class YawRate(InputSource):
 
 
 Quantity = Literal["x", "y", "heading", "speed"]
+MOST = 1000  # steps or classes of an input: more is a slip, and memory without end
 
 
 @dataclass(frozen=True)
@@ -90,10 +91,10 @@ class Past(InputSource):
     newest_first: bool = False
 
     def __post_init__(self) -> None:
-        if self.steps < 1 or not 0.0 < self.spacing_s < float("inf"):
+        if not 1 <= self.steps <= MOST or not 0.0 < self.spacing_s < float("inf"):
+            apart = f"{self.steps} steps {self.spacing_s:g} s apart"
             raise EvaluationError(
-                f"past: {self.steps} steps {self.spacing_s:g} s apart: both must be"
-                " positive"
+                f"past: {apart}: both are positive, steps up to {MOST}"
             )
 
     def value(self, seen: Observed) -> Array:
@@ -202,13 +203,11 @@ class NavigationCommand(InputSource):
     one_hot: int = 0
 
     def __post_init__(self) -> None:
-        if self.one_hot and not 0 <= min(self.numbers) <= max(self.numbers) < (
-            self.one_hot
-        ):
-            raise EvaluationError(
-                f"command: numbers {list(self.numbers)} do not fit one_hot = "
-                f"{self.one_hot} classes"
-            )
+        fit = 0 <= min(self.numbers) <= max(self.numbers) < self.one_hot <= MOST
+        if self.one_hot and not fit:
+            numbers = list(self.numbers)
+            classes = f"one_hot = {self.one_hot} classes, of {MOST} at most"
+            raise EvaluationError(f"command: numbers {numbers} do not fit {classes}")
 
     def value(self, seen: Observed) -> Array:
         """Return int64 [], or float32 [classes]."""

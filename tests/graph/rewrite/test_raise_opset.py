@@ -34,8 +34,6 @@ OPERATORS: dict[str, tuple[int, dict[str, Any], tuple[list[float], ...], int]] =
     "Dropout": (7, {"ratio": 0.5}, (), 1),
     "BatchNormalization": (8, {}, ([1, 2, 3, 4], [1, 0, 1, 0], [0] * 4, [4] * 4), 1),
     "TopK": (9, {"k": 3, "axis": 1}, (), 2),
-    "Flatten": (8, {"axis": 2}, (), 1),
-    "ArgMax": (11, {"axis": 1}, (), 1),
 }
 
 
