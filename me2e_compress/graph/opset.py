@@ -86,25 +86,6 @@ def _since(node: ir.Node, opset: int) -> int:
     return int(onnx.defs.get_schema(node.op_type, opset, "").since_version)
 
 
-def newer(model: ir.Model, opset: int) -> str | None:
-    """Write the nodes of a graph in a newer opset; return why that cannot be done.
-
-    The import stays as it is; functions keep the opset that they import.
-    """
-    before, known = opset_of(model), onnx.defs.onnx_opset_version()
-    if opset > known:
-        return f"onnx {onnx.__version__} converts to {known} at most"
-    changed = [
-        (node, before)
-        for node in model.graph.all_nodes()
-        if changed_since(node, before, opset)
-    ]
-    if failure := _write_in(model, changed, opset):
-        node, _, reason = failure
-        return f"{node.op_type} {node.name!r} cannot be written in {opset}: {reason}"
-    return None
-
-
 def _write_in(
     model: ir.Model, nodes: Sequence[tuple[ir.Node, int]], opset: int
 ) -> tuple[ir.Node, int, str] | None:

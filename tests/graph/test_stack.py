@@ -159,7 +159,11 @@ def test_names_that_two_parts_have_are_told_apart(tmp_path: Path) -> None:
 
 
 def test_an_older_part_is_written_in_the_opset_of_the_newest(tmp_path: Path) -> None:
-    path = write_stack(tmp_path, head=HEAD.replace('"" : 17', '"" : 16'))
+    back = "Unsqueeze<axes = [0]>(t) kept = Sub(u, learned)"  # an attribute till 13
+    there = f"t = Squeeze<axes = [0]>(next_bev) u = {back}"
+    head = HEAD.replace("kept = Sub(next_bev, learned)", there)
+    head = head.replace('"" : 17', '"" : 11')
+    path = write_stack(tmp_path, head=head)
 
     assert graph.opset_of(JoinedStack.load(path).model) == 17
     plans = [each["plan"][0, 0, 0] for each in replay(joined(path), ones(True))]

@@ -74,12 +74,10 @@ backbone (float[1,4] img, float[1,4] next_bev) => (float[1,4] feats)
             TWO_PARTS,
             {
                 "head": HEAD.replace('"" : 17', '"" : 11').replace(
-                    "kept = Sub(next_bev, learned)",
-                    "thin = Squeeze<axes = [0]>(next_bev)"
-                    " wide = Unsqueeze<axes = [0]>(thin) kept = Sub(wide, learned)",
+                    "Sub(next_bev, learned)", "Hardmax(next_bev)"
                 )
             },
-            "head.onnx is written in opset 11, backbone.onnx in 17, and Squeeze",
+            "head.onnx is written in opset 11, backbone.onnx in 17, and Hardmax",
         ),
         ('[[part]]\nname = "a.b"\nfile = "head.onnx"\n', {}, "letters, digits"),
         ('[[part]]\nname = "a"\n', {}, "part.0.file: Field required"),

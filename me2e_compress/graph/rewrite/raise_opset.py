@@ -23,7 +23,7 @@ _SCAN_AS_IS = 9
 _RESIZE_AS_IS = 11
 """The first opset whose Resize says how coordinates are made. Earlier ones, and
 Upsample, are asymmetric (onnx/docs/Changelog.md, Resize-11), which the converter of
-onnx 1.22 does not write; onnxruntime takes the left neighbour where it enlarges, the
+onnx 1.23 does not write; onnxruntime takes the left neighbour where it enlarges, the
 right one where it shrinks (GetNearestPixelFromOriginal, ``SIMPLE``)."""
 
 

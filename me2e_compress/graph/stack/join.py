@@ -11,8 +11,8 @@ import onnx_ir as ir
 
 from me2e_compress.errors import GraphError
 from me2e_compress.graph.nodes import STANDARD, graphs_of, nodes_of, opset_of
-from me2e_compress.graph.opset import newer
 from me2e_compress.graph.recurrence import RECURRENT, SessionPort, recurrence
+from me2e_compress.graph.rewrite.raise_opset import raise_opset
 from me2e_compress.graph.stack.stack_file import Part, StackFile
 from me2e_compress.registry import documents
 
@@ -442,8 +442,8 @@ def _write_one_opset(parts: Parts, models: Mapping[str, ir.Model]) -> None:
     for part, opset in opsets.items():
         if opset == opsets[newest] or not opset:
             continue
-        reason = newer(models[part], opsets[newest])
-        if reason is not None:
+        _, reason = raise_opset(models[part], opsets[newest], "join")
+        if reason:
             here, there = parts[part].path, parts[newest].path
             raise GraphError(
                 f"{here.name} is written in opset {opset}, {there.name} in"

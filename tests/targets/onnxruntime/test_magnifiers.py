@@ -27,7 +27,5 @@ GRAPH = """g (float[1,2,4,4] x) => (float[1,2,4,4] y)
 )
 def test_what_magnifies_the_rounding_is_named(readers: str, named: str | None) -> None:
     said = objection(parsed(GRAPH % readers).graph[0])
-    if named is None:
-        assert said is None
-    else:
-        assert said == f"it writes uint8, whose rounding {named} magnifies"
+    sentence = f"it writes uint8, whose rounding {named} magnifies"
+    assert said == (named and sentence)
