@@ -46,7 +46,6 @@ if TYPE_CHECKING:  # what a type checker sees; at run time names load when asked
     from me2e_compress.workflows.compare_dump import compare_dump as compare_dump
     from me2e_compress.workflows.compress import CompressResult as CompressResult
     from me2e_compress.workflows.compress import compress as compress
-    from me2e_compress.workflows.evaluate import EvaluateOptions as EvaluateOptions
     from me2e_compress.workflows.evaluate import EvaluateResult as EvaluateResult
     from me2e_compress.workflows.evaluate import ModelCheck as ModelCheck
     from me2e_compress.workflows.evaluate import check_model as check_model
@@ -67,6 +66,7 @@ if TYPE_CHECKING:  # what a type checker sees; at run time names load when asked
     from me2e_compress.workflows.options import CompareOptions as CompareOptions
     from me2e_compress.workflows.options import CompressOptions as CompressOptions
     from me2e_compress.workflows.options import EerOptions as EerOptions
+    from me2e_compress.workflows.options import EvaluateOptions as EvaluateOptions
     from me2e_compress.workflows.options import FramesOptions as FramesOptions
     from me2e_compress.workflows.options import GraphOptions as GraphOptions
     from me2e_compress.workflows.options import InspectOptions as InspectOptions
@@ -107,18 +107,15 @@ _ROOMS = {
     ),
     "workflows.compare_dump": "DumpResult compare_dump",
     "workflows.compress": "CompressResult compress",
-    "workflows.evaluate": (
-        "EvaluateOptions EvaluateResult ModelCheck check_model evaluate"
-    ),
+    "workflows.evaluate": "EvaluateResult ModelCheck check_model evaluate",
     "workflows.files": "EngineResult JoinResult SplitResult build join split",
     "workflows.frames": "record_frames",
     "workflows.inspect": "InspectResult inspect",
     "workflows.lint": "LintResult lint",
     "workflows.options": (
-        "BuildOptions CalibrateOptions CompareOptions CompressOptions "
-        "EerOptions FramesOptions GraphOptions InspectOptions LintOptions "
-        "PlanOptions ProfileOptions SearchOptions SensitivityOptions "
-        "WriteOptions"
+        "BuildOptions CalibrateOptions CompareOptions CompressOptions EerOptions "
+        "EvaluateOptions FramesOptions GraphOptions InspectOptions LintOptions "
+        "PlanOptions ProfileOptions SearchOptions SensitivityOptions WriteOptions"
     ),
     "workflows.plan": "PlanResult plan",
     "workflows.profile": "ProfileResult profile",

@@ -7,13 +7,15 @@ from me2e_compress.cli.console import is_json, listening, say, show, show_of, te
 from me2e_compress.errors import OptionError
 from me2e_compress.extras import need_extra
 from me2e_compress.metrics import BUDGET_MS
-from me2e_compress.simulator.scenarios import VARIANTS
 from me2e_compress.workflows.options import (
     EerOptions,
-    GraphOptions,
+    EvaluateOptions,
+    RoutesOptions,
+    WorkerOptions,
     WriteOptions,
-    check_count,
 )
+
+RUNNING = WorkerOptions()
 
 
 def evaluate(
@@ -22,17 +24,7 @@ def evaluate(
     *,
     output: Output | None = None,
     check: bool = False,
-    routes: str = "all",
-    latency: str = "none",
-    seed: int = 0,
-    workers: int = 1,
-    weather: str = "",
-    drive_on: bool = False,
-    engine: str = "local",
-    render: str | None = None,
-    evaluator: str = "highway",
-    model: GraphOptions | None = None,
-    writing: WriteOptions = WRITING,
+    options: EvaluateOptions | None = None,
 ) -> None:
     """Drive a policy over routes of highway-env; run it again to go on.
 
@@ -44,53 +36,25 @@ def evaluate(
         policy: M.onnx, highway, expert, onnx{path=M.onnx,...}; see list
         output: the results folder
         check: say what fits and what is missing, drive nothing
-        routes: routes: all, a number, ID,ID; or a file of routes
-        latency: none, fps:F, trace:FILE, measured, or see list
-        seed: seed of everything random
-        workers: processes at a time
-        weather: fog_m=80,night=0.5 ...
-        drive_on: go on after a collision, as Bench2Drive
-        engine: local, ray, or ray:ADDRESS of a cluster
-        render: draw this route as GIF and PNG
-        evaluator: who drives it: highway, NAME{option=value}, or see list
     """
     from me2e_compress.workflows import evaluate as workflow
 
-    model = model or GraphOptions()
-    adapter, module_map, provider = model.adapter, model.module_map, model.runs_on
     # --check drives nothing, and needs no folder
     if check:
         if policy is None:
             raise OptionError("--check needs a policy: POLICY")
         with listening() as listener:
-            checked = workflow.check_model(
-                policy, adapter, provider, listener, module_map
-            )
+            checked = workflow.check_model(policy, options, listener)
         show(checked)
         checked.check()
         return
     if output is None:
         raise OptionError("driving needs -o RESULTS/")
-    check_count("--seed", seed)
-    check_count("--workers", workers, least=1)
-    engine_name, address = engine_and_address(engine)
-    options = workflow.EvaluateOptions(
-        routes=routes, latency=latency, seed=seed, workers=workers, adapter=adapter,
-        module_map=None if module_map is None else str(module_map), weather=weather,
-        drive_on=drive_on, engine=engine_name, address=address, render=render,
-        provider=provider, force=writing.force, evaluator=evaluator,
-    )  # fmt: skip
     with listening() as listener:
         result = workflow.evaluate(policy, output, options, listener)
     show(result)
     for file in result.pictures:
         tell(f"wrote {file}")
-
-
-def engine_and_address(text: str) -> tuple[str, str | None]:
-    """Split ``ray:ADDRESS``; None stands for a cluster of its own, or for none."""
-    name, _, address = text.partition(":")
-    return name, address or None
 
 
 def score(
@@ -134,8 +98,7 @@ def study(
     dry_run: bool = False,
     provider: str | None = None,
     trust_code: bool = False,
-    workers: int = 1,
-    engine: str = "local",
+    running: WorkerOptions = RUNNING,
     writing: WriteOptions = WRITING,
 ) -> None:
     """Drive variants under conditions and compare them; run it again to go on.
@@ -148,11 +111,9 @@ def study(
         dry_run: count drives and hours, drive nothing
         provider: runs the graph: cpu, cuda, ...; not the study's
         trust_code: run Python and libraries that it names
-        workers: processes at a time
-        engine: local, ray, or ray:ADDRESS of a cluster
     """
     need_extra("highway", "a study")
-    from me2e_compress.evaluators.highway.engine import engine_of
+    from me2e_compress.evaluators.highway.engine import engine_named
     from me2e_compress.study import load_study
     from me2e_compress.study.report.page import write_study
     from me2e_compress.study.run import run_study
@@ -166,7 +127,7 @@ def study(
         asked = asked.of_blocks(tables.split(","))
     inputs = (definition, *asked.inputs())
     check_folder(output, inputs, (JSON, MARKDOWN, HTML))
-    ahead = workload(asked, output, workers)
+    ahead = workload(asked, output, running.workers)
     if dry_run:
         show(ahead)
         return
@@ -182,9 +143,8 @@ def study(
     # drive, or go on, and write the report
     tell(ahead.headline)
     with listening() as listener:
-        name, address = engine_and_address(engine)
-        chosen_engine = engine_of(name, workers, address)
-        found = run_study(asked, output, chosen_engine, listener, force=writing.force)
+        engine = engine_named(running.engine, running.workers)
+        found = run_study(asked, output, engine, listener, force=writing.force)
         files = write_study(found, output, words, force=writing.force)
     show(found)
     if not is_json():
@@ -194,21 +154,13 @@ def study(
 def routes(
     *,
     output: Output | None = None,
-    seed: int = 0,
-    variants: int = VARIANTS,
-    scenarios: str = "all",
-    workers: int = 1,
     examine: Path | None = None,
-    writing: WriteOptions = WRITING,
+    options: RoutesOptions | None = None,
 ) -> None:
     """Make a fresh set of admitted routes, or examine an existing set again.
 
     Args:
         output: the manifest to write
-        seed: seed of everything random
-        variants: routes of each type
-        scenarios: scenario types: all, or NAME,NAME
-        workers: processes at a time
         examine: examine this manifest instead of making one
     """
     from me2e_compress.workflows import routes as workflow
@@ -218,7 +170,4 @@ def routes(
         return
     if output is None:
         raise OptionError("a new set needs -o ROUTES.json")
-    check_count("--variants", variants, least=1)
-    check_count("--workers", workers, least=1)
-    options = workflow.RoutesOptions(seed, variants, scenarios, workers, writing.force)
     show_of(workflow.make_routes, output, options)

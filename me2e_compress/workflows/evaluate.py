@@ -16,100 +16,58 @@ from me2e_compress.driving.policies import POLICIES, Driver, driver_named, opene
 from me2e_compress.errors import EvaluationError, FramesError, GraphError
 from me2e_compress.evaluators.contract import Drive, Evaluator, evaluator_named
 from me2e_compress.evaluators.highway.drivers import OnnxDriver
-from me2e_compress.evaluators.highway.engine import engine_of
+from me2e_compress.evaluators.highway.engine import engine_named
 from me2e_compress.evaluators.results import MANIFEST, drive_routes, log_beside
 from me2e_compress.metrics.deadlines import Deadlines, charged, deadlines_table
 from me2e_compress.metrics.scores import Scores
 from me2e_compress.metrics.scores import score as score_episodes
 from me2e_compress.registry import options_of
-from me2e_compress.runtime.providers import CPU, Provider
+from me2e_compress.runtime.providers import CPU
 from me2e_compress.runtime.session import Session
 from me2e_compress.shipped.drivers import SHIPPED
 from me2e_compress.simulator.routes import Route, pick_routes
 from me2e_compress.targets.onnxruntime import slow_here
 from me2e_compress.workflows.checks import check_folder, model_path, try_first, writing
+from me2e_compress.workflows.options import EvaluateOptions, GraphOptions
 from me2e_compress.workflows.result import SILENT, Listener, Result, Shown
 from me2e_compress.workflows.score import driving_score, scores_table
 
 _FLAGS = {"module_map": "map"}
 """Command-line names of options that differ from their Python names."""
-_ABILITIES = {"seed": "latency", "workers": "engine", "address": "engine"}
+_ABILITIES = {"seed": "latency", "workers": "engine"}
 """What an evaluator must take for an option, where that has another name."""
 _FOR_ALL = ("evaluator", "force")
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class EvaluateOptions:
-    """Which routes are driven, under which conditions and where, in words.
+def drive_of(options: EvaluateOptions, evaluator: Evaluator) -> Drive:
+    """Read the words, for an evaluator that must take what they ask for.
 
-    Attributes:
-        routes: ``all``, a number, ``ID,ID`` or a file of routes.
-        latency: what a decision costs: ``none``, ``fps:F``, ``trace:FILE``,
-            ``measured``.
-        seed: seed of the draws from a trace.
-        latency_model: ``drop`` the decisions due meanwhile, or ``fifo``: delay every
-            control.
-        dt_ms: time step of the simulation, in milliseconds; results at different steps
-            are not compared.
-        weather: ``fog_m=80,night=0.5,dropped=BACK+FRONT``; empty is what each route
-            says.
-        drive_on: go on after a collision, as Bench2Drive does; every collision then
-            multiplies the score.
-        workers: routes at a time.
-        engine: ``local``, processes of this machine, or ``ray``, a cluster.
-        address: address of a running Ray cluster; None starts one.
-        adapter: TOML file that adapts the model to the policy contract.
-        module_map: preset or TOML file that says plan and state of the model; None
-            leaves them to its metadata.
-        provider: what runs the model; policies other than graphs ignore it.
-        render: draw these routes as GIF and PNG; chosen as ``routes`` is.
-        force: replace outputs that we did not write, too.
-        evaluator: who drives, ``name{option=value}``; it takes those of the options
-            above that it declares.
+    Raises:
+        EvaluationError: An option is invalid, or not the evaluator's.
     """
-
-    routes: str = "all"
-    latency: str = "none"
-    seed: int = 0
-    latency_model: str = "drop"
-    dt_ms: float = 50.0
-    weather: str = ""
-    drive_on: bool = False
-    workers: int = 1
-    engine: str = "local"
-    address: str | None = None
-    adapter: str | Path | None = None
-    module_map: str | None = None
-    provider: Provider = CPU
-    render: str | None = None
-    force: bool = False
-    evaluator: str = "highway"
-
-    def drive(self, evaluator: Evaluator) -> Drive:
-        """Read the words, for an evaluator that must take what they ask for.
-
-        Raises:
-            EvaluationError: An option is invalid, or not the evaluator's.
-        """
-        for field in dataclasses.fields(self):
-            if (
-                field.name not in _FOR_ALL
-                and getattr(self, field.name) != field.default
-            ):
-                flag = _FLAGS.get(field.name, field.name.replace("_", "-"))
-                ability = _ABILITIES.get(field.name, field.name)
-                evaluator.check_takes([ability], f"--{flag}: ")
-        routes: Sequence[RouteInfo] = ()
-        set_size = 0
-        if "routes" in evaluator.takes:
-            routes, set_size = evaluator.routes(self.routes)
-        return dataclasses.replace(
-            Drive.of_words(self.latency_model, self.dt_ms, self.weather, self.drive_on),
-            latency=parse_latency(self.latency, seed=self.seed),
-            routes=routes,
-            set_size=set_size,
-            engine=engine_of(self.engine, self.workers, self.address),
-        )
+    usual, provider = EvaluateOptions(), options.runs_on
+    for field in dataclasses.fields(options):
+        name = field.name
+        asked = getattr(options, name) != getattr(usual, name)
+        if name == "provider":
+            asked = provider != CPU
+        if asked and name not in _FOR_ALL:
+            flag = _FLAGS.get(name, name.replace("_", "-"))
+            evaluator.check_takes([_ABILITIES.get(name, name)], f"--{flag}: ")
+    routes: Sequence[RouteInfo] = ()
+    set_size = 0
+    if "routes" in evaluator.takes:
+        routes, set_size = evaluator.routes(options.routes)
+    conditions = Drive.of_words(
+        options.latency_model, options.dt_ms, options.weather, options.drive_on
+    )
+    return dataclasses.replace(
+        conditions,
+        latency=parse_latency(options.latency, seed=options.seed),
+        routes=routes,
+        set_size=set_size,
+        engine=engine_named(options.engine, options.workers),
+    )
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
@@ -197,18 +155,17 @@ def _evaluated(
     options: EvaluateOptions,
     listener: Listener,
 ) -> EvaluateResult:
-    drive = options.drive(evaluator)
+    drive = drive_of(options, evaluator)
     pictured: Sequence[RouteInfo] = ()
     if options.render is not None:  # of those that are driven; it reads their ids alone
         pictured = pick_routes(cast("Sequence[Route]", drive.routes), options.render)
     # find the driver, and open its graph in a process of its own first
     driver = None
     if policy is not None:
-        adapter, module_map = options.adapter, options.module_map
-        driver = driver_of(str(policy), adapter, options.provider, module_map)
+        driver = driver_of(str(policy), options)
     if isinstance(driver, OnnxDriver):
         file = driver.path
-        try_first(file, file.name, listener=listener, provider=options.provider)
+        try_first(file, file.name, listener=listener, provider=options.runs_on)
     # drive, or go on where an earlier run stopped
     episodes = drive_routes(evaluator, driver, drive, output, listener)
     # score over the whole set, though only a part of it was asked for
@@ -223,29 +180,24 @@ def _evaluated(
     late = charged(episodes, measured=drive.latency.measured)
     slow = None
     if isinstance(driver, OnnxDriver):
-        slow = slow_here(graph.load(driver.path), options.provider)
+        slow = slow_here(graph.load(driver.path), options.runs_on)
     name = evaluator.name if policy is None else str(policy)
     return EvaluateResult(name, output, scores, pictures, late, slow)
 
 
-def driver_of(
-    text: str,
-    adapter: str | Path | None = None,
-    provider: Provider = CPU,
-    module_map: str | Path | None = None,
-) -> Driver:
+def driver_of(text: str, options: GraphOptions) -> Driver:
     """Return the driver of a policy name, a path or a shipped model's name.
 
     Policies other than graphs ignore the provider.
     """
     if text in SHIPPED:  # by its path, which a file of that name may be instead
         text = str(model_path(text))
-    driver = driver_named(text, adapter, module_map)
+    driver = driver_named(text, options.adapter, options.module_map)
     if not isinstance(driver, OnnxDriver):
         return driver
     try:
         path = model_path(driver.path)
-        return dataclasses.replace(driver, path=path, provider=provider)
+        return dataclasses.replace(driver, path=path, provider=options.runs_on)
     except GraphError as error:
         policies = ", ".join(POLICIES.names())
         raise EvaluationError(f"{error}; policies: {policies}") from error
@@ -288,16 +240,14 @@ class ModelCheck(Result):
 
 def check_model(
     policy: str | Path,
-    adapter: str | Path | None = None,
-    provider: Provider = CPU,
+    options: GraphOptions | None = None,
     listener: Listener = SILENT,
-    module_map: str | Path | None = None,
 ) -> ModelCheck:
     """Check whether a policy could drive: open it, match its ports, run it on zeros.
 
-    The policy is an ONNX file or any other that :func:`evaluate` drives; an adapter is
-    the TOML file that adapts a model to the policy contract, a module map says which
-    output is the plan and which are fed back.
+    The policy is an ONNX file or any other that :func:`evaluate` drives; the options'
+    adapter is the TOML file that adapts a model to the policy contract, the module map
+    says which output is the plan and which are fed back.
 
     Raises:
         EvaluationError: The policy or adapter does not exist, or the file is no model.
@@ -305,13 +255,16 @@ def check_model(
         ProviderError: The provider is not available.
     """
     named = str(policy)
-    driver = driver_of(named, adapter, provider, module_map)
+    options = options or GraphOptions()
+    driver = driver_of(named, options)
     # a policy without a graph has no ports: opening it is the check
     if not isinstance(driver, OnnxDriver):
         opened(driver)
         return ModelCheck(named, "what its code answers", (), (), ())
     # the ports are read without a policy, which would refuse at the first problem
-    try_first(driver.path, driver.path.name, listener=listener, provider=provider)
+    try_first(
+        driver.path, driver.path.name, listener=listener, provider=options.runs_on
+    )
     read = Adapter() if driver.adapter is None else Adapter.load(driver.adapter)
     try:
         session = Session(

@@ -18,6 +18,7 @@ from cyclopts import Parameter, Token
 from me2e_compress.errors import EvaluationError, OptionError, RecipeError
 from me2e_compress.fidelity import ALIVE, SQNR_FLOOR_DB
 from me2e_compress.metrics import BUDGET_MS
+from me2e_compress.simulator.scenarios import VARIANTS
 
 if TYPE_CHECKING:  # onnxruntime takes a tenth of a second to import
     from me2e_compress.runtime.providers import Provider
@@ -394,6 +395,70 @@ class ProfileOptions(WriteOptions, GraphOptions):
         check_budget(self.budget_ms)
         check_count("--threads", self.threads, most=MOST_THREADS)
         check_count("--samples", self.samples or 0, most=MOST_SAMPLES)
+
+
+@Parameter(name="*")
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class WorkerOptions:
+    """Where drives are done, and how many at a time."""
+
+    workers: int = 1
+    """processes at a time"""
+    engine: str = "local"
+    """local, ray, or ray:ADDRESS of a cluster"""
+
+    def __post_init__(self) -> None:
+        check_count("--workers", self.workers, least=1)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class EvaluateOptions(WorkerOptions, GraphOptions, WriteOptions):
+    """Which routes are driven, and under which conditions, in words.
+
+    An evaluator takes those that it declares; ``evaluator`` and ``force`` are for all.
+    """
+
+    routes: str = "all"
+    """routes: all, a number, ID,ID; or a file of routes"""
+    latency: str = "none"
+    """none, fps:F, trace:FILE, measured, or see list"""
+    seed: int = 0
+    """seed of everything random"""
+    latency_model: Annotated[str, Parameter(parse=False)] = "drop"
+    """drop the decisions due meanwhile, or fifo: delay every control"""
+    dt_ms: Annotated[float, Parameter(parse=False)] = 50.0
+    """step of the simulation; results at different steps are not compared"""
+    weather: str = ""
+    """fog_m=80,night=0.5,dropped=BACK+FRONT ..."""
+    drive_on: bool = False
+    """go on after a collision, as Bench2Drive"""
+    render: str | None = None
+    """draw this route as GIF and PNG"""
+    evaluator: str = "highway"
+    """who drives it: highway, NAME{option=value}, or see list"""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_count("--seed", self.seed)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class RoutesOptions(WriteOptions):
+    """Which routes are made."""
+
+    seed: int = 0
+    """seed of everything random"""
+    variants: int = VARIANTS
+    """routes of each type"""
+    scenarios: str = "all"
+    """scenario types: all, or NAME,NAME"""
+    workers: int = 1
+    """processes at a time"""
+
+    def __post_init__(self) -> None:
+        check_count("--seed", self.seed)
+        check_count("--variants", self.variants, least=1)
+        check_count("--workers", self.workers, least=1)
 
 
 @Parameter(name="*")

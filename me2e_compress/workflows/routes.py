@@ -21,47 +21,13 @@ from me2e_compress.simulator.routes import (
     pick_routes,
     save_routes,
 )
-from me2e_compress.simulator.scenarios import VARIANTS
 from me2e_compress.version import __version__
 from me2e_compress.workflows.checks import writing
-from me2e_compress.workflows.options import check_count
+from me2e_compress.workflows.options import RoutesOptions
 from me2e_compress.workflows.result import SILENT, Listener, Result, Shown
 
 if TYPE_CHECKING:  # they take highway-env, an extra and a second to import
     from me2e_compress.evaluators.highway.generate import Admission, ScenarioRoutes
-
-
-@dataclasses.dataclass(frozen=True)
-class RoutesOptions:
-    """Which routes are made.
-
-    Attributes:
-        seed: decides every route.
-        variants: number of variants of each scenario type.
-        scenarios: ``all``, or ``NAME,NAME``.
-        workers: scenario types at a time.
-        force: replace outputs that we did not write, too.
-    """
-
-    seed: int = 0
-    variants: int = VARIANTS
-    scenarios: str = "all"
-    workers: int = 1
-    force: bool = False
-
-    def __post_init__(self) -> None:
-        check_count("--seed", self.seed)
-        for name in self.names:
-            if name not in SCENARIO_ABILITIES:
-                there = ", ".join(sorted(SCENARIO_ABILITIES))
-                raise EvaluationError(f"no scenario {name!r}; there are {there}")
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """The names of the scenario types."""
-        if self.scenarios == "all":
-            return tuple(SCENARIO_ABILITIES)
-        return tuple(name.strip() for name in self.scenarios.split(","))
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
@@ -124,6 +90,7 @@ def make_routes(
     from me2e_compress.evaluators.highway.generate import ScenarioRoutes, generate
 
     options, output = options or RoutesOptions(), Path(output)
+    types = _scenario_types(options.scenarios)
     deciding = {
         "version": f"{__version__}, road version {ROAD_VERSION}",
         "seed": options.seed,
@@ -147,19 +114,31 @@ def make_routes(
                 done = TypeAdapter(list[ScenarioRoutes])
                 begun = done.validate_python(record.get("done"))
         harvests = {one.scenario: one for one in begun}
-        names = [name for name in options.names if name not in harvests]
+        names = [name for name in types if name not in harvests]
         # keep and report each scenario type as soon as its routes are admitted
         made = generate(options.seed, names, options.variants, options.workers)
         for harvest in made:
             harvests[harvest.scenario] = harvest
             kept = [dataclasses.asdict(one) for one in harvests.values()]
             write_document(draft, deciding | {"done": kept})
-            count = len(harvests), len(options.names)
+            count = len(harvests), len(types)
             listener.on_progress("admitting", *count, harvest.scenario)
-        ordered = tuple(harvests[name] for name in options.names)
+        ordered = tuple(harvests[name] for name in types)
         save_routes([route for one in ordered for route in one.routes], output)
         draft.unlink(missing_ok=True)
         return RoutesResult(output, ordered)
+
+
+def _scenario_types(words: str) -> tuple[str, ...]:
+    """Read ``all``, or ``NAME,NAME``."""
+    if words == "all":
+        return tuple(SCENARIO_ABILITIES)
+    names = tuple(name.strip() for name in words.split(","))
+    for name in names:
+        if name not in SCENARIO_ABILITIES:
+            there = ", ".join(sorted(SCENARIO_ABILITIES))
+            raise EvaluationError(f"no scenario {name!r}; there are {there}")
+    return names
 
 
 @dataclasses.dataclass(frozen=True, repr=False)

@@ -18,8 +18,9 @@ from me2e_compress.simulator.routes import (
     load_routes,
     pick_routes,
 )
+from me2e_compress.workflows.options import RoutesOptions
 from me2e_compress.workflows.result import Listener
-from me2e_compress.workflows.routes import RoutesOptions, make_routes
+from me2e_compress.workflows.routes import make_routes
 from models.driver.curriculum import Trial
 from models.driver.episodes.collection import refuse_shipped
 
@@ -46,7 +47,12 @@ def routes_of(
     if not path.exists():
         types = what.scenarios or tuple(SCENARIO_ABILITIES)
         variants = -(-what.routes // len(types))
-        options = RoutesOptions(what.seed, variants, ",".join(types), workers)
+        options = RoutesOptions(
+            seed=what.seed,
+            variants=variants,
+            scenarios=",".join(types),
+            workers=workers,
+        )
         make_routes(path, options, Listener(lambda _, *told: on_done(*told[:2])))
     found = load_routes(path)
     refuse_shipped("trial", what.seed, [(e.scenario, e.seed) for e in found])

@@ -130,8 +130,8 @@ OTHERS = {
 DRIVE = {
     "--routes nowhere": "no route 'nowhere'",
     "--routes 1 --render nowhere": "no route 'nowhere'",
-    "--routes 1 --engine cloud": "engine 'cloud'",
-    "--routes 1 --engine local:a:1": "engine 'local' with address a:1",
+    "--routes 1 --engine cloud": "no engine 'cloud'",
+    "--routes 1 --engine local:a:1": "no engine 'local:a:1'",
     "--routes 1 --weather snow=1": "weather option 'snow'",
     "--routes 1 --weather night=dark": "weather option night",
     "--routes 1 --latency fast": "no latency source 'fast'",

@@ -47,7 +47,7 @@ latency = "trace"
 def here(monkeypatch: pytest.MonkeyPatch) -> Here:
     """Drive in this process."""
     here = Here()
-    monkeypatch.setattr(engine, "engine_of", lambda *words: here)
+    monkeypatch.setattr(engine, "engine_named", lambda *words: here)
     return here
 
 

@@ -178,7 +178,9 @@ def test_the_front_camera_is_recorded_cloned_and_plans(tmp_path: Path) -> None:
 
     assert ways.shape == (2, 4, 2)
     assert (np.diff(ways[:, :, 0]) >= 0).all()
-    assert not me2e.check_model(model, CAMERA / "front.toml").problems
+    assert not me2e.check_model(
+        model, me2e.GraphOptions(adapter=CAMERA / "front.toml")
+    ).problems
     first = next(iter(me2e.CalibrationSet(frames))).arrays
     del first["can_bus"]
     (planned,) = Session(model, threads=1).run(first).values()

@@ -18,6 +18,7 @@ from me2e_compress.evaluators.contract import Listener, evaluator_named
 from me2e_compress.evaluators.highway.evaluator import Highway
 from me2e_compress.metrics.episode import Episode
 from me2e_compress.registry import registry
+from me2e_compress.workflows.evaluate import drive_of
 
 
 def test_words_reach_the_drive() -> None:
@@ -25,7 +26,7 @@ def test_words_reach_the_drive() -> None:
         latency="fps:5", dt_ms=25, weather="night=0.5", routes="2"
     )
 
-    drive = options.drive(Highway())
+    drive = drive_of(options, Highway())
 
     assert drive.latency == FrameRate(5.0)
     assert drive.dt_us == 25_000
@@ -41,8 +42,8 @@ def test_words_reach_the_drive() -> None:
         ({"weather": "hail=1"}, "weather option 'hail': there are fog_m"),
         ({"dt_ms": 1e308}, r"a step of 1e\+308 ms: it must divide 50 ms"),
         ({"dt_ms": float("nan")}, "a step of nan ms"),
-        ({"engine": "cloud"}, "engine 'cloud' with address None"),
-        ({"address": "here"}, "engine 'local' with address here"),
+        ({"engine": "cloud"}, "no engine 'cloud'; there are local, ray and ray:A"),
+        ({"engine": "local:here"}, "no engine 'local:here'"),
         ({"latency_model": "lifo"}, "no latency model 'lifo'; there are drop, fifo"),
     ],
 )

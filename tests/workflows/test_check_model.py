@@ -7,6 +7,7 @@ import pytest
 
 from me2e_compress import ModelCheck, check_model
 from me2e_compress.errors import EvaluationError
+from me2e_compress.workflows.options import GraphOptions
 from tests.evaluators.highway.drivers import straight_on
 
 IMAGE = {
@@ -59,7 +60,7 @@ def checked(tmp_path: Path, adapter: str | None = ADAPTER + PLAN) -> ModelCheck:
     if adapter is None:
         return check_model(model)
     (tmp_path / "a.toml").write_text(adapter)
-    return check_model(model, tmp_path / "a.toml")
+    return check_model(model, GraphOptions(adapter=tmp_path / "a.toml"))
 
 
 def test_every_port_and_its_part(tmp_path: Path) -> None:
@@ -126,7 +127,9 @@ def test_what_is_no_graph_is_opened_or_named(tmp_path: Path) -> None:
     with pytest.raises(EvaluationError, match="no such file"):
         check_model(tmp_path / "no.onnx")
     with pytest.raises(EvaluationError, match="No such file"):
-        check_model(tcp_like(tmp_path / "m.onnx"), tmp_path / "no.toml")
+        check_model(
+            tcp_like(tmp_path / "m.onnx"), GraphOptions(adapter=tmp_path / "no.toml")
+        )
     assert not check_model("blind:6").problems
     with pytest.raises(EvaluationError, match="No module named 'nowhere_at_all'"):
         check_model("nowhere_at_all:make")

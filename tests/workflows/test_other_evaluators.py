@@ -8,7 +8,7 @@ import pytest
 
 from me2e_compress import evaluate, score
 from me2e_compress.errors import EvaluationError, GraphError
-from me2e_compress.workflows.evaluate import EvaluateOptions
+from me2e_compress.workflows.options import EvaluateOptions
 from me2e_compress.workflows.result import Listener
 from tests.evaluators.bench2drive.files import checkpoint, record, write
 from tests.evaluators.highway.drivers import straight_on

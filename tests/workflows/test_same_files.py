@@ -12,8 +12,9 @@ from me2e_compress.manager import recipe
 from me2e_compress.registry.drafts import IN_JSON
 from me2e_compress.simulator.routes import save_routes
 from me2e_compress.workflows.files import export_stack
+from me2e_compress.workflows.options import RoutesOptions
 from me2e_compress.workflows.result import Result
-from me2e_compress.workflows.routes import RoutesOptions, examine_routes, make_routes
+from me2e_compress.workflows.routes import examine_routes, make_routes
 from tests.command import Command
 from tests.simulator.world.driving import route_of
 
@@ -120,7 +121,9 @@ CASES: dict[str, tuple[str, Call]] = {
     ),
     "make_routes": (
         f"routes -o routes.json --seed 4 --variants 1 --scenarios {STOP}",
-        lambda: make_routes("routes.json", RoutesOptions(4, 1, STOP)),
+        lambda: make_routes(
+            "routes.json", RoutesOptions(seed=4, variants=1, scenarios=STOP)
+        ),
     ),
 }
 

@@ -7,6 +7,7 @@ from me2e_compress.evaluators.highway.drivers import image_size_of
 from me2e_compress.shipped.drivers import shipped
 from me2e_compress.study import load_study
 from me2e_compress.workflows.evaluate import driver_of
+from me2e_compress.workflows.options import GraphOptions
 
 STUDY = """
 title = "Half of it"
@@ -27,7 +28,11 @@ def test_it_is_found_by_name() -> None:
 
     assert driver.label == "highway"
     by_file = driver_named(str(shipped("highway"))).fingerprint()
-    assert driver.fingerprint() == driver_of("highway").fingerprint() == by_file
+    assert (
+        driver.fingerprint()
+        == driver_of("highway", GraphOptions()).fingerprint()
+        == by_file
+    )
     assert image_size_of(driver.open()) == (96, 160)
 
 

@@ -273,13 +273,11 @@ class RayEngine:
             raise EvaluationError(f"ray: no cluster at {self.address}") from error
 
 
-def engine_of(name: str, workers: int, address: str | None) -> Engine:
-    """Return the engine of a name; only ``ray`` takes an address."""
-    if name == "local" and address is None:
+def engine_named(words: str, workers: int) -> Engine:
+    """Return the engine of ``local``, ``ray`` or ``ray:ADDRESS`` of a cluster."""
+    name, _, address = words.partition(":")
+    if words == "local":
         return LocalEngine(workers)
     if name == "ray":
-        return RayEngine(workers, address)
-    raise EvaluationError(
-        f"engine {name!r} with address {address}: there are local, and ray with or "
-        "without an address"
-    )
+        return RayEngine(workers, address or None)
+    raise EvaluationError(f"no engine {words!r}; there are local, ray and ray:ADDRESS")

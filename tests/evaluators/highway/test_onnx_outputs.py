@@ -16,6 +16,7 @@ from me2e_compress.evaluators.highway.drivers import OnnxDriver
 from me2e_compress.runtime.frames import Array
 from me2e_compress.runtime.plan_adapter import Floats, PlanAdapter
 from me2e_compress.workflows.evaluate import check_model
+from me2e_compress.workflows.options import GraphOptions
 from tests.evaluators.highway.asked import observation
 from tests.evaluators.highway.drivers import EXIT, straight_on
 
@@ -154,7 +155,7 @@ def test_a_module_map_names_the_plan(tmp_path: Path) -> None:
 
     assert isinstance(policy.plan(observation()), Trajectory)
     assert driver.fingerprint() != OnnxDriver(model).fingerprint()
-    assert check_model(model, module_map=driver.module_map).problems == ()
+    assert check_model(model, GraphOptions(module_map=driver.module_map)).problems == ()
 
 
 def test_a_module_map_of_another_graph_does_not_drive(tmp_path: Path) -> None:
