@@ -22,8 +22,8 @@ from rich.text import Text
 from me2e_compress.display import Cell, Table, duration, printable
 from me2e_compress.workflows.result import SILENT, Listener, Result
 
-console = Console(record=True)
-errors = Console(stderr=True, highlight=False)
+console = Console(record=True, emoji=False)
+errors = Console(stderr=True, highlight=False, emoji=False)
 
 
 class Verbosity(enum.Enum):
