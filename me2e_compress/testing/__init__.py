@@ -1,7 +1,6 @@
 """Checks that authors of extensions can run in their own tests."""
 
 from me2e_compress.testing.check_evaluator import check_evaluator
-from me2e_compress.testing.check_observer import check_observer
 from me2e_compress.testing.check_operator import DrawnCall, check_operator
 from me2e_compress.testing.check_pass import check_pass
 from me2e_compress.testing.check_policy import check_policy
@@ -11,7 +10,6 @@ __all__ = [
     "DrawnCall",
     "check_evaluator",
     "check_form",
-    "check_observer",
     "check_operator",
     "check_pass",
     "check_policy",
