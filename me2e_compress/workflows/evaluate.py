@@ -57,7 +57,7 @@ def drive_of(options: EvaluateOptions, evaluator: Evaluator) -> Drive:
     routes: Sequence[RouteInfo] = ()
     set_size = 0
     if "routes" in evaluator.takes:
-        routes, set_size = evaluator.routes(options.routes)
+        routes, set_size = evaluator.routes(str(options.routes))  # a number, too
     conditions = Drive.of_words(
         options.latency_model, options.dt_ms, options.weather, options.drive_on
     )
@@ -140,7 +140,7 @@ def evaluate(
         raise EvaluationError(f"{evaluator.name} drives no policy: leave out {policy}")
     # a trace that is no file is harmless here
     trace = options.latency.removeprefix("trace:")
-    read = (policy, options.routes, trace, options.adapter, options.module_map)
+    read = (policy, str(options.routes), trace, options.adapter, options.module_map)
     values = [getattr(evaluator, each.name) for each in options_of(type(evaluator))]
     files = [value for value in values if isinstance(value, Path)]
     check_folder(output, (*read, *files), (MANIFEST,))

@@ -4,7 +4,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from importlib.metadata import EntryPoint
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, cast
 
 import pytest
 
@@ -23,7 +23,7 @@ from me2e_compress.workflows.evaluate import drive_of
 
 def test_words_reach_the_drive() -> None:
     options = EvaluateOptions(
-        latency="fps:5", dt_ms=25, weather="night=0.5", routes="2"
+        latency="fps:5", dt_ms=25, weather="night=0.5", routes=cast("str", 2)
     )
 
     drive = drive_of(options, Highway())
