@@ -16,7 +16,7 @@ from google.protobuf.message import DecodeError, Message
 
 from me2e_compress.display import reason
 from me2e_compress.errors import GraphError
-from me2e_compress.graph import structure
+from me2e_compress.graph import provenance, structure
 from me2e_compress.graph.nodes import STANDARD, nodes_of
 from me2e_compress.graph.opset import lower
 from me2e_compress.graph.summary import weight_bytes
@@ -62,6 +62,7 @@ def load(path: str | Path) -> ir.Model:
     try:
         in_order = structure.check(proto)
         model = _built(proto, in_order)
+        provenance.unpack(model)
     except GraphError as error:
         raise GraphError(f"{path}: {error}") from error
     ir.external_data.set_base_dir(model.graph, path.parent)
@@ -134,7 +135,7 @@ def save(model: ir.Model, path: str | Path, *, external: bool | None = None) -> 
         tempfile.TemporaryDirectory(dir=path.parent, prefix=".saving-") as folder,
     ):
         draft = Path(folder) / path.name
-        with _ours(model):
+        with _ours(model), provenance.packed(model):
             if external:
                 ir.save(model, draft, format="protobuf", external_data=data.name)
             else:

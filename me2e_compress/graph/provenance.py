@@ -1,12 +1,17 @@
 """Where a node comes from: its module, its source nodes, the passes that made it.
 
-Stored in the node's ONNX metadata, so that it survives saving and every tool that
-keeps metadata. The manager refuses a pass that loses it.
+Stored in the node's ONNX metadata, so that it survives every tool that keeps metadata;
+in a file, origins other than a node's own name stand compressed in the model's. The
+manager refuses a pass that loses it.
 """
 
+import base64
+import contextlib
 import dataclasses
 import json
-from collections.abc import Iterable
+import zlib
+from collections import Counter
+from collections.abc import Iterable, Iterator
 
 import onnx_ir as ir
 
@@ -14,6 +19,8 @@ from me2e_compress.errors import GraphError
 from me2e_compress.graph.nodes import nodes_in
 
 MODULE, ORIGINS, PASSES = "me2e.module", "me2e.origins", "me2e.passes"
+_LARGEST = 1 << 28
+"""Most bytes of a text that was compressed."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -156,3 +163,73 @@ def is_same(old: ir.Node | None, new: ir.Node) -> bool:
 
 _BODIES = (ir.AttributeType.GRAPH, ir.AttributeType.GRAPHS)
 """Kinds of attributes whose nodes are looked at one by one."""
+
+
+def compressed(text: str) -> str:
+    """Write a long text as metadata of a model: zlib, in base 64."""
+    return base64.b64encode(zlib.compress(text.encode())).decode()
+
+
+def decompressed(text: str) -> str:
+    """Read what :func:`compressed` wrote; JSON is returned as it stands.
+
+    Raises:
+        ValueError: it is neither, or holds more than 256 MiB.
+    """
+    if text[:1] in ("", "[", "{"):
+        return text
+    reader = zlib.decompressobj()
+    try:
+        raw = reader.decompress(base64.b64decode(text, validate=True), _LARGEST)
+    except zlib.error as error:
+        raise ValueError(f"not a compressed text: {text[:40]}") from error
+    if not reader.eof:
+        raise ValueError(f"cut short, or too long: {text[:40]}")
+    return raw.decode()
+
+
+@contextlib.contextmanager
+def packed(model: ir.Model) -> Iterator[None]:
+    """Take the origins from the nodes while a model is written, into one text.
+
+    Origins that are a node's own name alone are not written; what two nodes of one name
+    have stays with them.
+    """
+    nodes = list(nodes_in(model.graph))
+    times = Counter(node.name for node in nodes)
+    props = {
+        str(node.name): node.metadata_props
+        for node in nodes
+        if ORIGINS in node.metadata_props and times[node.name] == 1
+    }
+    before = {name: dict(each) for name, each in props.items()}
+    texts = {name: each.pop(ORIGINS) for name, each in props.items()}
+    table = {name: text for name, text in texts.items() if text != json.dumps([name])}
+    if texts:
+        model.metadata_props[ORIGINS] = compressed(json.dumps(table))
+    try:
+        yield
+    finally:
+        model.metadata_props.pop(ORIGINS, None)
+        for name, each in before.items():
+            props[name].clear()
+            props[name].update(each)
+
+
+def unpack(model: ir.Model) -> None:
+    """Give the nodes of a model that was read their origins again.
+
+    Raises:
+        GraphError: what stands there is not what :func:`packed` wrote.
+    """
+    text = model.metadata_props.pop(ORIGINS, None)
+    if text is None:
+        return
+    try:
+        table = dict(json.loads(decompressed(text)))
+    except (ValueError, TypeError, RecursionError) as error:
+        raise GraphError(f"its metadata {ORIGINS} is not a table of names") from error
+    for node in nodes_in(model.graph):
+        if MODULE in node.metadata_props:
+            own = json.dumps([node.name])
+            node.metadata_props.setdefault(ORIGINS, str(table.get(node.name, own)))

@@ -194,7 +194,7 @@ def load_plan(path: Path) -> QuantPlan:
 def stamp_plan(model: ir.Model, plan: QuantPlan) -> None:
     """Write a plan into a model's metadata."""
     text = json.dumps(dataclasses.asdict(plan), separators=(",", ":"))
-    model.metadata_props[METADATA] = text
+    model.metadata_props[METADATA] = provenance.compressed(text)
 
 
 def plan_of(model: ir.Model) -> QuantPlan | None:
@@ -209,7 +209,9 @@ def plan_of(model: ir.Model) -> QuantPlan | None:
     with documents.reading(
         "the plan in the model's metadata", RecipeError, "not a plan"
     ):
-        return pydantic.TypeAdapter(QuantPlan).validate_json(text)
+        return pydantic.TypeAdapter(QuantPlan).validate_json(
+            provenance.decompressed(text)
+        )
 
 
 @dataclasses.dataclass(frozen=True)
