@@ -17,6 +17,7 @@ import onnx_ir as ir
 
 from me2e_compress.errors import GraphError
 from me2e_compress.graph.nodes import nodes_in
+from me2e_compress.registry.documents import MalformedError
 
 MODULE, ORIGINS, PASSES = "me2e.module", "me2e.origins", "me2e.passes"
 _LARGEST = 1 << 28
@@ -174,17 +175,17 @@ def decompressed(text: str) -> str:
     """Read what :func:`compressed` wrote; JSON is returned as it stands.
 
     Raises:
-        ValueError: it is neither, or holds more than 256 MiB.
+        MalformedError: it is neither, or holds more than 256 MiB.
     """
     if text[:1] in ("", "[", "{"):
         return text
     reader = zlib.decompressobj()
     try:
         raw = reader.decompress(base64.b64decode(text, validate=True), _LARGEST)
-    except zlib.error as error:
-        raise ValueError(f"not a compressed text: {text[:40]}") from error
+    except (ValueError, zlib.error) as error:
+        raise MalformedError(f"{text[:40]!r} is not a compressed text") from error
     if not reader.eof:
-        raise ValueError(f"cut short, or too long: {text[:40]}")
+        raise MalformedError(f"{text[:40]!r} is cut short, or too long")
     return raw.decode()
 
 

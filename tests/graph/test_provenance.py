@@ -8,6 +8,7 @@ from me2e_compress import graph
 from me2e_compress.errors import GraphError
 from me2e_compress.graph import provenance
 from me2e_compress.graph.provenance import ORIGINS, Provenance
+from me2e_compress.registry.documents import MalformedError
 
 
 @pytest.fixture
@@ -79,5 +80,5 @@ def test_a_text_of_more_than_its_bound_is_refused(
     text = "abc" * 1000
     assert provenance.decompressed(provenance.compressed(text)) == text
     monkeypatch.setattr(provenance, "_LARGEST", 2999)
-    with pytest.raises(ValueError, match="too long"):
+    with pytest.raises(MalformedError, match="too long"):
         provenance.decompressed(provenance.compressed(text))
