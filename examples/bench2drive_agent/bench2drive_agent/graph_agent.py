@@ -1,6 +1,7 @@
 """An ONNX graph that keeps the policy contract, as an agent of the leaderboard."""
 
 import json
+import logging
 import math
 import re
 import time
@@ -36,6 +37,7 @@ from me2e_compress.runtime.providers import PROVIDERS
 
 FULL_BRAKE = PedalsAndWheel(0.0, 0.0, 1.0)
 """Before the first control acts."""
+_LOG = logging.getLogger(__name__)
 WALL_CLOCK = re.compile(r"(_\d\d){5}$")
 """The end of a save name: month, day, hour, minute, second of the start."""
 
@@ -103,8 +105,8 @@ class GraphAgent(AutonomousAgent):  # type: ignore[misc]
         self._last: EgoKinematics | None = None
         nodes = [(*_place(at), option) for at, option in self._global_plan_world_coord]
         first, _ = self._global_plan[0]
-        self._follower = RouteFollower(nodes)
-        self._geo = GeoReference.through(first["lat"], first["lon"], *nodes[0][:2])
+        self._follower, self._begins = RouteFollower(nodes), nodes[0][:2]
+        self._geo = GeoReference.through(first["lat"], first["lon"], *self._begins)
         self._pictures = Pictures(
             self._policy.image_size, options.jpeg_quality, _fill(self._policy)
         )
@@ -146,7 +148,12 @@ class GraphAgent(AutonomousAgent):  # type: ignore[misc]
 
     def _motion(self, sensors: Any) -> EgoKinematics:
         """Return what GPS, IMU and speedometer say, in a right-handed world."""
-        x, y = self._geo.metres(*sensors[mounted.GPS][1][:2])
+        reading = sensors[mounted.GPS][1][:2]
+        if self.step == 0:
+            self._geo = self._geo.as_read(reading, *self._begins)
+            if self._geo.mirrored:
+                _LOG.warning("GPS latitudes are mirrored, as in CARLA 0.9.16")
+        x, y = self._geo.metres(*reading)
         imu = [float(value) for value in sensors[mounted.IMU][1]]
         if math.isnan(imu[6]):  # as it is in the first frames
             imu = [0.0] * 7

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Self, TypeAlias
 
 import numpy as np
@@ -20,10 +20,21 @@ Node: TypeAlias = tuple[np.ndarray, int]
 
 @dataclass(frozen=True)
 class GeoReference:
-    """The geographic origin of a CARLA map in degrees."""
+    """The geographic origin of a CARLA map in degrees.
+
+    Mirrored readings fall to the north: those of CARLA 0.9.16 do.
+    """
 
     latitude: float
     longitude: float
+    mirrored: bool = False
+
+    def as_read(self, reading: tuple[float, float], x: float, y: float) -> Self:
+        """Return it mirrored if only then a reading is within 4 m of its place."""
+        for each in (self, replace(self, mirrored=True)):
+            if math.dist(each.metres(*reading), (x, y)) <= PASSED_M:
+                return each
+        return self
 
     @classmethod
     def through(cls, latitude: float, longitude: float, x: float, y: float) -> Self:
@@ -38,7 +49,8 @@ class GeoReference:
         """Convert a place to metres east and north of the map's origin."""
         north = _mercator(latitude) - _mercator(self.latitude)
         east = math.radians(longitude - self.longitude)
-        return _scale(self.latitude) * east, _scale(self.latitude) * north
+        scale = _scale(self.latitude)
+        return scale * east, -scale * north if self.mirrored else scale * north
 
 
 def _mercator(latitude: float) -> float:

@@ -51,7 +51,10 @@ def vector(x: float, y: float, z: float) -> SimpleNamespace:
 
 @dataclass
 class World:
-    """Where the hero is; it asks itself what it senses."""
+    """Where the hero is; it asks itself what it senses.
+
+    ``mirrored`` GPS latitudes fall to the north, as in CARLA 0.9.16.
+    """
 
     x: float = 0.0
     y: float = 0.0
@@ -60,6 +63,7 @@ class World:
     acceleration: float = 0.0
     turn_deg: float = 0.0
     frame: int = 0
+    mirrored: bool = False
     sensors: list[dict[str, Any]] = field(default_factory=list)
 
     def tick(self, control: VehicleControl | None) -> None:
@@ -110,7 +114,9 @@ class World:
             image[..., 2] = 200  # BGRA: red
             return image
         if kind == "sensor.other.gnss":
-            return np.array([*gps_of(self.x, self.y), 0.0])
+            return np.array(
+                [*gps_of(self.x, -self.y if self.mirrored else self.y), 0.0]
+            )
         if kind == "sensor.other.imu":
             compass = math.radians(self.yaw_deg) + math.pi / 2
             gyro = math.radians(self.turn_deg)

@@ -52,6 +52,23 @@ def test_the_route_turns_the_wheel(
     assert board.seen[-1][1] > 0.0
 
 
+def test_mirrored_latitudes_are_told_and_driven_by(
+    board: Leaderboard,
+    graph_agent: ModuleType,
+    model: Path,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    board.noise, board.world.y, board.world.mirrored = 0.0, 92.5, True
+    route = [(20.0 * k, 92.5, RoadOption.LANEFOLLOW) for k in range(6)]
+
+    agent = board.drive(graph_agent, options(model), 3, route)
+
+    assert [each.message for each in caplog.records] == [
+        "GPS latitudes are mirrored, as in CARLA 0.9.16"
+    ]
+    assert agent._motion(board.world.sensed()).y == pytest.approx(-92.5, abs=0.1)
+
+
 CONTROLS = """
 [control]
 throttle = "gas[0]"

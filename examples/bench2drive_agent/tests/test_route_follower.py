@@ -20,6 +20,25 @@ def test_one_known_place_gives_all_others(
     )
 
 
+@given(st.floats(10, 8000), metres, metres, st.booleans())
+def test_mirrored_latitudes_are_found_out(
+    north: float, x: float, other: float, sensor: bool
+) -> None:
+    plain = GeoReference.through(*gps_of(x, -north), x, north)
+
+    found = plain.as_read(gps_of(x, north if sensor else -north), x, north)
+
+    assert found.mirrored == sensor
+    read = found.metres(*gps_of(other, other if sensor else -other))
+    assert read == pytest.approx((other, other), abs=1e-4)
+
+
+def test_a_first_reading_that_fits_nowhere_changes_nothing() -> None:
+    found = GeoReference.through(*gps_of(0, -90), 0, 90)
+
+    assert found.as_read(gps_of(300, 50), 0, 90) == found
+
+
 BEND = [(0, 0, 4), (30, 0, 1), (30, 40, 4), (30, 120, 4)]
 
 
