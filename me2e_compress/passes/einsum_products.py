@@ -9,14 +9,8 @@ import numpy as np
 import onnx_ir as ir
 
 from me2e_compress.graph import array_of, is_standard, provenance, static_shape
-from me2e_compress.graph.nodes import FLOATS
-from me2e_compress.graph.rewrite import (
-    add_constant,
-    fresh_name,
-    graphs_of,
-    put,
-    value_names,
-)
+from me2e_compress.graph.nodes import FLOATS, graphs_of
+from me2e_compress.graph.rewrite import add_constant, fresh_name, put, value_names
 
 _TWO_OPERANDS = re.compile(r"([A-Za-z]+),([A-Za-z]+)->([A-Za-z]+)")
 

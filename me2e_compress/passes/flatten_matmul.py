@@ -9,8 +9,8 @@ import onnx_ir as ir
 
 from me2e_compress.display import counted
 from me2e_compress.graph import array_of, is_standard, opset_of, static_shape
-from me2e_compress.graph.nodes import VIEWS
-from me2e_compress.graph.rewrite import graphs_of, remove_dead, value_names
+from me2e_compress.graph.nodes import VIEWS, graphs_of
+from me2e_compress.graph.rewrite import remove_dead, value_names
 from me2e_compress.graph.summary import value_bytes
 from me2e_compress.passes.base import Context, Pass, PassResult
 from me2e_compress.passes.hoist_linear.rebuilding import NodeWriter, Rewriter

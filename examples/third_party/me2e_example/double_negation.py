@@ -5,7 +5,8 @@ from typing import ClassVar
 
 import onnx_ir as ir
 
-from me2e_compress.graph.rewrite import bypass, maker, remove_dead
+from me2e_compress.graph.nodes import maker
+from me2e_compress.graph.rewrite import bypass, remove_dead
 from me2e_compress.passes import Context, Pass, PassResult
 
 

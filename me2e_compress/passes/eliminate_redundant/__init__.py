@@ -9,17 +9,15 @@ import onnx_ir as ir
 import onnx_ir.passes.common as common
 
 from me2e_compress.graph import infer_shapes, opset_of, provenance, static_shape
-from me2e_compress.graph.nodes import DRAWS, attribute_values
-from me2e_compress.graph.rewrite import (
-    bypass,
-    can_replace,
+from me2e_compress.graph.nodes import (
+    DRAWS,
+    attribute_values,
     graphs_of,
     has_subgraph,
     is_read,
     is_standard,
-    remove_dead,
-    remove_node,
 )
+from me2e_compress.graph.rewrite import bypass, can_replace, remove_dead, remove_node
 from me2e_compress.passes.base import Context, Pass, PassResult
 from me2e_compress.passes.eliminate_redundant.rules import MergeSite, identity_of, merge
 

@@ -19,23 +19,18 @@ from me2e_compress.graph import array_of, provenance, static_shape
 from me2e_compress.graph.nodes import (
     ELEMENTWISE,
     VIEWS,
+    Array,
     attribute_values,
     input_at,
     integers_at,
     integers_of,
-    maker,
-    permutation_of,
-)
-from me2e_compress.graph.rewrite import (
-    Array,
-    add_constant,
-    bypass,
     is_read,
     is_standard,
-    put,
+    maker,
+    permutation_of,
     sole_reader,
-    value_names,
 )
+from me2e_compress.graph.rewrite import add_constant, bypass, put, value_names
 
 # Nodes that return their input.
 

@@ -25,10 +25,9 @@ import onnx_ir as ir
 from me2e_compress import graph as graphs
 from me2e_compress.display import counted
 from me2e_compress.graph import provenance
+from me2e_compress.graph.nodes import Array, graphs_of
 from me2e_compress.graph.rewrite import (
-    Array,
     add_constant,
-    graphs_of,
     lift_constants,
     put,
     remove_dead,

@@ -3,10 +3,10 @@
 import onnx_ir as ir
 
 from me2e_compress.graph import array_of, provenance
+from me2e_compress.graph.nodes import graphs_of
 from me2e_compress.graph.rewrite import (
     can_replace,
     fresh_name,
-    graphs_of,
     remove_node,
     replace_value,
     value_names,

@@ -15,8 +15,15 @@ import onnx_ir as ir
 import onnxruntime
 
 from me2e_compress.graph import array_of, shapes, static_shape
-from me2e_compress.graph.nodes import DRAWS, NATIVE, attribute_values, unrenamed
-from me2e_compress.graph.rewrite import Array, has_subgraph, is_standard
+from me2e_compress.graph.nodes import (
+    DRAWS,
+    NATIVE,
+    Array,
+    attribute_values,
+    has_subgraph,
+    is_standard,
+    unrenamed,
+)
 from me2e_compress.graph.shapes import refined
 from me2e_compress.graph.summary import value_bytes
 from me2e_compress.runtime.session import REFUSALS

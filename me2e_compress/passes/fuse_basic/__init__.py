@@ -6,7 +6,8 @@ from typing import ClassVar
 import onnx_ir as ir
 
 from me2e_compress.graph import array_of
-from me2e_compress.graph.rewrite import Fusion, fuse, maker
+from me2e_compress.graph.nodes import maker
+from me2e_compress.graph.rewrite import Fusion, fuse
 from me2e_compress.passes.base import Context, Pass, PassResult
 from me2e_compress.passes.fuse_basic import activations, constants, weights
 

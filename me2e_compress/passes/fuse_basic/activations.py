@@ -17,9 +17,14 @@ import numpy as np
 import onnx_ir as ir
 
 from me2e_compress.graph import array_of, rank_of, static_shape
-from me2e_compress.graph.nodes import integers_at
-from me2e_compress.graph.rewrite import (
+from me2e_compress.graph.nodes import (
     Array,
+    integers_at,
+    is_close,
+    scalar_of,
+    sole_reader,
+)
+from me2e_compress.graph.rewrite import (
     Facts,
     Fusion,
     Kit,
@@ -27,12 +32,9 @@ from me2e_compress.graph.rewrite import (
     Pattern,
     constant,
     either,
-    is_close,
     needs_opset,
     op,
     product,
-    scalar_of,
-    sole_reader,
     var,
 )
 

@@ -17,18 +17,8 @@ import numpy as np
 import onnx_ir as ir
 
 from me2e_compress.graph import array_of, provenance, static_shape
-from me2e_compress.graph.nodes import ELEMENTWISE
-from me2e_compress.graph.rewrite import (
-    FLOATS,
-    Array,
-    Facts,
-    Fusion,
-    Kit,
-    Match,
-    constant,
-    op,
-    var,
-)
+from me2e_compress.graph.nodes import ELEMENTWISE, FLOATS, Array
+from me2e_compress.graph.rewrite import Facts, Fusion, Kit, Match, constant, op, var
 
 CANCELLATION = 1e3
 """Constants that cancel more than three decimal digits are not added in advance."""

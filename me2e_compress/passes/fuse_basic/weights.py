@@ -30,25 +30,27 @@ import numpy as np
 import onnx_ir as ir
 
 from me2e_compress.graph import bias_of, channel_axis, input_at, static_shape
-from me2e_compress.graph.rewrite import (
+from me2e_compress.graph.nodes import (
     Array,
+    Numbers,
+    array_of,
+    holds_numbers,
+    numbers_of,
+    overflow,
+    sole_reader,
+)
+from me2e_compress.graph.provenance import inherit
+from me2e_compress.graph.rewrite import (
     Facts,
     Fusion,
     Kit,
     Match,
-    Numbers,
-    array_of,
     constant,
     either,
     fresh_name,
-    holds_numbers,
-    inherit,
     match,
     moved,
-    numbers_of,
     op,
-    overflow,
-    sole_reader,
     var,
 )
 from me2e_compress.passes.digits import Layout, before, sizes, whole

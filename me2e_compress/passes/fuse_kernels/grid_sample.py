@@ -16,8 +16,14 @@ import onnx_ir as ir
 
 from me2e_compress.errors import PreconditionError
 from me2e_compress.graph import static_shape
-from me2e_compress.graph.nodes import VIEWS, is_standard, permutation_of, sole_reader
-from me2e_compress.graph.rewrite import maker, replace_value
+from me2e_compress.graph.nodes import (
+    VIEWS,
+    is_standard,
+    maker,
+    permutation_of,
+    sole_reader,
+)
+from me2e_compress.graph.rewrite import replace_value
 from me2e_compress.operators import OWN_DOMAIN, FusedCall
 
 LEAST_CHANNELS = 16

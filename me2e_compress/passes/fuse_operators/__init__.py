@@ -9,9 +9,9 @@ import onnx_ir as ir
 from me2e_compress.errors import GraphError, PreconditionError, RecipeError
 from me2e_compress.graph import array_of, graphs_of, is_standard, opset_of
 from me2e_compress.graph.nodes import is_read, nodes_in
+from me2e_compress.graph.provenance import inherit
 from me2e_compress.graph.rewrite import (
     add_constant,
-    inherit,
     remove_dead,
     replace_value,
     value_names,

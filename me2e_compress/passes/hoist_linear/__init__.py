@@ -7,7 +7,8 @@ import onnx_ir as ir
 
 from me2e_compress.display import counted
 from me2e_compress.graph import macs, nodes_of, opset_of
-from me2e_compress.graph.rewrite import graphs_of, remove_dead, value_names
+from me2e_compress.graph.nodes import graphs_of
+from me2e_compress.graph.rewrite import remove_dead, value_names
 from me2e_compress.passes.base import Context, Pass, PassResult
 from me2e_compress.passes.hoist_linear.rebuilding import Rewriter
 from me2e_compress.passes.hoist_linear.repeats import before_repeat

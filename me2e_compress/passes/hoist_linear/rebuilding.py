@@ -6,12 +6,11 @@ import numpy as np
 import onnx_ir as ir
 
 from me2e_compress.graph import static_shape
+from me2e_compress.graph.nodes import Array, is_read
+from me2e_compress.graph.provenance import inherit
 from me2e_compress.graph.rewrite import (
-    Array,
     add_constant,
     fresh_name,
-    inherit,
-    is_read,
     remove_node,
     replace_value,
 )

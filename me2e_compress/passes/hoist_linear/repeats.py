@@ -24,8 +24,14 @@ import numpy as np
 import onnx_ir as ir
 
 from me2e_compress.graph import array_of, is_standard, macs, rank_of, static_shape
-from me2e_compress.graph.nodes import integers_at, permutation_of
-from me2e_compress.graph.rewrite import Array, holds_numbers, is_read, sole_reader
+from me2e_compress.graph.nodes import (
+    Array,
+    holds_numbers,
+    integers_at,
+    is_read,
+    permutation_of,
+    sole_reader,
+)
 from me2e_compress.passes.digits import (
     Digit,
     Digits,

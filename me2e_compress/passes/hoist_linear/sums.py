@@ -22,14 +22,15 @@ import numpy as np
 import onnx_ir as ir
 
 from me2e_compress.graph import array_of, is_standard, static_shape
-from me2e_compress.graph.nodes import LAYOUT_OPERATORS, permutation_of
-from me2e_compress.graph.rewrite import (
+from me2e_compress.graph.nodes import (
     FLOATS,
+    LAYOUT_OPERATORS,
     Numbers,
     holds_numbers,
     maker,
     numbers_of,
     overflow,
+    permutation_of,
     sole_reader,
 )
 from me2e_compress.passes.hoist_linear.rebuilding import NodeWriter, Rewriter

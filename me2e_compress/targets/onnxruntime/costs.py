@@ -9,8 +9,7 @@ import onnx_ir as ir
 
 from me2e_compress import graph
 from me2e_compress.graph import static_shape
-from me2e_compress.graph.nodes import constant_values
-from me2e_compress.graph.rewrite import sole_reader
+from me2e_compress.graph.nodes import constant_values, sole_reader
 from me2e_compress.operators import find, int8_inputs
 from me2e_compress.quantization.costs import Border, Costs, Join, Layers
 from me2e_compress.targets.onnxruntime.region import JOINS, Region, end_of, find_region

@@ -15,6 +15,7 @@ import onnx_ir as ir
 
 from me2e_compress.errors import PreconditionError
 from me2e_compress.graph import rank_of, rewrite
+from me2e_compress.graph.nodes import sole_reader
 from me2e_compress.targets.onnxruntime.region import end_of, reads_one_pixel
 from me2e_compress.targets.quantized import QUANTIZE
 from me2e_compress.targets.weights import (
@@ -118,7 +119,7 @@ def write_layer(
         weight, integers = with_bias(weight, bias, step)
     # Does a QuantizeLinear alone read it, behind bias and ReLU?
     left = node.inputs[0]
-    reader = rewrite.sole_reader(end_of(_last_of(node)))
+    reader = sole_reader(end_of(_last_of(node)))
     known = left is not None and left.shape is not None
     quantize = reader if known and reader and reader.op_type == QUANTIZE else None
     # Choose the form.

@@ -10,8 +10,7 @@ import onnx_ir as ir
 from me2e_compress import graph
 from me2e_compress.calibration.observers import scale_of
 from me2e_compress.graph import bias_of, is_standard, producer_of, rank_of
-from me2e_compress.graph.nodes import scalar_of
-from me2e_compress.graph.rewrite import sole_reader
+from me2e_compress.graph.nodes import scalar_of, sole_reader
 from me2e_compress.graph.shapes import extent, is_one_matrix, open_shape, static_shape
 from me2e_compress.operators import int8_inputs
 from me2e_compress.targets.weights import is_bias
