@@ -4,8 +4,8 @@ from collections import deque
 from typing import Literal
 
 from me2e_compress.driving.contract import PedalsAndWheel
-from me2e_compress.driving.waypoint_pid import PidOptions, Place, WaypointPid
 from me2e_compress.runtime.plan_adapter import Trajectory
+from models.tcp.waypoint_pid import PidOptions, Place, WaypointPid
 
 Rule = Literal["tcp", "bench2drive"]
 

@@ -32,8 +32,8 @@ from me2e_compress.driving.latency import DecisionFacts, parse_latency
 from me2e_compress.driving.onnx_policy import OnnxPolicy
 from me2e_compress.driving.realtime import DT_US, HeldControl
 from me2e_compress.driving.shipped_adapters import adapter_file
-from me2e_compress.driving.waypoint_pid import PidOptions, WaypointPid
 from me2e_compress.runtime.providers import PROVIDERS
+from models.tcp.waypoint_pid import PidOptions, WaypointPid
 
 FULL_BRAKE = PedalsAndWheel(0.0, 0.0, 1.0)
 """Before the first control acts."""
