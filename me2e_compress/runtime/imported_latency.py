@@ -15,7 +15,7 @@ from pathlib import Path
 from statistics import fmean
 from typing import Annotated, TypeVar
 
-from pydantic import BaseModel, Field, TypeAdapter, ValidationError
+from pydantic import BaseModel, Field, TypeAdapter
 
 from me2e_compress.errors import EvaluationError
 from me2e_compress.registry import documents
@@ -85,7 +85,7 @@ def read_imports(paths: Sequence[Path]) -> Imported:
 def read_import(path: Path) -> Imported:
     """Read one file."""
     # The first character tells JSON from a log.
-    try:
+    with documents.reading(path, EvaluationError, FORMATS):
         content = documents.content(path)
         text = content.decode("utf-8-sig", errors="replace")
         if text.lstrip()[:1] not in ("[", "{"):
@@ -96,16 +96,13 @@ def read_import(path: Path) -> Imported:
                 raise EvaluationError(f"{path}: {FORMATS}; no power of a rail in it")
             return Imported(rails_w=rails, sources=("tegrastats",))
         found = documents.from_json(content)
-    except OSError as error:
-        raise EvaluationError(f"{path}: {error.strerror}") from error
-    except documents.MalformedError as error:
-        raise EvaluationError(f"{path}: {FORMATS}: {error}") from error
-    if isinstance(found, dict):
-        trace = LatencyTrace.load(path)
-        return Imported(trace.samples_us, machine=trace.machine, sources=("a trace",))
-    # A list is trtexec's; a profile begins with a count.
-    first = next((each for each in found if isinstance(each, dict)), {})
-    try:
+        if isinstance(found, dict):
+            trace = LatencyTrace.load(path)
+            return Imported(
+                trace.samples_us, machine=trace.machine, sources=("a trace",)
+            )
+        # A list is trtexec's; a profile begins with a count.
+        first = next((each for each in found if isinstance(each, dict)), {})
         if "count" not in first:
             times = TypeAdapter(_Some[_Time]).validate_python(found)
             samples = tuple(round(1e3 * each.latencyMs) for each in times)
@@ -120,10 +117,6 @@ def read_import(path: Path) -> Imported:
             layers_us={name: (taken,) for name, taken in by_cost},
             sources=("a profile of trtexec",),
         )
-    except ValidationError as error:
-        one = error.errors(include_url=False)[0]
-        where = ".".join(map(str, one["loc"])) or "the file"
-        raise EvaluationError(f"{path}: {FORMATS}: {where}: {one['msg']}") from error
 
 
 _Ms = Annotated[float, Field(ge=0.0, le=_LONGEST_MS, allow_inf_nan=False)]

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Annotated, Any, Self, TypeAlias
 
 import psutil
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import ConfigDict, Field, TypeAdapter, model_validator, with_config
 
 from me2e_compress.display import Table, counted, not_measured, table
 from me2e_compress.errors import EvaluationError
@@ -24,12 +24,13 @@ SHORTEST_S = 0.5
 """Shortest block to be judged, seconds: systems count CPU time in ticks of 10 ms."""
 
 
+@with_config(ConfigDict(strict=True))
 @dataclass(frozen=True)
 class Load:
     """Mean number of cores that other processes took during a measurement."""
 
-    others: float
-    cores: int
+    others: Annotated[float, Field(ge=0, alias="others_cores")]
+    cores: Annotated[int, Field(ge=1)]
 
     @property
     def busy(self) -> bool:
@@ -159,6 +160,13 @@ def _missing_percentiles(count: int) -> str:
     return not_measured({name: each for name, each in why.items() if each})
 
 
+Samples: TypeAlias = Annotated[
+    tuple[Annotated[int, Field(ge=0)], ...], Field(min_length=1, strict=False)
+]
+"""Microseconds of one inference or more; a list in a file."""
+
+
+@with_config(ConfigDict(strict=True))
 @dataclass(frozen=True, repr=False)
 class LatencyTrace:
     """Latencies in the order in which they were measured.
@@ -175,9 +183,9 @@ class LatencyTrace:
 
     model_sha256: str
     machine: str
-    samples_us: tuple[int, ...]
+    samples_us: Samples
     frames: str | None = None
-    modules_us: Microseconds = field(default_factory=dict)
+    modules_us: Mapping[str, Samples] = field(default_factory=dict)
     others: Load | None = None
 
     @property
@@ -231,33 +239,13 @@ class LatencyTrace:
     def load(cls, path: Path) -> Self:
         """Read a trace; its percentiles are recomputed from the samples."""
         with documents.reading(path, EvaluationError, "not a latency trace"):
-            record = _Record.model_validate_json(documents.content(path))
-        return cls(
-            record.model_sha256,
-            record.machine,
-            tuple(record.samples_us),
-            record.frames,
-            {name: tuple(taken) for name, taken in record.modules_us.items()},
-            record.others,
+            return TypeAdapter(cls).validate_json(documents.content(path))
+
+    @model_validator(mode="before")
+    @classmethod
+    def _with_load(cls, record: Any) -> Any:
+        """Make a load of its two numbers, which a file has beside the rest."""
+        both = (
+            isinstance(record, dict) and not {"others_cores", "cores"} - record.keys()
         )
-
-
-_Samples: TypeAlias = Annotated[list[Annotated[int, Field(ge=0)]], Field(min_length=1)]
-
-
-class _Record(BaseModel):
-    model_config = ConfigDict(strict=True)
-
-    model_sha256: str
-    machine: str
-    frames: str | None = None
-    samples_us: _Samples
-    modules_us: dict[str, _Samples] = Field(default_factory=dict)
-    others_cores: Annotated[float, Field(ge=0)] | None = None
-    cores: Annotated[int, Field(ge=1)] | None = None
-
-    @property
-    def others(self) -> Load | None:
-        if self.others_cores is None or self.cores is None:
-            return None
-        return Load(self.others_cores, self.cores)
+        return {**record, "others": record} if both else record
