@@ -31,7 +31,6 @@ from benchmarks.subject import Subject, at
 from me2e_compress import graph
 from me2e_compress.calibration.calibrator import Calibrator
 from me2e_compress.calibration.dataset import CalibrationSet
-from me2e_compress.calibration.sample import FrameSubset
 from me2e_compress.graph.modules import ModuleMap
 from me2e_compress.quantization.plan import make_plan, tensors_of
 from me2e_compress.quantization.scheme import QuantScheme
@@ -158,7 +157,7 @@ def measure(chosen: argparse.Namespace) -> dict[str, float | int | None]:
     method, optimize = OURS[chosen.run]
     subject = at(chosen.out)
     recording = CalibrationSet(subject.frames)
-    frames = FrameSubset(recording, tuple(range(min(chosen.frames, len(recording)))))
+    frames = recording.part(range(min(chosen.frames, len(recording))))
     cpu, wall = time.process_time(), time.perf_counter()
     tensors: tuple[str, ...] = ()
     model = graph.load(subject.model)

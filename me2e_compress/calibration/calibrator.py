@@ -11,11 +11,11 @@ import numpy.typing as npt
 import onnx_ir as ir
 
 from me2e_compress import graph
-from me2e_compress.calibration.dataset import archive_of, load_arrays
+from me2e_compress.calibration.dataset import CalibrationSet, archive_of, load_arrays
 from me2e_compress.calibration.observers import DEFAULT_METHOD, OBSERVERS
 from me2e_compress.calibration.ranges import Ranges
 from me2e_compress.calibration.statistics import BINS, Statistics, checksum, no_element
-from me2e_compress.calibration.stream import Readings, Recording, probed_session, stream
+from me2e_compress.calibration.stream import Readings, probed_session, stream
 from me2e_compress.errors import FramesError, GraphError
 from me2e_compress.registry import documents
 from me2e_compress.runtime.atomic import write_bytes
@@ -205,7 +205,7 @@ class Calibrator:
         self,
         model: ir.Model,
         tensors: Sequence[str],
-        frames: Recording,
+        frames: CalibrationSet,
         progress: Progress | None = None,
     ) -> Ranges:
         """Collect statistics and compute ranges; see :meth:`collect`."""
@@ -217,7 +217,7 @@ class Calibrator:
         self,
         model: ir.Model,
         tensors: Sequence[str],
-        frames: Recording,
+        frames: CalibrationSet,
         progress: Progress | None = None,
     ) -> Statistics:
         """Run the model over the frames, its recurrent state fed forward.
@@ -272,7 +272,7 @@ class _Job:
         settings: Calibrator,
         model: ir.Model,
         blank: Statistics,
-        frames: Recording,
+        frames: CalibrationSet,
         progress: Progress | None,
         passes: int,
     ) -> None:

@@ -13,6 +13,7 @@ Other inputs are fed unchanged. A reader that does not know the key refuses the 
 since their type and shape do not fit the model.
 """
 
+import copy
 import dataclasses
 import hashlib
 import io
@@ -20,9 +21,9 @@ import itertools
 import json
 import math
 import zipfile
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import IO, Annotated, Literal, TypeAlias, TypeVar
+from typing import IO, Annotated, Literal, Self, TypeAlias, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -208,7 +209,12 @@ FROZEN_INPUTS = "me2e.static_inputs"
 
 
 class CalibrationSet:
-    """A recording on disk, read frame by frame.
+    """A recording on disk, or a part of one, read frame by frame.
+
+    Attributes:
+        folder: that of the recording.
+        files: of all its frames.
+        places: indices of these frames in the whole recording.
 
     Raises:
         FramesError: no such folder, no frames, or scenes.json is missing or malformed.
@@ -233,7 +239,8 @@ class CalibrationSet:
         with documents.reading(path, FramesError, "not JSON"):
             content = documents.from_json(documents.content(path))
         index = content if isinstance(content, dict) else {}
-        self.scenes = _scenes(path, index, len(self.files))
+        self.places: Sequence[int] = range(len(self.files))
+        self._starts = _scenes(path, index, len(self.files))
         # Old recordings, and those without pixels, have no such entry.
         pixels = index.get("pixels")
         version = pixels.get("version") if isinstance(pixels, dict) else None
@@ -247,23 +254,33 @@ class CalibrationSet:
             )
         self.pixels = entry.inputs
 
-    def __len__(self) -> int:
-        return len(self.files)
+    def part(self, places: Iterable[int]) -> Self:
+        """Return the frames of some places in the whole; the first starts a scene."""
+        part = copy.copy(self)
+        part.places = tuple(places)
+        return part
 
     @property
-    def places(self) -> range:
-        """Indices of all frames."""
-        return range(len(self.files))
+    def scenes(self) -> tuple[int, ...]:
+        """Positions among these frames where a scene begins."""
+        return tuple(at for at in range(len(self)) if self._begins(at))
+
+    def _begins(self, index: int) -> bool:
+        return not index or self.places[index] in self._starts
+
+    def __len__(self) -> int:
+        return len(self.places)
 
     def __iter__(self) -> Iterator[Frame]:
         """Read the frames in order, one in memory at a time."""
         return (self[index] for index in range(len(self)))
 
     def __getitem__(self, index: int) -> Frame:
-        """Read one frame and normalise its pixels."""
-        path = self.files[index]
+        """Read one frame and normalise its pixels; its index is that in the whole."""
+        place = self.places[index]
+        path = self.files[place]
         arrays = self._as_fed(path, load_arrays(path), PixelInput.normalised)
-        return Frame(index, index in self.scenes, arrays)
+        return Frame(place, self._begins(index), arrays)
 
     def _as_fed(
         self, path: Path, held: Mapping[str, T], turn: Callable[[PixelInput, T], T]
@@ -280,13 +297,13 @@ class CalibrationSet:
 
     @property
     def fingerprint(self) -> str:
-        """A digest that changes with the content, the order or the scenes.
+        """A digest of the whole: it changes with its content, order or scenes.
 
         It uses the checksums in every .npz (CRC-32 and size of each array), so that the
         arrays need not be read.
         """
         digest = hashlib.blake2b(digest_size=16)
-        digest.update(repr(self.scenes).encode())
+        digest.update(repr(self._starts).encode())
         if self.pixels:
             digest.update(repr(sorted(self.pixels.items())).encode())
         # The directory of each archive has its checksums.
@@ -304,7 +321,7 @@ class CalibrationSet:
         return digest.hexdigest()
 
     def check(self, model: ir.Model) -> None:
-        """Read every frame once and check it against a model's inputs.
+        """Read every frame of the whole once and check it against a model's inputs.
 
         Recurrent inputs may be absent. Names that the model lacks are an error, except
         those that ``freeze-inputs`` made constants: their values must be the same.

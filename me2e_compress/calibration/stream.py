@@ -4,49 +4,27 @@ import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Protocol, TypeAlias
+from typing import TypeAlias
 
 import numpy as np
 import numpy.typing as npt
 import onnx_ir as ir
 import onnx_ir.passes.common as common
 
+from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.graph.nodes import makers_of, reads_of
-from me2e_compress.runtime.frames import Array, Frame, Frames
+from me2e_compress.runtime.frames import Array
 from me2e_compress.runtime.probing import READINGS, Probe, insert_probes
 from me2e_compress.runtime.providers import CPU, Provider
-from me2e_compress.runtime.session import DTYPES, Session, replay
+from me2e_compress.runtime.session import DTYPES, Session, feed_forward
 
 Readings: TypeAlias = npt.NDArray[np.float32]
 """Readings of the probes in one frame: float32 [tensors, width of the probe]."""
 
 
-class Recording(Frames, Protocol):
-    """Recorded frames, readable from any index on: all of a folder, or some."""
-
-    @property
-    def fingerprint(self) -> str:
-        """A digest that changes with the content of the whole recording."""
-        ...
-
-    @property
-    def places(self) -> Sequence[int]:
-        """Indices of these frames in the whole recording."""
-        ...
-
-    @property
-    def scenes(self) -> Sequence[int]:
-        """Positions among these frames where a scene begins."""
-        ...
-
-    def __getitem__(self, index: int) -> Frame:
-        """Read one frame."""
-        ...
-
-
 def stream(
     session: Session,
-    frames: Recording,
+    frames: CalibrationSet,
     width: int,
     begin: int = 0,
     state: Mapping[str, Array] | None = None,
@@ -59,17 +37,10 @@ def stream(
     there.
     """
     told = [name for name, port in session.outputs.items() if port.type in DTYPES]
-    wanted = list(dict.fromkeys([*told, *session.recurrent.values()]))
-    state = state or {}
-    for index in range(begin, len(frames)):
-        frame = frames[index]
-        if frame.starts_scene:
-            state = session.first_state(frame.arrays)
-        values = next(replay(session, [frame], wanted, state))
+    rest = (frames[index] for index in range(begin, len(frames)))
+    for inputs, values, after in feed_forward(session, rest, told, state):
         readings = values[READINGS].astype(np.float32).reshape(-1, width)
-        held = {**frame.arrays, **state, **values}
-        state = {name: values[answer] for name, answer in session.recurrent.items()}
-        yield readings, held, state
+        yield readings, {**inputs, **values}, after
 
 
 def probed_session(

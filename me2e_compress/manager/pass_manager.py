@@ -11,7 +11,6 @@ import onnx_ir as ir
 
 from me2e_compress import graph
 from me2e_compress.calibration.dataset import CalibrationSet
-from me2e_compress.calibration.stream import Recording
 from me2e_compress.errors import (
     GraphError,
     Me2eError,
@@ -206,7 +205,7 @@ class _Run:
         names = tuple(current.name for current, _ in stretch)
         return equivalence.skipped(names, reason), stretch, None
 
-    def _frames(self) -> Recording | None:
+    def _frames(self) -> CalibrationSet | None:
         return self.context.frames or self.manager.samples
 
     def _leave_out(self, stretch: Stretch, reason: str) -> tuple[str, ...]:

@@ -13,8 +13,7 @@ import numpy as np
 import numpy.typing as npt
 import onnx_ir as ir
 
-from me2e_compress.calibration.dataset import synthetic
-from me2e_compress.calibration.stream import Recording
+from me2e_compress.calibration.dataset import CalibrationSet, synthetic
 from me2e_compress.errors import FramesError, GraphError, PreconditionError
 from me2e_compress.graph.shapes import is_static, static_shape
 from me2e_compress.passes.fix_shapes import open_dimensions, sized_inputs
@@ -74,7 +73,7 @@ class VerificationInputs:
     def of(
         cls,
         model: ir.Model,
-        frames: Recording | None,
+        frames: CalibrationSet | None,
         seed: int,
         count: int,
         successor: ir.Model | None = None,

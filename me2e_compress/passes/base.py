@@ -9,8 +9,8 @@ import onnx_ir as ir
 
 from me2e_compress import graph
 from me2e_compress.calibration.calibrator import Calibrator
+from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.calibration.ranges import Ranges
-from me2e_compress.calibration.stream import Recording
 from me2e_compress.errors import FramesError
 from me2e_compress.graph.modules import ModuleMap
 from me2e_compress.runtime.providers import CPU, Provider
@@ -26,7 +26,7 @@ class Context:
     """
 
     modules: ModuleMap
-    frames: Recording | None = None
+    frames: CalibrationSet | None = None
     seed: int = 0
     provider: Provider = CPU
     measured: dict[str, Ranges] = dataclasses.field(

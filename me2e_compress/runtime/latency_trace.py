@@ -245,7 +245,7 @@ class LatencyTrace:
     @classmethod
     def _with_load(cls, record: Any) -> Any:
         """Make a load of its two numbers, which a file has beside the rest."""
-        both = (
-            isinstance(record, dict) and not {"others_cores", "cores"} - record.keys()
-        )
-        return {**record, "others": record} if both else record
+        if not isinstance(record, dict):
+            return record
+        known = None not in (record.get("others_cores"), record.get("cores"))
+        return {**record, "others": record if known else None}

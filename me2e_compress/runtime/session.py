@@ -380,35 +380,50 @@ def replay(
     session: Session,
     frames: Iterable[Frame],
     outputs: Sequence[str] | None = None,
-    state: Mapping[str, Array] | None = None,
 ) -> Iterator[dict[str, Array]]:
-    """Run a model over a recording, its recurrent state fed forward; yield its outputs.
+    """Run a model over a recording and yield its outputs; see :func:`feed_forward`.
+
+    ``outputs`` None yields all.
+    """
+    wanted = list(session.outputs) if outputs is None else list(outputs)
+    for _, values, _ in feed_forward(session, frames, wanted):
+        yield {name: values[name] for name in wanted}
+
+
+def feed_forward(
+    session: Session,
+    frames: Iterable[Frame],
+    outputs: Sequence[str],
+    state: Mapping[str, Array] | None = None,
+) -> Iterator[tuple[dict[str, Array], dict[str, Array], dict[str, Array]]]:
+    """Run a model over a recording, its recurrent state fed forward.
 
     At the start of a scene a recurrent input comes from the frame or, if the frame has
     none, is zeros. Afterwards it is the model's output of the previous frame, even if
     the frame has an array for it. ``state`` holds the recurrent inputs before a first
-    frame that continues a scene, to resume an interrupted replay; ``outputs`` None
-    yields all.
+    frame that continues a scene, to resume an interrupted replay.
+
+    Yields:
+        All inputs of a frame, the outputs and those that are state, the next state.
 
     Raises:
         FramesError: a frame does not fit; the message names it.
         GraphError: a recurrent input of unknown shape has no first value.
     """
-    wanted = list(session.outputs) if outputs is None else list(outputs)
     # State is fetched even if the caller does not want it.
-    fetched = list(dict.fromkeys([*wanted, *session.recurrent.values()]))
-    memory: Mapping[str, Array] = {} if state is None else state
+    fetched = list(dict.fromkeys([*outputs, *session.recurrent.values()]))
+    memory = dict(state or {})
     for frame in frames:
         if frame.starts_scene:
             memory = session.first_state(frame.arrays)
+        inputs = {**frame.arrays, **memory}
         try:
-            fed = {**frame.arrays, **memory}
-            values = session.run(fed, fetched)
+            values = session.run(inputs, fetched)
         except FramesError as error:
             raise FramesError(f"frame {frame.index}: {error}") from error
         # The outputs of this frame are the next one's state.
         memory = {name: values[answer] for name, answer in session.recurrent.items()}
-        yield {name: values[name] for name in wanted}
+        yield inputs, values, memory
 
 
 def detached(outputs: Mapping[str, Array]) -> dict[str, Array]:

@@ -5,7 +5,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from google.protobuf.message import DecodeError
-from pydantic import BaseModel, ValidationError
 
 from me2e_compress import graph
 from me2e_compress.calibration.dataset import CalibrationSet
@@ -15,6 +14,7 @@ from me2e_compress.errors import GraphError, Me2eError, StudyError
 from me2e_compress.evaluators.highway.drivers import OnnxDriver
 from me2e_compress.graph.modules import ModuleMap
 from me2e_compress.manager.recipe import to_text
+from me2e_compress.registry import documents
 from me2e_compress.runtime.providers import CPU, PROVIDERS
 from me2e_compress.study.definition import Study, Variant
 from me2e_compress.study.workspace import Workspace
@@ -103,26 +103,15 @@ def prepare_variant(
     )
 
 
-class _File(BaseModel):
-    file: str
-    sha256: str
-
-
-class _Report(BaseModel):
-    source: _File
-    output: _File
-    pipeline: str
-
-
 def _reported_beside(model: Path) -> tuple[str, str] | None:
     """Read source and passes from the report next to a file, if it is of that file."""
     try:
-        report = _Report.model_validate_json(beside(model, "report").read_bytes())
-        if report.output.sha256 != graph.sha256_of(model):
+        report = documents.from_json(beside(model, "report").read_bytes())
+        if report["output"]["sha256"] != graph.sha256_of(model):
             return None
-    except (OSError, DecodeError, GraphError, ValidationError):
-        return None
-    return report.source.file, report.pipeline
+        return str(report["source"]["file"]), str(report["pipeline"])
+    except (OSError, DecodeError, GraphError, ValueError, LookupError, TypeError):
+        return None  # there is none, or it is not a report
 
 
 def _compressed(

@@ -25,7 +25,7 @@ from me2e_compress.calibration.review import (
     review,
     review_beside,
 )
-from me2e_compress.calibration.sample import FrameSubset, draw
+from me2e_compress.calibration.sample import draw
 from me2e_compress.display import counted, number, table
 from me2e_compress.errors import FramesError
 from me2e_compress.manager import recipe
@@ -173,7 +173,7 @@ def _ready(
     frames: str | Path | None,
     options: CalibrateOptions,
     listener: Listener,
-) -> tuple[PreparedGraph, FrameSubset | None]:
+) -> tuple[PreparedGraph, CalibrationSet | None]:
     """Read the graph and its frames, and run the passes before int8.
 
     Ranges belong to the graph as these passes leave it.
@@ -201,7 +201,7 @@ def _ready(
 
 def _measured(
     ready: PreparedGraph,
-    part: FrameSubset,
+    part: CalibrationSet,
     output: Path,
     options: CalibrateOptions,
     listener: Listener,
@@ -220,14 +220,14 @@ def _measured(
 
 
 def _imported(
-    ready: PreparedGraph, part: FrameSubset | None, options: CalibrateOptions
+    ready: PreparedGraph, part: CalibrationSet | None, options: CalibrateOptions
 ) -> tuple[Ranges, list[str]]:
     """Take another tool's ranges; name the tensors that it has none for."""
     path, tensors = Path(options.imported or ""), ready.tensors()
     ranges = taken_from(read_cache(path), path, ready.model, tensors)
     # two frames show the size of every tensor; the second has a state
     if part is not None:
-        few = dataclasses.replace(part, places=part.places[:2])
+        few = part.part(part.places[:2])
         calibrator = Calibrator(threads=options.threads, provider=options.runs_on)
         seen = calibrator.collect(ready.model, tuple(ranges.tensors), few)
         ranges = dataclasses.replace(ranges, rms=rms_of(seen))

@@ -11,7 +11,6 @@ import onnx_ir as ir
 from me2e_compress import graph
 from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.calibration.sample import hold_out
-from me2e_compress.calibration.stream import Recording
 from me2e_compress.display import Table, counted, table
 from me2e_compress.errors import EvaluationError, FramesError, GraphError
 from me2e_compress.fidelity.compare import Fidelity, Reference, Tally
@@ -327,7 +326,7 @@ class SplitFrames:
         samples: frames that exact passes are checked on where the user gave none.
     """
 
-    calibration: Recording | None
+    calibration: CalibrationSet | None
     measured: Frames | None
     kind: str
     samples: CalibrationSet | None = None

@@ -12,7 +12,6 @@ from me2e_compress.calibration.calibrator import Calibrator
 from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.calibration.observers import OBSERVERS
 from me2e_compress.calibration.ranges import Ranges
-from me2e_compress.calibration.sample import FrameSubset
 from me2e_compress.calibration.statistics import Statistics
 from me2e_compress.errors import FramesError, GraphError, RecipeError
 from me2e_compress.runtime.frames import Array, Frame
@@ -174,7 +173,7 @@ def test_a_file_that_holds_no_ranges_is_refused(tmp_path: Path, content: str) ->
 
 def test_no_frames_are_an_error(frames: CalibrationSet) -> None:
     with pytest.raises(FramesError, match="no frames to calibrate on"):
-        Calibrator(threads=1).run(conv_attention(), ["a"], FrameSubset(frames, ()))
+        Calibrator(threads=1).run(conv_attention(), ["a"], frames.part(()))
 
 
 FOUR = ("image", "a", "seen", "mixed")
@@ -262,7 +261,7 @@ def test_the_checkpoint_of_another_calibration_is_refused(
         )
     images = [image(seed + other.first_image) for seed in range(6)]
     whole = CalibrationSet(record(tmp_path / "other", images, (0, 4)))
-    frames = FrameSubset(whole, tuple(range(6))[-other.last_frames :])
+    frames = whole.part(range(6)[-other.last_frames :])
 
     with pytest.raises(FramesError, match=f"stale: a checkpoint of {message};"):
         Calibrator(

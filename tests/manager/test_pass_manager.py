@@ -8,7 +8,7 @@ import onnx_ir as ir
 import pytest
 
 from me2e_compress import graph
-from me2e_compress.calibration.stream import Recording
+from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.errors import GraphError, PassError, VerificationError
 from me2e_compress.graph import provenance, shapes
 from me2e_compress.manager import PassManager, Report, attempt
@@ -233,7 +233,7 @@ def test_a_pass_s_graph_is_written_once_for_checker_and_inference(
 def test_a_graph_that_kills_its_process_is_refused_before_it_is_run(
     context: Context, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def refuses(model: ir.Model, name: str, frames: Recording | None) -> None:
+    def refuses(model: ir.Model, name: str, frames: CalibrationSet | None) -> None:
         raise GraphError(f"{name} kills {frames}")
 
     def opens(*_: object, **__: object) -> None:

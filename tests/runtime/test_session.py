@@ -10,7 +10,7 @@ from me2e_compress.errors import FramesError, GraphError
 from me2e_compress.graph.nodes import constant_values
 from me2e_compress.runtime.frames import Array, Frame
 from me2e_compress.runtime.runnable import endless, unsupported
-from me2e_compress.runtime.session import Session, replay
+from me2e_compress.runtime.session import Session, feed_forward, replay
 from me2e_compress.targets.weights import evaluate_constants
 from tests.nets import parsed
 
@@ -41,8 +41,8 @@ def ones(index: int, starts: bool) -> Frame:
 def sums(
     counter: ir.Model, frames: list[Frame], state: Mapping[str, Array] | None = None
 ) -> list[float]:
-    replayed = replay(Session(counter), frames, state=state)
-    return [float(values["y"].item(0)) for values in replayed]
+    replayed = feed_forward(Session(counter), frames, ["y"], state)
+    return [float(values["y"].item(0)) for _, values, _ in replayed]
 
 
 def test_state_is_fed_forward_and_reset_where_a_scene_starts(counter: ir.Model) -> None:

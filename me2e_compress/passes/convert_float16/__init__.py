@@ -11,7 +11,7 @@ import numpy as np
 import onnx_ir as ir
 
 from me2e_compress.calibration.calibrator import Calibrator
-from me2e_compress.calibration.stream import Recording
+from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.display import counted
 from me2e_compress.errors import PreconditionError
 from me2e_compress.graph import (
@@ -234,7 +234,7 @@ _MOVES = LAYOUT_OPERATORS | {
 def wide_nodes(
     model: ir.Model,
     types: ElementTypes,
-    frames: Recording | None,
+    frames: CalibrationSet | None,
     *,
     keep_io: bool,
     provider: Provider = CPU,
@@ -305,7 +305,7 @@ def _by_ranges(
     model: ir.Model,
     types: ElementTypes,
     known: Collection[ir.Node],
-    frames: Recording,
+    frames: CalibrationSet,
     provider: Provider,
 ) -> dict[ir.Node, str]:
     # Map the measured values to the nodes that touch them
