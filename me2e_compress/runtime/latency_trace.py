@@ -144,10 +144,9 @@ def _shown(samples: Sequence[int]) -> list[str]:
 
 def shares_table(title: str, what: str, parts: Microseconds) -> Table:
     """Return a table of the parts: share, then percentiles in milliseconds."""
-    whole = max(1, sum(map(sum, parts.values())))
     rows = [
-        (name, f"{sum(samples) / whole:.1%}", *_shown(samples))
-        for name, samples in parts.items()
+        (each.name, f"{each.share:.1%}", *_shown(parts[each.name]))
+        for each in shares(parts)
     ]
     columns = (what, "share", "p50 ms", "p90 ms", "p99 ms", "max ms")
     count = min(map(len, parts.values()), default=0)
@@ -209,11 +208,6 @@ class LatencyTrace:
     def percentile_us(self, percent: float) -> int:
         """Return the smallest sample that ``percent`` of the samples do not exceed."""
         return percentile(self.samples_us, percent)
-
-    @property
-    def max_us(self) -> int:
-        """The slowest sample."""
-        return max(self.samples_us)
 
     def to_json(self) -> dict[str, Any]:
         """Return p50, p90, p99 and max with the samples; None with too few samples."""

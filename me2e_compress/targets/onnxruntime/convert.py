@@ -25,6 +25,7 @@ from me2e_compress.graph import (
 from me2e_compress.graph.nodes import LAYOUT_OPERATORS, maker
 from me2e_compress.runtime.int8_values import stored_bias
 from me2e_compress.runtime.providers import CPU, Provider
+from me2e_compress.targets.onnxruntime.lint_rules import PASSED
 from me2e_compress.targets.onnxruntime.lower import Draft, lower
 from me2e_compress.targets.onnxruntime.region import (
     LAYERS,
@@ -241,10 +242,6 @@ def _integers(dequantize: ir.Node, step: Floats) -> npt.NDArray[np.int8] | None:
 # become unsigned when a session opens, so the sign alone costs nothing.
 
 
-_PASSED = frozenset(
-    {"MaxPool", "Reshape", "Slice", "Squeeze", "Transpose", "Unsqueeze"}
-)
-"""Operators that onnxruntime moves a QuantizeLinear in front of (QDQPropagation)."""
 _LEAST = {ir.DataType.INT8: -128, ir.DataType.UINT8: 0}
 """Types of activations that there are integer kernels for, with their least number."""
 _OF_TENSORRT = (ir.DataType.INT8, ir.DataType.FLOAT8E4M3FN)
@@ -326,7 +323,7 @@ def _ends(value: ir.Value, *, takes_relu: bool) -> list[ir.Node]:
             least = _LEAST.get(_kind_of(end)) if end.op_type == QUANTIZE else None
             takes_relu &= least is not None and bool((_zeros_of(end) == least).all())
         return ends if takes_relu else [*readers, *ends]
-    passed = readers[0].op_type in _PASSED
+    passed = readers[0].op_type in PASSED
     return _ends(behind, takes_relu=takes_relu) if passed else readers
 
 

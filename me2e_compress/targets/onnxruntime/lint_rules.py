@@ -56,8 +56,8 @@ float16 moves one."""
 
 _REMEDY = "disabled_optimizers=['WeightBiasQuantization'] keeps it"
 _CLIPS = ("Clip", "Dropout", "Identity", "Relu")
-_MOVES = ("MaxPool", "Reshape", "Slice", "Squeeze", "Transpose", "Unsqueeze")
-"""Operators that onnxruntime moves a pair across, to the layer."""
+PASSED = ("MaxPool", "Reshape", "Slice", "Squeeze", "Transpose", "Unsqueeze")
+"""Operators that onnxruntime moves a pair across, to the layer (QDQPropagation)."""
 _FOLDED = ("Add", "BatchNormalization", "Mul")  # into a float weight, first
 
 Constants = Mapping[str, Array]
@@ -117,7 +117,7 @@ def _layers(model: ir.Model) -> Iterator[_Layer]:
             continue
         # The pair may stand before Identities and moves.
         value = node.inputs[0]
-        while (moved := maker(value, "Identity", *_MOVES)) is not None:
+        while (moved := maker(value, "Identity", *PASSED)) is not None:
             value = moved.inputs[0]
         pair = maker(value, DEQUANTIZE)
         if pair is None:
@@ -297,7 +297,7 @@ def _quantizer(layer: _Layer, folded: tuple[str, ...] = ()) -> ir.Node | None:
     Those are what is folded into the layer first, then clips, then moves.
     """
     value = layer.end
-    moves: tuple[str, ...] = _MOVES
+    moves: tuple[str, ...] = PASSED
     if layer.node.op_type == "Gemm" and layer.bias is None:
         moves = tuple(each for each in moves if each != "Transpose")  # fused before
     stages = [moves] if layer.is_reshaped else [folded, _CLIPS, moves]
