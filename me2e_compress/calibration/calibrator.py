@@ -14,16 +14,27 @@ from me2e_compress import graph
 from me2e_compress.calibration.dataset import CalibrationSet, archive_of, load_arrays
 from me2e_compress.calibration.observers import DEFAULT_METHOD, OBSERVERS
 from me2e_compress.calibration.ranges import Ranges
-from me2e_compress.calibration.statistics import BINS, Statistics, checksum, no_element
-from me2e_compress.calibration.stream import Readings, probed_session, stream
+from me2e_compress.calibration.statistics import (
+    BINS,
+    Floats,
+    Statistics,
+    checksum,
+    no_element,
+)
 from me2e_compress.errors import FramesError, GraphError
 from me2e_compress.registry import documents
 from me2e_compress.runtime.atomic import write_bytes
 from me2e_compress.runtime.frames import Array
-from me2e_compress.runtime.probing import Probe, Reading, shared_constant
+from me2e_compress.runtime.probing import (
+    READINGS,
+    Probe,
+    Reading,
+    probed_session,
+    shared_constant,
+)
 from me2e_compress.runtime.providers import CPU, Provider
 from me2e_compress.runtime.runnable import unsupported
-from me2e_compress.runtime.session import DTYPES
+from me2e_compress.runtime.session import DTYPES, feed_forward
 
 # The probes of a calibration: extremes, and histograms of magnitudes.
 
@@ -329,10 +340,11 @@ class _Job:
 
     def _pass(
         self, probe: Probe, before: int
-    ) -> Iterator[tuple[Readings, Mapping[str, Array], int]]:
+    ) -> Iterator[tuple[Floats, Mapping[str, Array], int]]:
         """Run the rest of a pass; ``before`` frames belong to earlier passes.
 
-        Yields the readings of each frame, its inputs and outputs, and its index.
+        Yields the readings of each frame [tensors, width of the probe], its inputs and
+        outputs, and its index.
         """
         # Skip what an interrupted run has done.
         begin = max(self.begun.done - before, 0)
@@ -347,10 +359,13 @@ class _Job:
             provider=self.settings.provider,
         )
         state = self.begun.state if begin else None
-        readings = stream(session, self.frames, probe.width, begin, state)
+        told = [name for name, port in session.outputs.items() if port.type in DTYPES]
+        rest = (self.frames[index] for index in range(begin, len(self.frames)))
+        runs = feed_forward(session, rest, told, state)
         # Store the progress from time to time.
-        for at, (numbers, held, after) in enumerate(readings, begin):
-            yield numbers, held, self.seen.frames[at]
+        for at, (inputs, values, after) in enumerate(runs, begin):
+            readings = values[READINGS].astype(np.float32).reshape(-1, probe.width)
+            yield readings, {**inputs, **values}, self.seen.frames[at]
             done = before + at + 1
             every = self.settings.every
             if self.settings.checkpoint and (done % every == 0 or done == self.total):
@@ -377,7 +392,7 @@ def _ports(values: Iterable[ir.Value]) -> tuple[str, ...]:
     return tuple(str(each.name) for each in numbers)
 
 
-def check_finite(readings: Readings, tensors: Sequence[str], place: int) -> None:
+def check_finite(readings: Floats, tensors: Sequence[str], place: int) -> None:
     """Raise a FramesError for a NaN or infinite element; mean squares may overflow."""
     bad = np.isnan(readings).any(1) | np.isinf(readings[:, :2]).any(1)
     bad &= ~no_element(readings)
