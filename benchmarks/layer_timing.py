@@ -14,7 +14,8 @@ from me2e_compress.calibration.ranges import Ranges
 from me2e_compress.graph import provenance
 from me2e_compress.graph.modules import ModuleMap
 from me2e_compress.graph.provenance import Provenance
-from me2e_compress.quantization.plan import QuantPlan, make_plan
+from me2e_compress.quantization.decision import QuantPlan
+from me2e_compress.quantization.plan import make_plan
 from me2e_compress.quantization.rules import RULE_SETS
 from me2e_compress.quantization.scheme import QuantScheme
 from me2e_compress.runtime.frames import Frame

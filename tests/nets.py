@@ -11,7 +11,8 @@ from me2e_compress import graph
 from me2e_compress.graph import provenance
 from me2e_compress.graph.modules import ModuleMap
 from me2e_compress.graph.provenance import Provenance
-from me2e_compress.quantization.plan import Decision, QuantPlan, make_plan
+from me2e_compress.quantization.decision import Decision, QuantPlan
+from me2e_compress.quantization.plan import make_plan
 from me2e_compress.quantization.rules import RULE_SETS
 from me2e_compress.quantization.rules.rule_sets import PaperRules
 from me2e_compress.quantization.scheme import QuantScheme

@@ -10,8 +10,7 @@ from me2e_compress.display import (
     reason,
     significant,
 )
-from me2e_compress.quantization.decision import Decision
-from me2e_compress.quantization.plan import QuantPlan
+from me2e_compress.quantization.decision import Decision, QuantPlan
 from me2e_compress.quantization.scheme import QuantScheme
 
 

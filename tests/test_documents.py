@@ -9,8 +9,7 @@ from me2e_compress.calibration.ranges import Ranges
 from me2e_compress.errors import Me2eError
 from me2e_compress.graph.modules import ModuleMap
 from me2e_compress.manager import recipe
-from me2e_compress.quantization.decision import Overrides
-from me2e_compress.quantization.plan import load_plan
+from me2e_compress.quantization.decision import Overrides, load_plan
 from me2e_compress.registry import documents
 from me2e_compress.registry.documents import MalformedError, from_json, from_toml
 

@@ -17,7 +17,7 @@ from me2e_compress import graph
 from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.errors import StudyError
 from me2e_compress.graph import WEIGHTED
-from me2e_compress.quantization.plan import plan_of
+from me2e_compress.quantization.decision import plan_of
 from me2e_compress.runtime.energy.meter import measure_energy
 from me2e_compress.runtime.profile import record_traces
 from me2e_compress.runtime.providers import CPU

@@ -15,8 +15,14 @@ from me2e_compress.display import significant
 from me2e_compress.errors import EvaluationError
 from me2e_compress.fidelity.compare import Fidelity, Reference
 from me2e_compress.graph.modules import ModuleMap
-from me2e_compress.quantization.decision import keep_float, overrides_text
-from me2e_compress.quantization.plan import RESIDUAL, Overrides, QuantPlan, make_plan
+from me2e_compress.quantization.decision import (
+    RESIDUAL,
+    Overrides,
+    QuantPlan,
+    keep_float,
+    overrides_text,
+)
+from me2e_compress.quantization.plan import make_plan
 from me2e_compress.quantization.rules import RuleSet
 from me2e_compress.quantization.scheme import QuantScheme
 from me2e_compress.registry import drafts

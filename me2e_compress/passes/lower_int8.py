@@ -11,7 +11,7 @@ from me2e_compress.calibration.observers import DEFAULT_METHOD
 from me2e_compress.display import counted
 from me2e_compress.graph import provenance
 from me2e_compress.passes.base import Context, Pass, PassResult
-from me2e_compress.quantization.plan import plan_of, stamp_plan
+from me2e_compress.quantization.decision import plan_of, stamp_plan
 from me2e_compress.targets import onnxruntime
 
 

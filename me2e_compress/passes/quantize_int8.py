@@ -12,14 +12,8 @@ from me2e_compress.calibration.review import review
 from me2e_compress.display import counted
 from me2e_compress.errors import PreconditionError
 from me2e_compress.passes.base import Context, Pass, PassResult
-from me2e_compress.quantization.plan import (
-    INT8,
-    Overrides,
-    QuantPlan,
-    make_plan,
-    sharing_costs,
-    stamp_plan,
-)
+from me2e_compress.quantization.decision import INT8, Overrides, QuantPlan, stamp_plan
+from me2e_compress.quantization.plan import make_plan, sharing_costs
 from me2e_compress.quantization.rules import DEFAULT_RULES, RULE_SETS, RuleSet
 from me2e_compress.quantization.scheme import QuantScheme
 from me2e_compress.registry.registry import WRITTEN

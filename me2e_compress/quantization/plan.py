@@ -25,17 +25,10 @@ from me2e_compress.quantization.decision import (
     NONE,
     RESIDUAL,
     Decision,
-    KeptFloat,
     Overrides,
     Pins,
-    PlanDifference,
     QuantPlan,
     ScaleGroup,
-    differences,
-    load_plan,
-    plan_of,
-    save_plan,
-    stamp_plan,
 )
 from me2e_compress.quantization.rules import (
     DEFAULT_RULES,
@@ -46,28 +39,6 @@ from me2e_compress.quantization.rules import (
     RuleSet,
 )
 from me2e_compress.quantization.scheme import QuantScheme
-
-__all__ = [
-    "FLOAT",
-    "INT8",
-    "RESIDUAL",
-    "Decision",
-    "KeptFloat",
-    "Overrides",
-    "PlanDifference",
-    "QuantPlan",
-    "ScaleGroup",
-    "SharingCost",
-    "differences",
-    "load_plan",
-    "make_plan",
-    "plan_of",
-    "save_plan",
-    "share_scales",
-    "sharing_costs",
-    "stamp_plan",
-    "tensors_of",
-]
 
 # Find tensors whose scales are decided together.
 

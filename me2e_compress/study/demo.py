@@ -9,7 +9,7 @@ from me2e_compress.evaluators.highway.engine import LocalEngine
 from me2e_compress.metrics.measure import Estimate
 from me2e_compress.metrics.route_summary import shown_by
 from me2e_compress.metrics.scores import Scores
-from me2e_compress.quantization.plan import plan_of
+from me2e_compress.quantization.decision import plan_of
 from me2e_compress.simulator.routes import load_routes, pick_routes
 from me2e_compress.study.cells import MISSING, measure_cell, number
 from me2e_compress.study.condition import Condition

@@ -17,7 +17,7 @@ from me2e_compress.errors import PreconditionError, RecipeError
 from me2e_compress.graph import is_standard, opset_of
 from me2e_compress.graph.validity import refusal
 from me2e_compress.quantization.costs import Costs
-from me2e_compress.quantization.plan import KeptFloat, QuantPlan
+from me2e_compress.quantization.decision import KeptFloat, QuantPlan
 from me2e_compress.registry import Registry
 from me2e_compress.runtime.providers import CPU, Provider
 

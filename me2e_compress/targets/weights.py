@@ -15,7 +15,7 @@ from me2e_compress.errors import PreconditionError
 from me2e_compress.graph import CONVOLUTIONS, opset_of, producer_of, rewrite
 from me2e_compress.graph.nodes import array_of, sole_reader, unrenamed
 from me2e_compress.graph.shapes import extent
-from me2e_compress.quantization.plan import Decision
+from me2e_compress.quantization.decision import Decision
 from me2e_compress.runtime.frames import Array
 from me2e_compress.runtime.session import run_once
 

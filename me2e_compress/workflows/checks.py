@@ -35,7 +35,7 @@ from me2e_compress.errors import FORMER, GraphError
 from me2e_compress.graph.modules import ModuleMap, map_of
 from me2e_compress.graph.opset import lowered
 from me2e_compress.graph.shapes import unshaped_plugins
-from me2e_compress.operators.kernels import why_not
+from me2e_compress.operators.kernels.trampoline import why_not
 from me2e_compress.registry.drafts import is_marked
 from me2e_compress.runtime.atomic import write_bytes
 from me2e_compress.runtime.children import run_script

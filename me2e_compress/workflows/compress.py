@@ -17,7 +17,7 @@ from me2e_compress.passes import Context, Pass
 from me2e_compress.passes.fix_shapes import with_sizes
 from me2e_compress.passes.import_normalize import with_own_domains
 from me2e_compress.passes.quantize_int8 import QuantizeInt8
-from me2e_compress.quantization.plan import plan_of, save_plan
+from me2e_compress.quantization.decision import plan_of, save_plan
 from me2e_compress.registry import drafts
 from me2e_compress.runtime.atomic import write_document
 from me2e_compress.runtime.latency_trace import cpu_seconds

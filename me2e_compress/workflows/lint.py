@@ -13,7 +13,7 @@ from me2e_compress.errors import PreconditionError, RecipeError
 from me2e_compress.passes import Pass
 from me2e_compress.passes.import_normalize import with_own_domains
 from me2e_compress.passes.quantize_int8 import QuantizeInt8
-from me2e_compress.quantization.plan import plan_of
+from me2e_compress.quantization.decision import plan_of
 from me2e_compress.runtime.providers import CPU
 from me2e_compress.targets import (
     SEVERITIES,

@@ -31,7 +31,8 @@ from me2e_compress.evaluators import EVALUATORS
 from me2e_compress.graph import modules
 from me2e_compress.manager.report import versions
 from me2e_compress.operators import OPERATORS
-from me2e_compress.operators.kernels import KERNELS, why_not
+from me2e_compress.operators.kernels.kernel import KERNELS
+from me2e_compress.operators.kernels.trampoline import why_not
 from me2e_compress.passes import PASSES
 from me2e_compress.quantization.rules import RULE_SETS, RULES
 from me2e_compress.registry import Entry, Registry, describe

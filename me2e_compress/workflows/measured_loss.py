@@ -22,7 +22,7 @@ from me2e_compress.manager.verification_inputs import VerificationInputs, relati
 from me2e_compress.passes import Pass
 from me2e_compress.passes.lower_int8 import LowerInt8
 from me2e_compress.passes.quantize_int8 import QuantizeInt8
-from me2e_compress.quantization.plan import plan_of
+from me2e_compress.quantization.decision import plan_of
 from me2e_compress.runtime.frames import Array, Frame, Frames
 from me2e_compress.runtime.latency_trace import cpu_seconds
 from me2e_compress.runtime.providers import CPU, Provider

@@ -17,7 +17,7 @@ from me2e_compress.manager import PassManager, recipe
 from me2e_compress.passes import Context, Pass
 from me2e_compress.passes.lower_int8 import LowerInt8
 from me2e_compress.passes.quantize_int8 import QuantizeInt8
-from me2e_compress.quantization.plan import (
+from me2e_compress.quantization.decision import (
     PlanDifference,
     QuantPlan,
     differences,

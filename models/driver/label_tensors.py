@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from me2e_compress.simulator.cameras import PixelClass
+from me2e_compress.simulator.scene import PixelClass
 from models.driver.network.config import SIGNAL_KINDS, BevArea
 from models.driver.stored_episode import Array
 

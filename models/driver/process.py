@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from me2e_compress.simulator.cameras import CameraRig
+from me2e_compress.simulator.camera_rig import CameraRig
 from models.driver.checkpoint import Start, TrainingCheckpoint, fit
 from models.driver.data import Episodes, Sequences
 from models.driver.frenet import anchors_of

@@ -9,7 +9,7 @@ import pytest
 
 import me2e_compress as me2e
 from me2e_compress import graph
-from me2e_compress.quantization.plan import KeptFloat, load_plan, plan_of, save_plan
+from me2e_compress.quantization.decision import KeptFloat, load_plan, plan_of, save_plan
 from me2e_compress.registry.drafts import IN_JSON
 from tests.command import Cli
 from tests.nets import net

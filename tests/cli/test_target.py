@@ -13,7 +13,7 @@ from me2e_compress.errors import RecipeError
 from me2e_compress.graph.provenance import decompressed
 from me2e_compress.manager import recipe
 from me2e_compress.passes.quantize_int8 import QuantizeInt8
-from me2e_compress.quantization.plan import plan_of
+from me2e_compress.quantization.decision import plan_of
 from me2e_compress.runtime.providers import CudaProvider
 from me2e_compress.simulator.routes import save_routes
 from me2e_compress.workflows.lint import asked_of

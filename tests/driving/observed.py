@@ -13,7 +13,7 @@ from me2e_compress.driving.input_sources import (
     Observed,
     can_bus_between,
 )
-from me2e_compress.simulator.cameras import CameraRig
+from me2e_compress.simulator.camera_rig import CameraRig
 
 RIG = CameraRig(90, 160)
 

@@ -17,8 +17,8 @@ from me2e_compress.driving.adapter.image_inputs import (
 )
 from me2e_compress.driving.input_sources import INPUT_SOURCES, Axes
 from me2e_compress.errors import EvaluationError
-from me2e_compress.simulator.cameras import CAMERA_NAMES as RIG_NAMES
-from me2e_compress.simulator.cameras import CameraRig
+from me2e_compress.simulator.camera_rig import CAMERA_NAMES as RIG_NAMES
+from me2e_compress.simulator.camera_rig import CameraRig
 from me2e_compress.testing import check_form
 from tests.driving.observed import RIG, observed, value
 

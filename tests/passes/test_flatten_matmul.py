@@ -12,7 +12,8 @@ from me2e_compress.graph import static_shape
 from me2e_compress.passes import flatten_matmul
 from me2e_compress.passes.flatten_matmul import FlattenMatmul
 from me2e_compress.passes.work import small_products
-from me2e_compress.quantization.plan import FLOAT, make_plan
+from me2e_compress.quantization.decision import FLOAT
+from me2e_compress.quantization.plan import make_plan
 from me2e_compress.quantization.scheme import QuantScheme
 from tests.passes.hoisted import graph_of
 from tests.passes.small import apply, compute, ops, read

@@ -24,7 +24,7 @@ from me2e_compress.passes.convert_float16 import ConvertFloat16
 from me2e_compress.passes.convert_float32 import ConvertFloat32
 from me2e_compress.passes.lower_int8 import LowerInt8
 from me2e_compress.passes.quantize_int8 import QuantizeInt8
-from me2e_compress.quantization.plan import plan_of
+from me2e_compress.quantization.decision import plan_of
 from me2e_compress.runtime.session import Session
 from me2e_compress.targets.onnxruntime import int8_layers, unranged
 from me2e_compress.targets.tensorrt import TensorRT

@@ -9,17 +9,16 @@ from me2e_compress.errors import ModuleMapError, RecipeError
 from me2e_compress.graph.modules import Module, ModuleMap
 from me2e_compress.passes import Context
 from me2e_compress.passes.quantize_int8 import QuantizeInt8
-from me2e_compress.quantization.plan import (
+from me2e_compress.quantization.decision import (
     Decision,
     Overrides,
     differences,
     load_plan,
-    make_plan,
     plan_of,
     save_plan,
     stamp_plan,
-    tensors_of,
 )
+from me2e_compress.quantization.plan import make_plan, tensors_of
 from me2e_compress.quantization.rules import RuleSet
 from me2e_compress.quantization.rules.rule_sets import PaperRules, SafeRules
 from me2e_compress.quantization.scheme import QuantScheme

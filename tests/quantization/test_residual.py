@@ -7,14 +7,8 @@ import onnx_ir as ir
 import pytest
 
 from me2e_compress.calibration.ranges import Ranges
-from me2e_compress.quantization.plan import (
-    Decision,
-    Overrides,
-    QuantPlan,
-    make_plan,
-    share_scales,
-    sharing_costs,
-)
+from me2e_compress.quantization.decision import Decision, Overrides, QuantPlan
+from me2e_compress.quantization.plan import make_plan, share_scales, sharing_costs
 from me2e_compress.quantization.rules import RULE_SETS
 from me2e_compress.quantization.scheme import QuantScheme
 from tests.nets import MODULES, PAPER, net

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from me2e_compress.errors import RecipeError
-from me2e_compress.quantization.plan import Decision, make_plan
+from me2e_compress.quantization.decision import Decision
+from me2e_compress.quantization.plan import make_plan
 from me2e_compress.quantization.rules import RULE_SETS
 from me2e_compress.quantization.scheme import QuantScheme
 from tests.nets import MODULES, by_output, net, planned

@@ -10,7 +10,8 @@ from me2e_compress import graph
 from me2e_compress.calibration.ranges import Ranges
 from me2e_compress.graph import producer_of
 from me2e_compress.graph.nodes import numbers_of
-from me2e_compress.quantization.plan import QuantPlan, make_plan
+from me2e_compress.quantization.decision import QuantPlan
+from me2e_compress.quantization.plan import make_plan
 from me2e_compress.quantization.rules import RULE_SETS
 from me2e_compress.quantization.scheme import QuantScheme
 from me2e_compress.targets import TARGETS

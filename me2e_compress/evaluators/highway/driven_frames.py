@@ -15,7 +15,9 @@ from me2e_compress.evaluators.highway.generate import propose, seed_of
 from me2e_compress.evaluators.highway.observe import ObservationBuilder
 from me2e_compress.evaluators.highway.runner import EndingRules
 from me2e_compress.runtime.frames import Array, Frame
-from me2e_compress.simulator.cameras import CameraRig, Cameras, paint_texture
+from me2e_compress.simulator.camera_rig import CameraRig
+from me2e_compress.simulator.cameras.ground import paint_texture
+from me2e_compress.simulator.cameras.renderer import Cameras
 from me2e_compress.simulator.routes import EXPERT_S, Route, load_routes
 from me2e_compress.simulator.world import World
 

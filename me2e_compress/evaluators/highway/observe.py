@@ -12,8 +12,8 @@ from me2e_compress.driving.contract import EgoKinematics, Observation, Policy
 from me2e_compress.driving.input_sources import can_bus_between
 from me2e_compress.errors import EvaluationError
 from me2e_compress.evaluators.highway.conflict_recorder import rays_through
-from me2e_compress.simulator.camera_rig import CAMERA_HEIGHT_M, CAMERAS
-from me2e_compress.simulator.cameras import CameraRig, Cameras
+from me2e_compress.simulator.camera_rig import CAMERA_HEIGHT_M, CAMERAS, CameraRig
+from me2e_compress.simulator.cameras.renderer import Cameras
 from me2e_compress.simulator.plane_geometry import RoutePath
 from me2e_compress.simulator.scene import Actor, ActorKind, Ego, Scene
 from me2e_compress.simulator.world import World

@@ -10,7 +10,7 @@ import numpy as np
 from me2e_compress.driving.policies import Driver
 from me2e_compress.evaluators.contract import Drive
 from me2e_compress.evaluators.highway import runner
-from me2e_compress.simulator.cameras import paint_texture
+from me2e_compress.simulator.cameras.ground import paint_texture
 from me2e_compress.simulator.pictures.route import (
     Moment,
     RoutePicture,

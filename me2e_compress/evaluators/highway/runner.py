@@ -26,8 +26,9 @@ from me2e_compress.evaluators.highway.drivers import image_size_of
 from me2e_compress.evaluators.highway.episode_recorder import EpisodeRecorder
 from me2e_compress.evaluators.highway.observe import ObservationBuilder, road_users
 from me2e_compress.metrics.episode import Ending, Episode, InferenceRecord
-from me2e_compress.simulator.camera_rig import CLEAR
-from me2e_compress.simulator.cameras import CameraRig, Cameras, paint_texture
+from me2e_compress.simulator.camera_rig import CLEAR, CameraRig
+from me2e_compress.simulator.cameras.ground import paint_texture
+from me2e_compress.simulator.cameras.renderer import Cameras
 from me2e_compress.simulator.pictures.route import Moment
 from me2e_compress.simulator.routes import Route
 from me2e_compress.simulator.scene import Control, Ego, Scene

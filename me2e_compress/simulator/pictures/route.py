@@ -13,7 +13,8 @@ import numpy.typing as npt
 from PIL import Image
 
 from me2e_compress.errors import EvaluationError
-from me2e_compress.simulator.cameras import CAMERA_NAMES, GroundTexture
+from me2e_compress.simulator.camera_rig import CAMERA_NAMES
+from me2e_compress.simulator.cameras.ground import GroundTexture
 from me2e_compress.simulator.pictures.top_view import (
     EGO,
     INK,

@@ -10,13 +10,13 @@ import numpy.typing as npt
 from PIL import Image, ImageDraw, ImageFont
 
 from me2e_compress.simulator.camera_rig import SUBPIXEL_BITS, fixed_point
-from me2e_compress.simulator.cameras import GroundTexture, PixelClass
-from me2e_compress.simulator.cameras.ground import RESOLUTION_M
+from me2e_compress.simulator.cameras.ground import RESOLUTION_M, GroundTexture
 from me2e_compress.simulator.scene import (
     Actor,
     ActorKind,
     Ego,
     Event,
+    PixelClass,
     Scene,
     SignalKind,
     SignalState,

@@ -11,7 +11,7 @@ from me2e_compress.calibration.ranges import Ranges
 from me2e_compress.errors import GraphError
 from me2e_compress.operators import int8_inputs, int8_op_types
 from me2e_compress.quantization.costs import Costs
-from me2e_compress.quantization.plan import Decision, KeptFloat, QuantPlan
+from me2e_compress.quantization.decision import Decision, KeptFloat, QuantPlan
 from me2e_compress.runtime.optimized import optimized, origins, with_unique_names
 from me2e_compress.runtime.providers import CPU, Provider
 from me2e_compress.targets import LintFinding, LintRule, Target, error, warning

@@ -19,12 +19,8 @@ from me2e_compress.calibration.observers import scale_of
 from me2e_compress.calibration.ranges import Ranges
 from me2e_compress.graph import input_at, rewrite, static_shape
 from me2e_compress.operators import find, int8_inputs
-from me2e_compress.quantization.plan import (
-    Decision,
-    QuantPlan,
-    share_scales,
-    tensors_of,
-)
+from me2e_compress.quantization.decision import Decision, QuantPlan
+from me2e_compress.quantization.plan import share_scales, tensors_of
 from me2e_compress.targets import LintRule, Target
 from me2e_compress.targets.tensorrt.lint.support import rules, version_of
 from me2e_compress.targets.weights import (

@@ -30,7 +30,7 @@ from me2e_compress.errors import (
 )
 from me2e_compress.graph import rewrite
 from me2e_compress.graph.nodes import is_plugin
-from me2e_compress.quantization.plan import INT8, plan_of
+from me2e_compress.quantization.decision import INT8, plan_of
 from me2e_compress.runtime.children import run_script
 
 SM = (75, 80, 86, 89, 120, 121)

@@ -6,10 +6,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from me2e_compress.simulator.cameras import BirdseyeGrid, PixelClass
-from me2e_compress.simulator.cameras.birdseye import covered
+from me2e_compress.simulator.cameras.birdseye import BirdseyeGrid, covered
 from me2e_compress.simulator.plane_geometry import Floats
-from me2e_compress.simulator.scene import ACTOR_CLASSES, Actor, Ego, Scene
+from me2e_compress.simulator.scene import ACTOR_CLASSES, Actor, Ego, PixelClass, Scene
 
 AGENTS = 24
 AGENT_COLUMNS = 10

@@ -17,7 +17,7 @@ from me2e_compress.graph import sha256_of
 from me2e_compress.metrics.episode import Ending
 from me2e_compress.runtime.atomic import write_bytes
 from me2e_compress.runtime.children import pool
-from me2e_compress.simulator.cameras import CameraRig
+from me2e_compress.simulator.camera_rig import CameraRig
 from models.driver.episodes.collection import (
     FORMAT,
     MANIFEST,

@@ -11,7 +11,7 @@ import numpy.typing as npt
 from me2e_compress.evaluators.highway.controller import beyond
 from me2e_compress.evaluators.highway.expert.expert_policy import decide
 from me2e_compress.evaluators.highway.observe import can_bus_of
-from me2e_compress.simulator.cameras import CameraRig
+from me2e_compress.simulator.camera_rig import CameraRig
 from me2e_compress.simulator.cameras.birdseye import ground_classes
 from me2e_compress.simulator.plane_geometry import Floats, RoutePath
 from me2e_compress.simulator.scene import Signal, SignalKind, SignalState

@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from me2e_compress.errors import EvaluationError
-from me2e_compress.simulator.cameras import Cameras
+from me2e_compress.simulator.cameras.renderer import Cameras
 from me2e_compress.simulator.scene import Scene
 
 Bytes = npt.NDArray[np.uint8]

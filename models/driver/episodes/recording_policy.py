@@ -31,7 +31,9 @@ from me2e_compress.evaluators.highway.observe import (
     seen,
 )
 from me2e_compress.runtime.plan_adapter import Trajectory
-from me2e_compress.simulator.cameras import CameraRig, Cameras, paint_texture
+from me2e_compress.simulator.camera_rig import CameraRig
+from me2e_compress.simulator.cameras.ground import paint_texture
+from me2e_compress.simulator.cameras.renderer import Cameras
 from me2e_compress.simulator.plane_geometry import Floats
 from me2e_compress.simulator.scene import Scene
 from me2e_compress.simulator.world import Phase, World

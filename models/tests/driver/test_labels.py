@@ -8,7 +8,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from me2e_compress.simulator.cameras import PixelClass
+from me2e_compress.simulator.scene import PixelClass
 from models.driver.label_tensors import labels_of, raster_of, signals_of
 from models.driver.network.bev_grid import cell_centres
 from models.driver.network.config import BevArea

@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from me2e_compress.simulator.cameras import CameraRig
+from me2e_compress.simulator.camera_rig import CameraRig
 from models.driver.label_tensors import Labels, labels_of
 from models.driver.losses import (
     LampHead,

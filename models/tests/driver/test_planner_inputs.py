@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from me2e_compress.simulator.cameras import CameraRig
+from me2e_compress.simulator.camera_rig import CameraRig
 from models.driver import sampled_losses
 from models.driver.data import Episodes
 from models.driver.network.stack import Highway

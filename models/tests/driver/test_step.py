@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import nn
 
-from me2e_compress.simulator.cameras import CameraRig
+from me2e_compress.simulator.camera_rig import CameraRig
 from models.driver.data import Episodes, Sequences
 from models.driver.losses import LampHead
 from models.driver.network.bev_encoder import RECORD

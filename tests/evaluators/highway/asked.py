@@ -4,7 +4,7 @@ import numpy as np
 import numpy.typing as npt
 
 from me2e_compress.driving.contract import Observation, Policy, Trajectory, checked
-from me2e_compress.simulator.cameras import CameraRig
+from me2e_compress.simulator.camera_rig import CameraRig
 
 RIG = CameraRig(16, 24)
 

@@ -11,7 +11,7 @@ from me2e_compress.evaluators.highway.driven_frames import driven_frames, fresh_
 from me2e_compress.evaluators.highway.expert.expert_policy import Expert
 from me2e_compress.runtime.frames import Frame
 from me2e_compress.runtime.session import replay
-from me2e_compress.simulator.cameras import CameraRig
+from me2e_compress.simulator.camera_rig import CameraRig
 from tests.evaluators.highway.drivers import straight_on
 from tests.stand_in import write_model
 

@@ -1,6 +1,8 @@
 import pytest
 
-from me2e_compress.simulator.cameras import CameraRig, Cameras, GroundTexture
+from me2e_compress.simulator.camera_rig import CameraRig
+from me2e_compress.simulator.cameras.ground import GroundTexture
+from me2e_compress.simulator.cameras.renderer import Cameras
 from tests.simulator.cameras import town
 
 

@@ -13,17 +13,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from me2e_compress.errors import EvaluationError
-from me2e_compress.simulator.cameras import (
-    CAMERA_NAMES,
-    CameraRig,
-    Cameras,
-    GroundTexture,
-    PixelClass,
-    Weather,
-    paint_texture,
-)
+from me2e_compress.simulator.camera_rig import CAMERA_NAMES, CameraRig, Weather
+from me2e_compress.simulator.cameras.ground import GroundTexture, paint_texture
+from me2e_compress.simulator.cameras.renderer import Cameras
 from me2e_compress.simulator.plane_geometry import Roadmap
-from me2e_compress.simulator.scene import Ego, SignalState
+from me2e_compress.simulator.scene import Ego, PixelClass, SignalState
 from tests.profiles import scaled
 from tests.simulator.cameras import town
 

@@ -7,17 +7,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from me2e_compress.errors import EvaluationError
-from me2e_compress.simulator.cameras import (
-    CAMERA_NAMES,
+from me2e_compress.simulator.camera_rig import CAMERA_NAMES, CameraRig
+from me2e_compress.simulator.cameras.birdseye import (
     BirdseyeGrid,
-    CameraRig,
-    Cameras,
-    GroundTexture,
-    PixelClass,
     bev_classes,
+    covered,
+    ground_classes,
 )
-from me2e_compress.simulator.cameras.birdseye import covered, ground_classes
-from me2e_compress.simulator.scene import ActorKind, Scene
+from me2e_compress.simulator.cameras.ground import GroundTexture
+from me2e_compress.simulator.cameras.renderer import Cameras
+from me2e_compress.simulator.scene import ActorKind, PixelClass, Scene
 from tests.simulator.cameras import town
 
 FRONT, BACK = CAMERA_NAMES.index("FRONT"), CAMERA_NAMES.index("BACK")

@@ -5,13 +5,15 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from me2e_compress.simulator.cameras import CAMERA_NAMES, CameraRig, Cameras, PixelClass
+from me2e_compress.simulator.camera_rig import CAMERA_NAMES, CameraRig
 from me2e_compress.simulator.cameras.painter import painting_order
+from me2e_compress.simulator.cameras.renderer import Cameras
 from me2e_compress.simulator.cameras.solids import TEMPLATES
 from me2e_compress.simulator.scene import (
     ACTOR_CLASSES,
     Actor,
     ActorKind,
+    PixelClass,
     SignalState,
 )
 from tests.profiles import scaled

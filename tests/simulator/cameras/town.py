@@ -4,8 +4,7 @@ import math
 
 import numpy as np
 
-from me2e_compress.simulator.cameras import paint_texture
-from me2e_compress.simulator.cameras.ground import GroundTexture
+from me2e_compress.simulator.cameras.ground import GroundTexture, paint_texture
 from me2e_compress.simulator.plane_geometry import Lane, LaneMarking, Roadmap
 from me2e_compress.simulator.scene import (
     DIMENSIONS,

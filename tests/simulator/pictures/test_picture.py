@@ -8,7 +8,7 @@ import pytest
 from PIL import Image
 
 from me2e_compress.errors import EvaluationError
-from me2e_compress.simulator.cameras import CAMERA_NAMES
+from me2e_compress.simulator.camera_rig import CAMERA_NAMES
 from me2e_compress.simulator.pictures.route import (
     Moment,
     RoutePicture,

@@ -10,7 +10,7 @@ import torch
 
 from me2e_compress.driving.onnx_policy import OnnxPolicy
 from me2e_compress.runtime.session import Session
-from me2e_compress.simulator.cameras import CameraRig
+from me2e_compress.simulator.camera_rig import CameraRig
 from models.driver.network.bev_encoder import RECORD, motion_of
 from models.driver.network.config import HighwayConfig
 from models.driver.network.stack import Highway, stood_lately
