@@ -12,7 +12,6 @@ from me2e_compress.evaluators.highway.controller import beyond
 from me2e_compress.evaluators.highway.expert.expert_policy import decide
 from me2e_compress.evaluators.highway.observe import can_bus_of
 from me2e_compress.simulator.camera_rig import CameraRig
-from me2e_compress.simulator.cameras.birdseye import ground_classes
 from me2e_compress.simulator.plane_geometry import Floats, RoutePath
 from me2e_compress.simulator.scene import Signal, SignalKind, SignalState
 from me2e_compress.simulator.world import Privileged, World
@@ -22,6 +21,7 @@ from models.driver.episodes.agents import (
     GRID,
     agents,
 )
+from models.driver.episodes.birdseye import ground_classes
 from models.driver.episodes.jpeg import pictures
 from models.driver.episodes.recording_policy import LabelledFrame, cameras_of
 

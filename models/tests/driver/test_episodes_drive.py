@@ -11,12 +11,12 @@ from me2e_compress.evaluators import Drive
 from me2e_compress.evaluators.highway.expert.expert_policy import Expert, ceiling
 from me2e_compress.evaluators.highway.runner import drive
 from me2e_compress.simulator.camera_rig import CLEAR, CameraRig
-from me2e_compress.simulator.cameras.birdseye import bev_classes
 from me2e_compress.simulator.cameras.ground import paint_texture
 from me2e_compress.simulator.cameras.renderer import Cameras
 from me2e_compress.simulator.scene import PixelClass, Scene
 from me2e_compress.simulator.world import World
 from models.driver.episodes import GRID, Collection, decode
+from models.driver.episodes.birdseye import bev_classes
 from models.driver.episodes.collecting import episode_of
 from models.driver.episodes.collection import Task, tasks_of
 from models.driver.episodes.episode_arrays import Arrays, arrays_of

@@ -173,7 +173,8 @@ STORM = Weather(fog_m=60.0, night=0.5, rain=0.7, brightness=1.1, noise=4.0, seed
 PROGRAM = """
 import hashlib
 from tests.simulator.cameras import town
-from me2e_compress.simulator.cameras import CameraRig, Cameras, Weather
+from me2e_compress.simulator.camera_rig import CameraRig, Weather
+from me2e_compress.simulator.cameras.renderer import Cameras
 weather = Weather(fog_m=60.0, night=0.5, rain=0.7, brightness=1.1, noise=4.0, seed=3)
 for options in (Weather(), weather):
     images = Cameras(town.paint(), CameraRig(96, 160), options).render(town.busy())
