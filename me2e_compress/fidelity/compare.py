@@ -117,7 +117,7 @@ class Reference:
         self,
         other: Session,
         frames: Iterable[Frame] | None = None,
-        watch: Watch | None = None,
+        watching: Sequence[Watch] = (),
     ) -> Fidelity:
         """Compare another model with it, as :func:`compare` does.
 
@@ -125,14 +125,14 @@ class Reference:
         change, pass the reference model itself.
         """
         shown = self.frames if frames is None else frames
-        return compare(self.session, other, shown, watch, iter(self.answers))
+        return compare(self.session, other, shown, watching, iter(self.answers))
 
 
 def compare(
     a: Session,
     b: Session,
     frames: Iterable[Frame],
-    watch: Watch | None = None,
+    watching: Sequence[Watch] = (),
     answers: Iterator[dict[str, Array]] | None = None,
 ) -> Fidelity:
     """Run two models over the same frames, each with its own recurrent state.
@@ -140,7 +140,7 @@ def compare(
     Outputs that are sequences or optional are left out.
 
     All arithmetic is float64. One frame is in memory at a time. ``a`` is the reference,
-    and ``answers`` what it answered if it has run already; ``watch`` is shown the
+    and ``answers`` what it answered if it has run already; ``watching`` are shown the
     outputs of both on every frame, states included.
 
     Raises:
@@ -175,7 +175,7 @@ def compare(
             moved.append(np.nan_to_num(np.linalg.norm(gap, axis=1), nan=math.inf))
             if adapter.scores is not None:
                 chosen.append(adapter.choice(left) == adapter.choice(right))
-        if watch is not None:
+        for watch in watching:
             watch(left, right, frame)
         count += 1
     if not count:
@@ -416,7 +416,15 @@ class SetTally:
     outputs: SetOutputs
     agents: int = 0
     matched: int = 0
-    power: dict[str, list[float]] = field(default_factory=dict)
+    tallies: dict[str, Tally] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, a: Session, b: Session) -> Self | None:
+        """Return the tally of the first's sets; None unless the second has them too."""
+        shapes = {name: port.shape for name, port in a.outputs.items()}
+        named = SetOutputs.of(a.metadata, shapes)
+        both = named is not None and set(named.names) <= set(b.outputs)
+        return cls(named) if named is not None and both else None
 
     def add(
         self, left: Mapping[str, Array], right: Mapping[str, Array], frame: Frame
@@ -436,16 +444,10 @@ class SetTally:
         self.matched += len(mine)
         # signal and noise of matched rows
         for name in outputs.names:
-            one = np.asarray(left[name][0][mine], np.float64)
-            gap = one - np.asarray(right[name][0][theirs], np.float64)
-            sums = self.power.setdefault(name, [0.0, 0.0])
-            sums[0] += float(np.vdot(one, one))
-            sums[1] += float(np.vdot(gap, gap))
+            tally = self.tallies.setdefault(name, Tally(name))
+            tally.add(left[name][0][mine], right[name][0][theirs], frame.index)
 
     def result(self) -> SetFidelity:
         """Return the figures of all frames."""
-        return SetFidelity(
-            self.agents,
-            self.matched,
-            {name: decibels(*p) for name, p in self.power.items() if self.matched},
-        )
+        sqnr_db = {name: each.result().sqnr_db for name, each in self.tallies.items()}
+        return SetFidelity(self.agents, self.matched, sqnr_db if self.matched else {})

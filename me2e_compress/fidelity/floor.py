@@ -16,7 +16,8 @@ from me2e_compress.graph.nodes import (
     nodes_inside,
     reads_of,
 )
-from me2e_compress.runtime.frames import Frame
+from me2e_compress.runtime.frames import Frame, Frames
+from me2e_compress.runtime.session import Session
 
 PLAN_FLOOR_M = 0.5
 """A car 1.9 m wide in the middle of a lane of 3.5 m still keeps 0.3 m to its lines."""
@@ -110,9 +111,19 @@ class Rounding:
     choices: Mapping[str, str]
 
     @classmethod
-    def of(cls, reference: Reference, model: ir.Model, floor: Floor) -> Self:
-        """Run a graph on its frames again, the input rounded; `model` is that graph."""
-        session, first = reference.session, next(iter(reference.frames))
+    def of(
+        cls,
+        session: Session,
+        frames: Frames,
+        model: ir.Model,
+        floor: Floor,
+        outputs: Collection[str],
+    ) -> Self:
+        """Run a graph, which is `model`, on frames with and without the input rounded.
+
+        Of the `outputs` alone it says anything.
+        """
+        first = next(iter(frames))
         sizes = {
             name: values.size
             for name, values in first.arrays.items()
@@ -122,18 +133,13 @@ class Rounding:
         if not name:
             return cls("", {}, {})
         # Frames of which that input is rounded to int8's grid, one in memory at a time.
-        rounded = reference.compare(
-            session, (_rounded(frame, name) for frame in reference.frames)
+        rounded = Reference.of(session, frames).compare(
+            session, (_rounded(frame, name) for frame in frames)
         )
-        low = {each.output: each.value for each in floor.shortfalls(rounded)}
+        below = floor.shortfalls(rounded)
+        low = {each.output: each.value for each in below if each.output in outputs}
         choices = {each: choice_between(model, name, each) for each in low}
         return cls(name, low, {k: v for k, v in choices.items() if v})
-
-    def among(self, outputs: Collection[str]) -> Self:
-        """Return what it says of some outputs."""
-        values = {name: self.values[name] for name in self.values if name in outputs}
-        choices = {name: each for name, each in self.choices.items() if name in values}
-        return dataclasses.replace(self, values=values, choices=choices)
 
 
 CHOICES = frozenset(

@@ -2,7 +2,7 @@
 
 import dataclasses
 import itertools
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 import onnx_ir as ir
@@ -10,10 +10,10 @@ import onnx_ir as ir
 from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.display import Table, counted, number, table
 from me2e_compress.errors import EvaluationError, GraphError, ModuleMapError
+from me2e_compress.fidelity import ALIVE
 from me2e_compress.fidelity.compare import (
     Fidelity,
     SetFidelity,
-    SetOutputs,
     SetTally,
     common_adapter,
 )
@@ -26,17 +26,17 @@ from me2e_compress.fidelity.first_difference import (
 from me2e_compress.fidelity.liveness import Liveness, LivenessTally
 from me2e_compress.graph import provenance
 from me2e_compress.graph.modules import ModuleMap, assign, map_of
-from me2e_compress.runtime.frames import Array, Frame
+from me2e_compress.runtime.frames import Frame
 from me2e_compress.runtime.session import Session
 from me2e_compress.targets.onnxruntime import slow_here
 from me2e_compress.workflows.checks import model_path, opened
-from me2e_compress.workflows.measured_loss import (
+from me2e_compress.workflows.options import CompareOptions, GraphOptions
+from me2e_compress.workflows.result import SILENT, Listener, Result, Shown
+from me2e_compress.workflows.runtime_loss import (
     RuntimeLoss,
     RuntimeTally,
     has_int8_kernels,
 )
-from me2e_compress.workflows.options import CompareOptions, GraphOptions
-from me2e_compress.workflows.result import SILENT, Listener, Result, Shown
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
@@ -173,32 +173,55 @@ def compare(
     right = session(paths[1], stock=options.as_it_stands)
     try:
         common_adapter(left, right)
-        shapes = {name: port.shape for name, port in left.outputs.items()}
-        named = SetOutputs.of(left.metadata, shapes)
+        sets = SetTally.of(left, right)
     except GraphError as error:
         raise GraphError(f"{paths[0]}: {error}") from error
-    # agents are matched where both graphs have the named sets
-    both = named is not None and set(named.names) <= set(right.outputs)
-    sets = SetTally(named) if named is not None and both else None
-    lively = LivenessTally(left, right) if options.alive else None
     # what onnxruntime's int8 answers, beside the nodes as they stand
     kernels, judged = None, graphs[paths[1]][0]
     if not options.as_it_stands and has_int8_kernels(judged, provider):
-        kernels = RuntimeTally(session(paths[1], stock=True), recording)
-    watching = [each.add for each in (sets, lively, kernels) if each is not None]
-
-    def watch(a: dict[str, Array], b: dict[str, Array], frame: Frame) -> None:
-        for add in watching:
-            add(a, b, frame)
-
-    fidelity = measure(left, right, map(reported, recording), watch)
+        kernels = session(paths[1], stock=True)
+    shown = map(reported, recording)
+    found = compared(left, right, shown, judged, kernels, sets, alive=options.alive)
+    agents = None if sets is None else sets.result()
     return CompareResult(
-        *paths,
+        *paths, found.fidelity, found.liveness, agents, found.runtime, slow
+    )
+
+
+@dataclasses.dataclass(frozen=True)
+class Comparison:
+    """How a graph answers beside another: what `compare` says, and `compress`."""
+
+    fidelity: Fidelity
+    liveness: Liveness | None
+    runtime: RuntimeLoss | None
+
+
+def compared(
+    reference: Session,
+    candidate: Session,
+    frames: Iterable[Frame],
+    model: ir.Model,
+    kernels: Session | None = None,
+    sets: SetTally | None = None,
+    *,
+    alive: float = ALIVE,
+) -> Comparison:
+    """Run two sessions over frames, and tally how far outputs are apart and move.
+
+    `model` is the candidate's graph, `kernels` runs it by onnxruntime's int8, and
+    `sets` is shown what both answer. `alive` 0 does not ask which outputs are dead.
+    """
+    lively = LivenessTally(reference, candidate) if alive else None
+    frames, again = itertools.tee(frames)
+    runtime = None if kernels is None else RuntimeTally(kernels, again)
+    del again  # what nobody reads must not be kept
+    watching = [each.add for each in (sets, lively, runtime) if each is not None]
+    fidelity = measure(reference, candidate, frames, watching)
+    return Comparison(
         fidelity,
-        None if lively is None else lively.result(options.alive),
-        None if sets is None else sets.result(),
-        None if kernels is None else kernels.result(judged, fidelity),
-        slow,
+        None if lively is None else lively.result(alive),
+        None if runtime is None else runtime.result(model, fidelity),
     )
 
 

@@ -5,33 +5,29 @@ from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 
-import numpy as np
 import onnx_ir as ir
 
-from me2e_compress import graph
 from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.calibration.sample import hold_out
 from me2e_compress.display import Table, counted, table
 from me2e_compress.errors import EvaluationError, FramesError, GraphError
-from me2e_compress.fidelity.compare import Fidelity, Reference, Tally
+from me2e_compress.fidelity.compare import Fidelity
 from me2e_compress.fidelity.floor import Floor, Rounding, Shortfall, shown
-from me2e_compress.fidelity.liveness import Liveness, LivenessTally
+from me2e_compress.fidelity.liveness import Liveness
 from me2e_compress.manager import Report
-from me2e_compress.manager.runtime_levels import first_node
-from me2e_compress.manager.verification_inputs import VerificationInputs, relative
 from me2e_compress.passes import Pass
 from me2e_compress.passes.lower_int8 import LowerInt8
 from me2e_compress.passes.quantize_int8 import QuantizeInt8
 from me2e_compress.quantization.decision import plan_of
-from me2e_compress.runtime.frames import Array, Frame, Frames
+from me2e_compress.runtime.frames import Frames
 from me2e_compress.runtime.latency_trace import cpu_seconds
-from me2e_compress.runtime.providers import CPU, Provider
-from me2e_compress.runtime.session import Session, replay
+from me2e_compress.runtime.providers import Provider
+from me2e_compress.runtime.session import Session
 from me2e_compress.shipped.drivers import sample_frames
 from me2e_compress.targets import TARGETS
-from me2e_compress.targets.onnxruntime import int8_rewrites
-from me2e_compress.targets.quantized import describe_quantized
+from me2e_compress.workflows.compare import compared
 from me2e_compress.workflows.result import Listener
+from me2e_compress.workflows.runtime_loss import RuntimeLoss, has_int8_kernels
 
 NOT_ASKED = "--measure-frames 0"
 
@@ -40,36 +36,6 @@ FEW_NODES = 3
 
 FEW = 3
 """Fewer frames say little: four of one drive lay 12 to 15 dB from four others."""
-
-
-@dataclasses.dataclass(frozen=True)
-class RuntimeLoss:
-    """How onnxruntime's int8 kernels compute an int8 graph on this processor.
-
-    Attributes:
-        sqnr_db: SQNR of the outputs that they answer otherwise than the nodes, dB.
-        nodes_db: SQNR of the same outputs by the nodes as they stand, dB.
-        causes: layers, and what is done to them; the first node, where no rule knows.
-    """
-
-    sqnr_db: Mapping[str, float]
-    nodes_db: Mapping[str, float]
-    causes: tuple[str, ...] = ()
-
-    def lines(self) -> Iterator[str]:
-        """Yield what the runtime answers otherwise, and why; nothing if it does not."""
-        if not self.sqnr_db:
-            return
-        apart = ", ".join(
-            f"{name} {value:z.1f} dB (its nodes {self.nodes_db[name]:z.1f})"
-            for name, value in self.sqnr_db.items()
-        )
-        yield f"onnxruntime's int8 answers otherwise than the file: {apart}"
-        more = len(self.causes) - _NAMED
-        for cause in self.causes[:_NAMED]:
-            yield f"the runtime's, not the file's: {cause}"
-        if more > 0:
-            yield f"the runtime's, not the file's: {more} layers more (lint names them)"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -216,100 +182,6 @@ class MeasuredLoss:
             )
 
 
-APART_DB = 6.0
-"""From how much more noise on, in dB, an output is named: twice the amplitude."""
-
-QUIET_DB = 30.0
-"""Outputs with an SQNR above that are not named: int8 kernels round ties otherwise than
-the nodes do, which is 36 dB of the driver's noisiest output (without any overflow)."""
-
-_OVERFLOW = (
-    "sums of uint8 by int8 overflow 16 bits on this processor, which has no VNNI: set"
-    " session.x64quantprecision to 1, as profile and evaluate do"
-)
-
-_NAMED = 5
-"""How many layers a line names."""
-
-
-class RuntimeTally:
-    """Compares a graph, as onnxruntime's int8 runs it, with a reference.
-
-    Args:
-        session: the graph, with int8 kernels.
-        frames: those that the reference is shown.
-    """
-
-    def __init__(self, session: Session, frames: Frames) -> None:
-        self._answers = replay(session, frames)
-        self._tallies: dict[str, Tally] = {}
-        self._first: dict[str, float] = {}
-        self._frame: Frame | None = None
-        self._provider = session.provider
-
-    def add(
-        self, reference: dict[str, Array], nodes: dict[str, Array], frame: Frame
-    ) -> None:
-        """Add a frame: what the reference and the nodes of the graph answered."""
-        answers = next(self._answers)
-        for name in (each for each in nodes if each in reference):
-            tally = self._tallies.setdefault(name, Tally(name))
-            tally.add(reference[name], answers[name], frame.index)
-            if self._frame is None:
-                self._first[name] = relative(nodes[name], answers[name])
-        self._frame = self._frame or frame
-
-    def result(self, model: ir.Model, fidelity: Fidelity) -> RuntimeLoss:
-        """Return what is noisier than by the nodes, and the causes."""
-        nodes = {each.name: each.sqnr_db for each in fidelity.outputs}
-        runs = {name: tally.result().sqnr_db for name, tally in self._tallies.items()}
-        apart = [
-            name
-            for name, sqnr in runs.items()
-            if sqnr < QUIET_DB and sqnr < nodes[name] and sqnr <= nodes[name] - APART_DB
-        ]
-        if not apart:
-            return RuntimeLoss({}, {})
-        shaped = model.clone()
-        graph.infer_shapes(shaped)
-        causes = [f"{each.node}: {each.message}" for each in int8_rewrites(shaped)]
-        worst = max(apart, key=lambda name: self._first[name])
-        if not causes and self._overflows(model):
-            causes = [_OVERFLOW]
-        # else the first node from which the output is half as far off as at last
-        elif not causes and self._frame is not None and self._first[worst]:
-            inputs = VerificationInputs([self._frame], "recorded", self._provider)
-            half = self._first[worst] / 2
-            node = first_node(model, worst, "all", half, inputs, int8_kernels=True)
-            if node is not None:
-                causes = [f"{worst} differs from {node.name} ({node.op_type}) on"]
-        return RuntimeLoss(
-            {name: runs[name] for name in apart},
-            {name: nodes[name] for name in apart},
-            tuple(causes),
-        )
-
-    def _overflows(self, model: ir.Model) -> bool:
-        """Return whether an output is 6 dB nearer its nodes with sums of 32 bits."""
-        if self._frame is None:
-            return False
-        provider, shown = self._provider, [self._frame]
-        (nodes,) = replay(Session(model, provider=provider), shown)
-        (stock,) = replay(Session(model, stock=True, provider=provider), shown)
-        (wide,) = replay(Session(model, int8_kernels=True, provider=provider), shown)
-
-        def noise(name: str, answers: dict[str, Array]) -> float:
-            apart = nodes[name].astype(np.float64) - answers[name].astype(np.float64)
-            return float(np.square(apart).sum())
-
-        return any(4 * noise(name, wide) < noise(name, stock) for name in nodes)
-
-
-def has_int8_kernels(model: ir.Model, provider: Provider) -> bool:
-    """Return whether onnxruntime would run a graph by int8 kernels of its own."""
-    return provider.target == CPU.target and describe_quantized(model) is not None
-
-
 KEPT_OUT = "kept out of calibration"
 SHARED = "calibrated on as well: there is no other"
 PERHAPS_SHARED = "that the saved ranges may have been measured on"
@@ -398,8 +270,7 @@ def _compared(
     passes = [each.applied for each in report.lossy]
     before, after = report.lossy[0].before, report.model
     open_session = partial(Session, release=True, provider=provider)
-    reference, session = Reference.of(open_session(before), frames), open_session(after)
-    lively = LivenessTally(reference.session, session)
+    reference, session = open_session(before), open_session(after)
     # a graph that was written for onnxruntime is run by its int8 kernels, too
     kernels = None
     written = any(
@@ -408,27 +279,16 @@ def _compared(
         for each in passes
     )
     if written and has_int8_kernels(after, provider):
-        kernels = RuntimeTally(open_session(after, stock=True), frames)
-
-    def watch(a: dict[str, Array], b: dict[str, Array], frame: Frame) -> None:
-        lively.add(a, b, frame)
-        if kernels is not None:
-            kernels.add(a, b, frame)
-
-    fidelity = reference.compare(session, watch=watch)
-    loss = dataclasses.replace(
-        loss,
-        fidelity=fidelity,
-        liveness=lively.result(),
-        runtime=None if kernels is None else kernels.result(after, fidelity),
-    )
-    low = [each.output for each in loss.floor.shortfalls(fidelity)]
+        kernels = open_session(after, stock=True)
+    found = compared(reference, session, frames, after, kernels)
+    loss = dataclasses.replace(loss, **vars(found))
+    low = [each.output for each in loss.floor.shortfalls(found.fidelity)]
     if not low:
         return loss
     # outputs that choose between near-equal candidates are not judged
-    rounding = Rounding.of(reference, before, loss.floor).among(low)
+    rounding = Rounding.of(reference, frames, before, loss.floor, low)
     unsteady = {name: rounding.values[name] for name in rounding.choices}
-    below = loss.floor.shortfalls(fidelity, unsteady)
+    below = loss.floor.shortfalls(found.fidelity, unsteady)
     int8 = any(isinstance(each, QuantizeInt8) for each in passes)
     plan = plan_of(after) if below and int8 else None
     placed = () if plan is None else plan.placed

@@ -12,7 +12,6 @@ from me2e_compress.fidelity.compare import (
     Displacement,
     Fidelity,
     OutputFidelity,
-    Reference,
     SetFidelity,
     SetOutputs,
     SetTally,
@@ -261,17 +260,16 @@ def test_an_output_that_chooses_is_told_by_rounding_the_input() -> None:
     values = np.array([[4.0, 4.001, -127.0, 0.0]], np.float32)
     frames = [Frame(0, True, {"img": values})]
     model = parsed(CHOOSER)
-    reference = Reference.of(Session(model), frames)
+    outputs = ["steady", "chosen", "coarse"]
 
-    found = Rounding.of(reference, model, Floor())
+    found = Rounding.of(Session(model), frames, model, Floor(), outputs)
 
     assert found.input == "img"
     assert list(found.values) == ["chosen", "coarse"]
     assert found.values["chosen"] < 0
     assert found.choices == {"chosen": "/head/TopK (TopK)"}
-    assert found.among(["coarse"]) == Rounding(
-        "img", {"coarse": found.values["coarse"]}, {}
-    )
+    alone = Rounding.of(Session(model), frames, model, Floor(), ["coarse"])
+    assert alone == Rounding("img", {"coarse": found.values["coarse"]}, {})
 
 
 CHOICES = """

@@ -79,7 +79,7 @@ def drive(count: int = 4, scenes: tuple[int, ...] = (0,)) -> list[Frame]:
 def measured(model: ir.Model, frames: list[Frame] | None = None) -> Liveness:
     a, b = Session(driver()), Session(model)
     tally = LivenessTally(a, b)
-    compare(a, b, drive() if frames is None else frames, tally.add)
+    compare(a, b, drive() if frames is None else frames, [tally.add])
     return tally.result()
 
 

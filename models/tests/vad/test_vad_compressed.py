@@ -128,7 +128,7 @@ def seeing(result: ir.Model, reference: Reference, context: Context) -> Session:
     assert not provenance.missing(result)
     session = Session(result, threads=1)
     tally = LivenessTally(reference.session, session)
-    compare(reference.session, session, context.frames, tally.add)
+    compare(reference.session, session, context.frames, [tally.add])
     (plan,) = (e for e in tally.result().outputs if e.output == "ego_fut_preds")
     assert (plan.moves or 0) >= 0.05
     return session

@@ -1,0 +1,139 @@
+"""What onnxruntime's own int8 kernels answer otherwise than an int8 graph says."""
+
+import dataclasses
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from functools import partial
+
+import numpy as np
+import onnx_ir as ir
+
+from me2e_compress import graph
+from me2e_compress.fidelity.compare import Fidelity, Tally
+from me2e_compress.manager.runtime_levels import first_node
+from me2e_compress.manager.verification_inputs import VerificationInputs, relative
+from me2e_compress.runtime.frames import Array, Frame
+from me2e_compress.runtime.providers import CPU, Provider
+from me2e_compress.runtime.session import Session, replay
+from me2e_compress.targets.onnxruntime import int8_rewrites
+from me2e_compress.targets.quantized import describe_quantized
+
+APART_DB = 6.0
+"""From how much more noise on, in dB, an output is named: twice the amplitude."""
+
+QUIET_DB = 30.0
+"""Outputs with an SQNR above that are not named: int8 kernels round ties otherwise than
+the nodes do, which is 36 dB of the driver's noisiest output (without any overflow)."""
+
+_NAMED = 5
+"""How many layers a line names."""
+
+
+@dataclasses.dataclass(frozen=True)
+class RuntimeLoss:
+    """How onnxruntime's int8 kernels compute an int8 graph on this processor.
+
+    Attributes:
+        sqnr_db: SQNR of the outputs that they answer otherwise than the nodes, dB.
+        nodes_db: SQNR of the same outputs by the nodes as they stand, dB.
+        causes: layers, and what is done to them; the first node, where no rule knows.
+    """
+
+    sqnr_db: Mapping[str, float]
+    nodes_db: Mapping[str, float]
+    causes: tuple[str, ...] = ()
+
+    def lines(self) -> Iterator[str]:
+        """Yield what the runtime answers otherwise, and why; nothing if it does not."""
+        if not self.sqnr_db:
+            return
+        apart = ", ".join(
+            f"{name} {value:z.1f} dB (its nodes {self.nodes_db[name]:z.1f})"
+            for name, value in self.sqnr_db.items()
+        )
+        yield f"onnxruntime's int8 answers otherwise than the file: {apart}"
+        more = len(self.causes) - _NAMED
+        for cause in self.causes[:_NAMED]:
+            yield f"the runtime's, not the file's: {cause}"
+        if more > 0:
+            yield f"the runtime's, not the file's: {more} layers more (lint names them)"
+
+
+class RuntimeTally:
+    """Compares a graph, as onnxruntime's int8 runs it, with a reference.
+
+    Args:
+        session: the graph, with int8 kernels.
+        frames: those that the reference is shown.
+    """
+
+    def __init__(self, session: Session, frames: Iterable[Frame]) -> None:
+        self._answers, self._provider = replay(session, frames), session.provider
+        self._tallies: dict[str, Tally] = {}
+        self._frame: Frame | None = None
+
+    def add(
+        self, reference: dict[str, Array], nodes: dict[str, Array], frame: Frame
+    ) -> None:
+        """Add a frame: what the reference and the nodes of the graph answered."""
+        answers, self._frame = next(self._answers), self._frame or frame
+        for name in (each for each in nodes if each in reference):
+            tally = self._tallies.setdefault(name, Tally(name))
+            tally.add(reference[name], answers[name], frame.index)
+
+    def result(self, model: ir.Model, fidelity: Fidelity) -> RuntimeLoss:
+        """Return what is noisier than by the nodes, and the causes."""
+        nodes = {each.name: each.sqnr_db for each in fidelity.outputs}
+        runs = {name: tally.result().sqnr_db for name, tally in self._tallies.items()}
+        apart = [
+            name
+            for name, sqnr in runs.items()
+            if sqnr < QUIET_DB and sqnr < nodes[name] and sqnr <= nodes[name] - APART_DB
+        ]
+        if not apart or self._frame is None:
+            return RuntimeLoss({}, {})
+        shaped = model.clone()
+        graph.infer_shapes(shaped)
+        causes = [f"{each.node}: {each.message}" for each in int8_rewrites(shaped)]
+        if not causes:
+            causes = [*_unknown_causes(model, apart, self._frame, self._provider)]
+        return RuntimeLoss(
+            {name: runs[name] for name in apart},
+            {name: nodes[name] for name in apart},
+            tuple(causes),
+        )
+
+
+def _unknown_causes(
+    model: ir.Model, outputs: Sequence[str], frame: Frame, provider: Provider
+) -> Iterator[str]:
+    """Name what one frame tells: sums that overflow, else the first node that differs.
+
+    Sums do where an output is 6 dB nearer its nodes with sums of 32 bits.
+    """
+    run = partial(Session, model, provider=provider)
+    sessions = run(), run(stock=True), run(int8_kernels=True)
+    (nodes,), (stock,), (wide,) = (replay(each, [frame], outputs) for each in sessions)
+
+    def noise(name: str, answers: Mapping[str, Array]) -> float:
+        apart = nodes[name].astype(np.float64) - answers[name].astype(np.float64)
+        return float(np.square(apart).sum())
+
+    if any(4 * noise(name, wide) < noise(name, stock) for name in outputs):
+        yield (
+            "sums of uint8 by int8 overflow 16 bits on this processor, which has no"
+            " VNNI: set session.x64quantprecision to 1, as profile and evaluate do"
+        )
+        return
+    # the first node from which the output is half as far off as at last
+    gaps = {name: relative(nodes[name], stock[name]) for name in outputs}
+    worst = max(outputs, key=lambda name: gaps[name])
+    inputs = VerificationInputs([frame], "recorded", provider)
+    half = gaps[worst] / 2
+    node = first_node(model, worst, "all", half, inputs, int8_kernels=True)
+    if half and node is not None:
+        yield f"{worst} differs from {node.name} ({node.op_type}) on"
+
+
+def has_int8_kernels(model: ir.Model, provider: Provider) -> bool:
+    """Return whether onnxruntime would run a graph by int8 kernels of its own."""
+    return provider.target == CPU.target and describe_quantized(model) is not None
