@@ -275,10 +275,15 @@ class Tally:
         largest = np.abs(x).max(axis=others)
         self._channels[2] = np.maximum(self._channels[2], largest)
 
+    @property
+    def sqnr_db(self) -> float:
+        """The SQNR over the frames so far."""
+        return decibels(self.signal, self.noise)
+
     def result(self) -> OutputFidelity:
         """Return the output's fidelity over the frames so far."""
         error = self.gap / self.reach if self.reach else math.inf if self.gap else 0.0
-        sqnr, by_frame = decibels(self.signal, self.noise), self.frames_db
+        sqnr, by_frame = self.sqnr_db, self.frames_db
         spread = (min(by_frame), max(by_frame)) if len(by_frame) > 1 else (None, None)
         stray = self.strays / self.count if self.count else 0.0
         small, small_db = self._small()
@@ -449,5 +454,5 @@ class SetTally:
 
     def result(self) -> SetFidelity:
         """Return the figures of all frames."""
-        sqnr_db = {name: each.result().sqnr_db for name, each in self.tallies.items()}
+        sqnr_db = {name: each.sqnr_db for name, each in self.tallies.items()}
         return SetFidelity(self.agents, self.matched, sqnr_db if self.matched else {})

@@ -1,7 +1,6 @@
 """What an engine lost, output by output: to quantization and to compilation."""
 
 import dataclasses
-import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import TypeAlias
 
@@ -11,7 +10,7 @@ from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.calibration.engine_dump import EngineDump
 from me2e_compress.errors import EvaluationError
 from me2e_compress.fidelity import ALIVE
-from me2e_compress.fidelity.compare import decibels
+from me2e_compress.fidelity.compare import Tally
 from me2e_compress.fidelity.liveness import OutputTally
 from me2e_compress.runtime.frames import Array, Frame
 from me2e_compress.runtime.session import DTYPES, Session
@@ -87,19 +86,16 @@ class EngineRun:
                 )
 
 
-LOWEST_DB = -20.0
-"""The closeness of outputs that cannot be compared, since the graph's is not finite."""
-
-
 @dataclasses.dataclass(frozen=True)
 class OutputLoss:
     """What one output lost, in dB of SQNR over all frames; infinite where nothing.
 
+    It is -infinity where the graph or its source is not finite.
+
     Attributes:
         quantization_db: The graph against its float source; None without one.
         compilation_db: The engine, and the host that feeds it, against the graph.
-        all_db: The engine against the float source, or against the graph without one;
-            None if it cannot be compared.
+        all_db: The engine against the float source, or against the graph without one.
         moves: Standard deviation of the engine's answers over the frames, as a share of
             the source's, or the graph's without one; None if those rest.
         dead: What is wrong if it moves hardly at all; empty otherwise.
@@ -108,29 +104,9 @@ class OutputLoss:
     name: str
     quantization_db: float | None
     compilation_db: float
-    all_db: float | None
+    all_db: float
     moves: float | None
     dead: str
-
-
-class _Sums:
-    """Signal and noise of one comparison of one output; ``decibels`` None: unknown."""
-
-    def __init__(self) -> None:
-        self.signal = self.noise = 0.0
-        self.decibels: float | None = None
-
-    def add(self, truth: Array, value: Array) -> None:
-        """Take a frame; another shape makes the noise NaN."""
-        if value.shape != truth.shape:
-            self.noise = math.nan
-        else:
-            wide = np.asarray(truth, np.float64)
-            gap = wide - np.asarray(value, np.float64)
-            self.signal += float(np.vdot(wide, wide))
-            self.noise += float(np.vdot(gap, gap))
-        known = math.isfinite(self.noise)
-        self.decibels = decibels(self.signal, self.noise) if known else None
 
 
 def losses(
@@ -145,37 +121,35 @@ def losses(
     called with the index of every frame.
 
     Raises:
-        EvaluationError: an output of the engine has another shape than the graph's, or
-            is not finite.
+        EvaluationError: an output has another shape in the graph than in the engine or
+            the source, or one of the engine is not finite.
     """
     names = run.names
     movements = {name: OutputTally(name) for name in names}
-    parts = ("quantization", "compilation", "all")
-    sums = {name: {part: _Sums() for part in parts} for name in names}
-    floats: Iterator[tuple[object, Mapping[str, Array]]] = iter(())
-    if source is not None:
-        floats = run.follow(source, [name for name in names if name in source.outputs])
+    compiled, whole = ({name: Tally(name) for name in names} for _ in range(2))
+    known = [] if source is None else [each for each in names if each in source.outputs]
+    quantized = {name: Tally(name) for name in known}
+    floats = iter(()) if source is None else run.follow(source, known)
     for index, (_, truth) in enumerate(run.follow(run.session, names)):
         on_frame(index)
         run.check(index, truth)
         dumped, (_, exact) = run.dump[index], next(floats, (None, {}))
-        for name, parted in sums.items():
+        for name in names:
             right = exact.get(name, truth[name])
-            if name in exact:
-                parted["quantization"].add(right, truth[name])
-            parted["compilation"].add(truth[name], dumped[name])
-            parted["all"].add(right, dumped[name])
+            if name in quantized:
+                quantized[name].add(right, truth[name], index)
+            compiled[name].add(truth[name], dumped[name], index)
+            whole[name].add(right, dumped[name], index)
             movements[name].add(right, dumped[name])
     moved = {name: movement.result(alive) for name, movement in movements.items()}
     return tuple(
         OutputLoss(
             name,
-            parted["quantization"].decibels,
-            LOWEST_DB if compiled is None else compiled,
-            parted["all"].decibels,
+            quantized[name].sqnr_db if name in quantized else None,
+            compiled[name].sqnr_db,
+            whole[name].sqnr_db,
             moved[name].moves,
             str(moved[name]) if moved[name].is_dead else "",
         )
-        for name, parted in sums.items()
-        for compiled in (parted["compilation"].decibels,)
+        for name in names
     )

@@ -13,13 +13,13 @@ import onnx_ir as ir
 from me2e_compress import graph
 from me2e_compress.errors import EvaluationError
 from me2e_compress.fidelity import SQNR_FLOOR_DB
-from me2e_compress.fidelity.compare import decibels
+from me2e_compress.fidelity.compare import Tally
 from me2e_compress.fidelity.engine_loss import EngineRun
 from me2e_compress.graph.nodes import constant_values, nodes_of, reads_of
 from me2e_compress.graph.provenance import module_of
 from me2e_compress.runtime.frames import Array, Frame
 from me2e_compress.runtime.providers import CPU, Provider
-from me2e_compress.runtime.session import Session, detached
+from me2e_compress.runtime.session import Session, detached, replay
 
 ROUNDING_DB = 80.0
 """SQNR of two float32 values that differ by rounding alone: two runtimes are 3e-5 to
@@ -131,18 +131,12 @@ def _compared(
 ) -> FirstDifference:
     """Compare arrays of the same name, in the order in which a graph computes them."""
 
-    def sqnr(one: Array, other: Array) -> float:
-        # What is infinite or NaN in both is no difference.
-        if one.shape != other.shape:
+    def sqnr(name: str) -> float:
+        if expected[name].shape != values[name].shape:
             return -np.inf
-        x, y = (np.asarray(each, np.float64) for each in (one, other))
-        equal = (x == y) | (np.isnan(x) & np.isnan(y))
-        with np.errstate(invalid="ignore"):
-            noise = np.where(equal, 0.0, x - y)
-        if not np.isfinite(noise).all():
-            return -np.inf
-        signal = x[np.isfinite(x)]
-        return decibels(float(np.vdot(signal, signal)), float(np.vdot(noise, noise)))
+        tally = Tally(name)
+        tally.add(expected[name], values[name], 0)
+        return tally.sqnr_db
 
     outputs = {value.name for value in model.graph.outputs}
     compared = tuple(
@@ -150,7 +144,7 @@ def _compared(
             module_of(node),
             name,
             f"{node.name or 'a node'} ({node.op_type})",
-            sqnr(expected[name], values[name]),
+            sqnr(name),
         )
         for name, node in _values_by_name(model).items()
         if name in expected
@@ -185,16 +179,13 @@ def _feeds_of_last(
 ) -> Mapping[str, Array]:
     """Return what a graph is fed at the last frame, state included."""
     session = Session(model, optimize=False, release=True, provider=provider)
-    state: Mapping[str, Array] = {}
-    feeds: Mapping[str, Array] = {}
-    for at, frame in enumerate(frames):
-        if frame.starts_scene or not at:
-            state = session.first_state(frame.arrays)
-        feeds = {**frame.arrays, **state}
-        if at < len(frames) - 1 and session.recurrent:
-            answers = detached(session.run(feeds, list(session.recurrent.values())))
-            state = {name: answers[out] for name, out in session.recurrent.items()}
-    return feeds
+    *before, last = frames if session.recurrent else frames[-1:]
+    state = session.first_state(frames[0].arrays)
+    for answers in replay(session, before, [*session.recurrent.values()], state):
+        pairs = session.recurrent.items()
+        state = detached({name: answers[output] for name, output in pairs})
+    fresh = session.first_state(last.arrays) if last.starts_scene else state
+    return {**last.arrays, **fresh}
 
 
 def _compute(

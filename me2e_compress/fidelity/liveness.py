@@ -170,12 +170,7 @@ class LivenessTally:
     """Watches how the outputs of two graphs move over frames."""
 
     def __init__(self, a: Session, b: Session) -> None:
-        names = [
-            name
-            for name, port in a.outputs.items()
-            if name in b.outputs and port.type.startswith("tensor(")
-        ]
-        self._tallies = {name: OutputTally(name) for name in names}
+        self._tallies: dict[str, OutputTally] = {}
         held = [name for name in a.recurrent if name in b.inputs]
         self._not_fed = tuple(name for name in held if name not in b.recurrent)
         self._frames = 0
@@ -185,7 +180,8 @@ class LivenessTally:
     ) -> None:
         """Take what both graphs answer to a frame."""
         self._frames += 1
-        for name, tally in self._tallies.items():
+        for name in (each for each in right if each in left):
+            tally = self._tallies.setdefault(name, OutputTally(name))
             tally.add(left[name], right[name])
 
     def result(self, alive: float = ALIVE) -> Liveness:

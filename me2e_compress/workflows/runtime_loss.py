@@ -83,7 +83,7 @@ class RuntimeTally:
     def result(self, model: ir.Model, fidelity: Fidelity) -> RuntimeLoss:
         """Return what is noisier than by the nodes, and the causes."""
         nodes = {each.name: each.sqnr_db for each in fidelity.outputs}
-        runs = {name: tally.result().sqnr_db for name, tally in self._tallies.items()}
+        runs = {name: tally.sqnr_db for name, tally in self._tallies.items()}
         apart = [
             name
             for name, sqnr in runs.items()
