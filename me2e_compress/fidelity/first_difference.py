@@ -19,7 +19,7 @@ from me2e_compress.graph.nodes import constant_values, nodes_of, reads_of
 from me2e_compress.graph.provenance import module_of
 from me2e_compress.runtime.frames import Array, Frame
 from me2e_compress.runtime.providers import CPU, Provider
-from me2e_compress.runtime.session import Session, detached, replay
+from me2e_compress.runtime.session import Session, detached, feed_forward
 
 ROUNDING_DB = 80.0
 """SQNR of two float32 values that differ by rounding alone: two runtimes are 3e-5 to
@@ -181,9 +181,8 @@ def _feeds_of_last(
     session = Session(model, optimize=False, release=True, provider=provider)
     *before, last = frames if session.recurrent else frames[-1:]
     state = session.first_state(frames[0].arrays)
-    for answers in replay(session, before, [*session.recurrent.values()], state):
-        pairs = session.recurrent.items()
-        state = detached({name: answers[output] for name, output in pairs})
+    for _, _, after in feed_forward(session, before, (), state):
+        state = detached(after)
     fresh = session.first_state(last.arrays) if last.starts_scene else state
     return {**last.arrays, **fresh}
 
