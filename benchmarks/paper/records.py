@@ -14,8 +14,9 @@ from benchmarks.paper.questions import SHIPPED, PaperQuestions
 from benchmarks.paper.result import PaperResult
 from benchmarks.paper.weigh import weigh, weighed
 from me2e_compress.errors import StudyError
+from me2e_compress.evaluators.highway import runner
 from me2e_compress.evaluators.highway.engine import LocalEngine
-from me2e_compress.evaluators.highway.render import watch
+from me2e_compress.simulator.pictures.route import Moment
 from me2e_compress.simulator.routes import Route
 from me2e_compress.study import Listener, Study
 from me2e_compress.study.drive_record import DriveRecord
@@ -122,7 +123,9 @@ def _keep_accident(setup: StudyCells, prepared: Sequence[PreparedVariant]) -> No
         # drive the route again, this time watched
         routes = (each for each in study.routes if isinstance(each, Route))
         route = next(each for each in routes if each.id == happened.route)
-        moments = watch(driver.driver, drive, route, happened.duration_us)
+        moments = list[Moment]()
+        seeing = runner.Listeners(on_moment=moments.append)
+        runner.drive(route, driver.driver.open(), drive, seeing)
         found = accident_of(record, happened, route, moments)
         if found.moments:
             found.save(path)

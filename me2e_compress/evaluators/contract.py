@@ -169,7 +169,7 @@ ABILITIES = (
     *("latency_model", "dt_ms", "weather", "drive_on", "engine", "render"),
 )
 """What an evaluator may declare that it takes: options of the command or of a study."""
-METHODS = {"routes": ("routes",), "render": ("render", "overlay", "routes")}
+METHODS = {"routes": ("routes",), "render": ("render", "routes")}
 """What who declares an ability must define."""
 
 
@@ -252,19 +252,6 @@ class Evaluator(abc.ABC):
         self, policy: Driver, drive: Drive, route: RouteInfo, folder: Path
     ) -> tuple[Path, ...]:
         """Drive a route again, draw it, and return the pictures' files."""
-        raise NotImplementedError
-
-    def overlay(
-        self,
-        labelled: Sequence[tuple[str, Driver, Drive]],
-        route: RouteInfo,
-        time_us: int,
-        path: Path,
-    ) -> None:
-        """Write a PNG of two drives of a route at a moment, the second in grey.
-
-        It is part of ``render``.
-        """
         raise NotImplementedError
 
     def check_takes(self, options: Iterable[str], whose: str = "") -> None:

@@ -230,7 +230,7 @@ class DriverDemo:
             timing=Timing(LATENCY_SAMPLES),
         )
         engine = LocalEngine(WORKERS)
-        result = run_study(study, self.out, engine, listener, 1, force=self.force)
+        result = run_study(study, self.out, engine, listener, force=self.force)
         # its report, with the demo's own sections and the files linked from the page
         files = (
             ("the driver", self._source),

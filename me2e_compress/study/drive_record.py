@@ -43,14 +43,6 @@ _HEAD, _ROUTE = TypeAdapter(_Head), TypeAdapter(RouteSummary)
 
 
 @dataclass(frozen=True)
-class Apart:
-    """Greatest distance to the baseline's ego at the same time, and that time."""
-
-    distance_m: float
-    time_us: int
-
-
-@dataclass(frozen=True)
 class DriveRecord:
     """One variant under one condition, or the reason why it was not driven.
 
@@ -60,8 +52,8 @@ class DriveRecord:
         made_by: Its fingerprint without the routes.
         difference: Paired by route with the baseline under the same condition; None for
             the baseline itself.
-        apart: By route, how far it was from the baseline; without routes that have no
-            frames.
+        apart_m: By route, how far it was from the baseline at most; without routes that
+            have no frames.
     """
 
     variant: str
@@ -70,7 +62,7 @@ class DriveRecord:
     made_by: Mapping[str, Any] = field(default_factory=dict)
     scores: Scores | None = None
     difference: PairedDifference | None = None
-    apart: Mapping[str, Apart] = field(default_factory=dict)
+    apart_m: Mapping[str, float] = field(default_factory=dict)
     reason: str = ""
 
     @classmethod
@@ -110,7 +102,6 @@ class DriveRecord:
 
     def to_json(self) -> dict[str, Any]:
         """Return scores, difference and routes, as they stand in the study's JSON."""
-        apart_m = {route: each.distance_m for route, each in self.apart.items()}
         return {
             "scheme": self.variant,
             "condition": self.condition,
@@ -127,7 +118,7 @@ class DriveRecord:
                     "infractions": [
                         {"kind": kind, "time_us": us} for kind, us in each.moments
                     ],
-                    "apart_m": apart_m.get(each.route),
+                    "apart_m": self.apart_m.get(each.route),
                 }
                 for each in self.routes
             ],
@@ -161,11 +152,11 @@ class DriveRecord:
             return cls(head.variant, head.condition, routes, head.made_by)
 
 
-def apart(
+def metres_apart(
     episodes: Sequence[Episode], reference: Sequence[Episode]
-) -> dict[str, Apart]:
-    """Return how far two drives of the same routes part, by route."""
-    by_route = dict[str, Apart]()
+) -> dict[str, float]:
+    """Return how far two drives of the same routes part at most, by route."""
+    by_route = dict[str, float]()
     for one, other in zip(episodes, reference, strict=True):
         if one.frames and other.frames:
             count = min(len(one.frames), len(other.frames))
@@ -173,9 +164,7 @@ def apart(
                 np.array([(frame.x, frame.y) for frame in each.frames[:count]])
                 for each in (one, other)
             )
-            gaps = np.hypot(*(here - there).T)
-            at = int(gaps.argmax())
-            by_route[one.route] = Apart(float(gaps[at]), one.frames[at].time_us)
+            by_route[one.route] = float(np.hypot(*(here - there).T).max())
     return by_route
 
 
@@ -264,76 +253,3 @@ def held_against(
         for one, other in pairs
         if one in there and other in there
     )
-
-
-SCORED, MOVED_M = 1.0, 0.5
-"""Two drives whose scores are closer, and that were never farther apart, look alike."""
-
-
-@dataclass(frozen=True)
-class Contrast:
-    """One route as two drivers drove it: ``route`` is the baseline's.
-
-    Attributes:
-        picture: A PNG of the moment, the baseline in grey under the variant, once it
-            is drawn.
-    """
-
-    drive: DriveRecord
-    route: RouteSummary
-    other: RouteSummary
-    picture: Path = Path()
-
-    @property
-    def apart(self) -> Apart:
-        """How far the two were from each other at most."""
-        return self.drive.apart.get(self.other.route, Apart(0.0, 0))
-
-    @property
-    def gap(self) -> float:
-        """How far the driving scores differ."""
-        return abs(self.route.driving_score - self.other.driving_score)
-
-    @property
-    def moment_us(self) -> int:
-        """Time of the worse drive's infraction, else of the greatest distance."""
-        if self.gap < SCORED:
-            return self.apart.time_us
-        worse, better = self.route, self.other
-        if worse.driving_score > better.driving_score:
-            worse, better = better, worse
-        kinds = [kind for kind, _ in better.moments]
-        timed = [(kind, us) for kind, us in worse.moments if us is not None]
-        alone = [us for kind, us in timed if kind not in kinds]
-        times = alone or [us for _, us in timed]
-        return times[0] if times else min(worse.duration_us, better.duration_us)
-
-
-def chosen_pairs(
-    baseline: str, drives: Sequence[DriveRecord], limit: int
-) -> list[Contrast]:
-    """Choose the widest gaps: one of each variant first, and no route twice."""
-    references = {each.condition: each for each in drives if each.variant == baseline}
-    pairs = [
-        Contrast(drive, route, other)
-        for drive in drives
-        if drive.variant != baseline and drive.routes
-        for route, other in zip(
-            references[drive.condition].routes, drive.routes, strict=True
-        )
-        if route.duration_us and other.duration_us  # who hung or crashed has no frames
-    ]
-    ranked = sorted(pairs, key=lambda pair: (-pair.gap, -pair.apart.distance_m))
-    # where all look alike, one picture shows just that
-    ranked = [
-        pair for pair in ranked if pair.gap >= SCORED or pair.apart.distance_m > MOVED_M
-    ] or ranked[:1]
-    chosen = list[Contrast]()
-    for others_only in (True, False):
-        for pair in ranked:
-            shown = [each.drive.variant for each in chosen]
-            if len(chosen) == limit or (others_only and pair.drive.variant in shown):
-                continue
-            if pair.route.route not in [each.route.route for each in chosen]:
-                chosen.append(pair)
-    return chosen

@@ -15,7 +15,7 @@ from me2e_compress.metrics.route_summary import difference
 from me2e_compress.metrics.scores import score
 from me2e_compress.study.condition import Condition
 from me2e_compress.study.definition import Study
-from me2e_compress.study.drive_record import Contrast, DriveRecord, apart, chosen_pairs
+from me2e_compress.study.drive_record import DriveRecord, metres_apart
 from me2e_compress.study.file import load_study
 from me2e_compress.study.outcome import (
     Clock,
@@ -38,7 +38,6 @@ def run_study(
     folder: str | Path,
     engine: Engine | None = None,
     listener: Listener = SILENT,
-    pictures: int = 3,
     *,
     force: bool = False,
 ) -> StudyResult:
@@ -53,7 +52,6 @@ def run_study(
         folder: Where models, traces and results go.
         engine: Where routes are driven; None for one process of this machine.
         listener: Is called with progress and warnings.
-        pictures: Number of routes on which two drives are shown side by side.
         force: Also replace a report that we did not write.
 
     Raises:
@@ -83,10 +81,9 @@ def run_study(
             for condition in study.conditions
             for drive in cells.under(condition, prepared)
         )
-        shown = cells.pictures(prepared, drives, pictures)
         made_by = this_machine(), versions()
         return StudyResult(
-            *(study, tuple(variants), drives, shown, clock.scale, *made_by, clock.load)
+            *(study, tuple(variants), drives, clock.scale, *made_by, clock.load)
         )
 
 
@@ -147,7 +144,7 @@ class StudyCells:
                 record = replace(
                     record,
                     difference=difference(record.routes, reference.routes, seed),
-                    apart=apart(episodes, theirs),
+                    apart_m=metres_apart(episodes, theirs),
                 )
             records.append(record)
         return tuple(records)
@@ -203,36 +200,3 @@ class StudyCells:
         record.save(self.workspace.record(prepared.variant, condition))
         set_size = study.set_size or evaluator.set_size or len(episodes)
         return replace(record, scores=score(episodes, set_size, study.seed)), episodes
-
-    def pictures(
-        self,
-        prepared: Sequence[PreparedVariant],
-        drives: Sequence[DriveRecord],
-        limit: int,
-    ) -> tuple[Contrast, ...]:
-        """Drive the routes on which variants diverge the most, up to that moment.
-
-        Existing pictures are reused; no route is shown twice, and variants alternate.
-        """
-        study = self.study
-        if "render" not in study.driven_by.takes:
-            return ()
-        contrasts = list[Contrast]()
-        by_name = {each.variant.name: each for each in prepared}
-        routes = {each.id: each for each in study.routes}
-        pairs = chosen_pairs(study.baseline, drives, limit)
-        for done, pair in enumerate(pairs):
-            self.listener.on_progress("pictures", done, len(pairs), pair.route.route)
-            variant, condition = study.drive_of(pair.drive.name)
-            route, us = routes[pair.route.route], pair.moment_us
-            path = self.workspace.picture(variant, condition, route.id, us)
-            both = [by_name[name] for name in (variant.name, study.baseline)]
-            labelled = [
-                (each.variant.name, each.driver, drive)
-                for each in both
-                if (drive := self.drive(each, condition)) is not None
-            ]
-            if not path.is_file() and len(labelled) == len(both):
-                study.driven_by.overlay(labelled, route, us, path)
-            contrasts.append(replace(pair, picture=path))
-        return tuple(contrasts)

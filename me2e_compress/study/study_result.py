@@ -16,7 +16,6 @@ from me2e_compress.study.condition import Condition
 from me2e_compress.study.definition import Study
 from me2e_compress.study.drive_record import (
     Change,
-    Contrast,
     DriveRecord,
     changes,
     held_against,
@@ -36,7 +35,6 @@ class StudyResult(Result):
 
     Attributes:
         drives: Condition by condition, the variants in the study's order.
-        contrasts: Pictures of moments at which two drives differ.
         device_scale: How many times slower the device is than the machine timed on.
         versions: Versions of the packages that decide the result.
         load: Load by other processes while latencies were measured; None if none was
@@ -46,7 +44,6 @@ class StudyResult(Result):
     study: Study
     variants: tuple[VariantOutcome, ...]
     drives: tuple[DriveRecord, ...]
-    contrasts: tuple[Contrast, ...]
     device_scale: float
     machine: str
     versions: Mapping[str, str]

@@ -38,14 +38,6 @@ class Workspace:
         """Return the path of the latency trace of a variant's model."""
         return self._made("traces") / f"{variant.name}.json"
 
-    def picture(
-        self, variant: Variant, condition: Condition, route: str, time_us: int
-    ) -> Path:
-        """Return the path of a picture of one moment."""
-        drive = self.drive(variant, condition)
-        name = f"{route}.{time_us // 1000}ms.{drive}.overlay.png"
-        return self._made("pictures") / name
-
     def _made(self, name: str) -> Path:
         path = self.folder / name
         try:

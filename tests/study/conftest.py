@@ -68,11 +68,15 @@ def make(models: Path) -> Make:
 
 
 @pytest.fixture(scope="session")
-def found(models: Path, tmp_path_factory: pytest.TempPathFactory) -> StudyResult:
-    """What the study finds; its folder is beside its first picture's."""
-    return run_study(
-        asked(models), tmp_path_factory.mktemp("found"), Here(), pictures=1
-    )
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of the study that is found."""
+    return tmp_path_factory.mktemp("found")
+
+
+@pytest.fixture(scope="session")
+def found(models: Path, folder: Path) -> StudyResult:
+    """What the study finds."""
+    return run_study(asked(models), folder, Here())
 
 
 def asked(models: Path) -> Study:

@@ -166,7 +166,7 @@ def test_every_option_reaches_the_drive(make: Make, tmp_path: Path) -> None:
         variants=(BLIND,), baseline="blind", conditions=(condition,), timing=Timing()
     )
 
-    found = run_study(made, tmp_path, Here(), pictures=0)
+    found = run_study(made, tmp_path, Here())
 
     manifest = tmp_path / "results" / "blind.all" / "evaluation.json"
     made_by = json.loads(manifest.read_text())
@@ -186,7 +186,7 @@ def test_a_mean_is_that_of_the_drive_that_it_names(make: Make, tmp_path: Path) -
         variants=(BLIND,), baseline="blind", conditions=(busy, even), timing=Timing()
     )
 
-    run_study(made, tmp_path, Here(), pictures=0)
+    run_study(made, tmp_path, Here())
 
     taken = {
         name: [
@@ -232,7 +232,7 @@ ASKED = Study(
 def test_a_block_drives_its_variants_and_the_rest_is_left(tmp_path: Path) -> None:
     before, engine = workload(ASKED, tmp_path, 2), Here()
 
-    run_study(ASKED, tmp_path, engine, pictures=0)
+    run_study(ASKED, tmp_path, engine)
 
     drives = [(each.variant, each.condition) for each in before.drives]
     assert drives == [("blind", "ideal"), ("faster", "ideal"), ("blind", "slow")]
@@ -269,7 +269,7 @@ def test_the_mean_of_a_drive_is_that_of_its_record(tmp_path: Path) -> None:
         blocks=(StudyBlock("tail", ("faster",), ("slow", "even")),),
     )
 
-    run_study(asked, tmp_path, Here(), pictures=0)
+    run_study(asked, tmp_path, Here())
 
     record = DriveRecord.load(tmp_path / "records" / "faster.even.jsonl")
     assert record.mean_latency_us == 500_000

@@ -143,7 +143,7 @@ def test_every_session_of_a_study_is_on_its_provider(
 ) -> None:
     folder = tmp_path / "out"
 
-    result = run_study(provided, folder, Here(), pictures=0)
+    result = run_study(provided, folder, Here())
 
     assert set(opened) == {provided.provider.plugins}
     (trace,) = (folder / "traces").glob("slow*")

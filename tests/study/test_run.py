@@ -60,8 +60,8 @@ def without_latency(record: dict[str, Any]) -> dict[str, Any]:
     return record
 
 
-def test_the_scores_are_those_of_the_results(found: StudyResult) -> None:
-    folder = found.contrasts[0].picture.parents[1] / "results" / "fast.slow"
+def test_the_scores_are_those_of_the_results(found: StudyResult, folder: Path) -> None:
+    folder = folder / "results" / "fast.slow"
     episodes = tuple(ResultsFolder.open(folder).episodes().values())
 
     drive = found.under(SLOW)[-1]
@@ -111,29 +111,10 @@ def test_fidelity_is_measured_against_the_baseline(found: StudyResult) -> None:
     assert fast.frames == 2
 
 
-def test_a_picture_shows_where_two_drives_part(found: StudyResult) -> None:
-    [contrast] = found.contrasts
-
-    gaps = [
-        abs(one.driving_score - other.driving_score)
-        for drive in found.drives
-        for one, other in zip(
-            found.under(IDEAL if drive.condition == "ideal" else SLOW)[1].routes,
-            drive.routes,
-            strict=True,
-        )
-    ]
-    here = abs(contrast.route.driving_score - contrast.other.driving_score)
-    assert here == max(gaps)
-    assert contrast.picture.read_bytes().startswith(b"\x89PNG")
-    longest = max(contrast.route.duration_us, contrast.other.duration_us)
-    assert 0 < contrast.moment_us <= longest
-
-
 def test_the_same_seed_gives_the_same_bytes(
     found: StudyResult, make: Make, tmp_path: Path
 ) -> None:
-    again = run_study(make(), tmp_path, Here(), pictures=0)
+    again = run_study(make(), tmp_path, Here())
 
     one, two = (
         json.dumps(without_latency(outcome.to_json())) for outcome in (found, again)
@@ -145,8 +126,8 @@ def test_what_is_there_is_not_made_again(make: Make, tmp_path: Path) -> None:
     asked = make(**ONE, timing=Timing())
     engine, again = Here(), Here()
 
-    one = run_study(asked, tmp_path, engine, pictures=0)
-    two = run_study(asked, tmp_path, again, pictures=0)
+    one = run_study(asked, tmp_path, engine)
+    two = run_study(asked, tmp_path, again)
 
     assert [route for _, route in engine.driven] != []
     assert again.driven == []
@@ -159,7 +140,7 @@ def test_a_study_is_silent_and_its_file_is_taken_as_it_is(
     toml = tmp_path / "study.toml"
     toml.write_text(STUDY.replace("routes = 8", "routes = 1"))
 
-    found = run_study(toml, tmp_path / "out", Here(), pictures=0)
+    found = run_study(toml, tmp_path / "out", Here())
 
     assert capfd.readouterr() == ("", "")
     assert found.study == load_study(toml)
@@ -171,19 +152,19 @@ def test_studies_share_what_they_have_in_common(make: Make, tmp_path: Path) -> N
     first = make(**ONE, timing=Timing())
     second = replace(first, variants=(faster, BLIND))
 
-    run_study(first, tmp_path, Here(), pictures=0)
-    run_study(second, tmp_path, engine, pictures=0)
+    run_study(first, tmp_path, Here())
+    run_study(second, tmp_path, engine)
 
     assert {name for name, _ in engine.driven} == {"blind:9"}
 
 
 def test_a_name_that_is_taken_by_another_driver(make: Make, tmp_path: Path) -> None:
     asked = make(**ONE, timing=Timing())
-    run_study(asked, tmp_path, Here(), pictures=0)
+    run_study(asked, tmp_path, Here())
     other = replace(asked, variants=(Variant("blind", "blind:9"),))
 
     with pytest.raises(EvaluationError, match=r"blind\.ideal: .* of another evaluatio"):
-        run_study(other, tmp_path, Here(), pictures=0)
+        run_study(other, tmp_path, Here())
 
 
 def test_a_missing_model_is_named_before_anything_drives(
@@ -214,7 +195,7 @@ from pathlib import Path
 from me2e_compress.study import load_study, run_study
 from tests.study.conftest import Here
 
-run_study(load_study(Path(sys.argv[1])), Path(sys.argv[2]), Here(), pictures=0)
+run_study(load_study(Path(sys.argv[1])), Path(sys.argv[2]), Here())
 """
 
 
@@ -237,13 +218,13 @@ def test_a_study_that_was_killed_goes_on(tmp_path: Path) -> None:
     engine = Here()
     names = {"blind": "blind", "blind:12": "faster"}
 
-    resumed = run_study(load_study(toml), out, engine, pictures=0)
+    resumed = run_study(load_study(toml), out, engine)
     driven = {(names[name], route) for name, route in engine.driven}
 
     assert len(done) < 16
     assert len(done) + len(engine.driven) == 16
     assert not done & driven
-    assert resumed == run_study(load_study(toml), whole, Here(), pictures=0)
+    assert resumed == run_study(load_study(toml), whole, Here())
 
 
 def test_who_listens_hears_every_stage(make: Make, tmp_path: Path) -> None:
@@ -255,7 +236,6 @@ def test_who_listens_hears_every_stage(make: Make, tmp_path: Path) -> None:
         tmp_path,
         Here(),
         Listener(lambda stage, *_: heard.append(stage)),
-        pictures=0,
     )
 
     assert list(dict.fromkeys(heard)) == [
@@ -277,7 +257,7 @@ def test_frames_of_its_own_are_of_other_routes_each(make: Make, tmp_path: Path) 
         to_record=FramesToRecord(1, 1, seed=4),
     )
 
-    run_study(asked, tmp_path, Here(), pictures=0)
+    run_study(asked, tmp_path, Here())
 
     about = [
         json.loads((tmp_path / name / "scenes.json").read_text())
@@ -290,9 +270,8 @@ def test_frames_of_its_own_are_of_other_routes_each(make: Make, tmp_path: Path) 
 
 
 @pytest.fixture
-def record(found: StudyResult) -> Path:
+def record(found: StudyResult, folder: Path) -> Path:
     """The record of one drive."""
-    folder = found.contrasts[0].picture.parents[1]
     return folder / "records" / "blind.slow.jsonl"
 
 

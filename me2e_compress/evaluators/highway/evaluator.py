@@ -126,19 +126,6 @@ class Highway(Evaluator):
         (ours,) = _ours([route])
         return render(policy, drive, ours, folder)
 
-    def overlay(
-        self,
-        labelled: Sequence[tuple[str, Driver, Drive]],
-        route: RouteInfo,
-        time_us: int,
-        path: Path,
-    ) -> None:
-        """Drive a route twice up to a moment, and lay the views over one another."""
-        from me2e_compress.evaluators.highway.render import overlay_drives
-
-        (ours,) = _ours([route])
-        overlay_drives(labelled, ours, time_us, path)
-
 
 def _ours(routes: Sequence[RouteInfo]) -> list[Route]:
     ours = [route for route in routes if isinstance(route, Route)]

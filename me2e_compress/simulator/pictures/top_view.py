@@ -164,23 +164,6 @@ STATES: dict[SignalState, Colour] = {
 AHEAD_M, BEHIND_M = 50.0, 22.0
 SCALE_BAR_M = 10.0
 LABEL_PX = 14
-OTHER: Colour = (64, 68, 76)
-OTHER_TRAIL: Colour = (150, 154, 162)
-MARGIN = 0.9
-"""Share of the way to the edge within which both egos of an overlay are shown."""
-
-
-@dataclass(frozen=True, eq=False)
-class OtherDrive:
-    """Another drive of the same route, drawn under the ego in grey.
-
-    ``trail`` [N, 2] holds its ego's positions, world metres; ``plan`` [n, 2] is in its
-    ego frame.
-    """
-
-    ego: Ego
-    trail: Floats
-    plan: Floats | None
 
 
 @dataclass(frozen=True, eq=False)
@@ -201,39 +184,28 @@ class BirdsEye:
         plan: Floats | None,
         events: tuple[Event, ...],
         size: tuple[int, int],
-        other: OtherDrive | None = None,
     ) -> Bytes:
         """Draw one moment, uint8 [rows, columns, 3].
 
         ``trail`` [N, 2] holds the ego's positions, ``plan`` [n, 2] metres in the ego
-        frame. The picture shows 72 m from top to bottom, or more if the other drive is
-        far away.
+        frame. The picture shows 72 m from top to bottom.
         """
-        # the ego heads up; zoom out until the other ego is in the picture
+        # the ego heads up
         rows, columns = size
         ego = scene.ego
         scale = rows / (AHEAD_M + BEHIND_M)
         anchor = (columns / 2, AHEAD_M * scale)
-        if other is not None:
-            ahead, left = ego.seen(np.array(other.ego.x), np.array(other.ego.y))
-            side_m = columns / scale / 2
-            shares = (ahead / AHEAD_M, -ahead / BEHIND_M, abs(left) / side_m)
-            scale /= max(1.0, *(float(share) / MARGIN for share in shares))
         pixels = np.empty((rows, columns, 3), np.uint8)
         canvas = Canvas(pixels, (ego.x, ego.y), ego.heading, scale, anchor)
         # layers, what matters most last
         self._ground(canvas)
         canvas.line(self.route, ROUTE, 2)
-        if other is not None and len(other.trail) > 1:
-            canvas.line(other.trail, OTHER_TRAIL, 5)
         if len(trail) > 1:
             canvas.line(trail, TRAIL, 3)
         _signals(canvas, scene)
         for actor in scene.actors:
             _actor(canvas, actor)
-        if other is not None:
-            _ego(canvas, other.ego, other.plan, OTHER, OTHER)
-        _ego(canvas, ego, plan, EGO, PLAN)
+        _ego(canvas, ego, plan)
         _infractions(canvas, events)
         _scale_bar(canvas)
         return pixels
@@ -271,18 +243,16 @@ class BirdsEye:
         )
 
 
-def _ego(
-    canvas: Canvas, ego: Ego, plan: Floats | None, colour: Colour, planned: Colour
-) -> None:
+def _ego(canvas: Canvas, ego: Ego, plan: Floats | None) -> None:
     corners = canvas.box(ego.x, ego.y, ego.heading, (ego.length, ego.width))
-    _vehicle(canvas, corners, colour)
+    _vehicle(canvas, corners, EGO)
     if plan is None:
         return
     points = np.concatenate([[(ego.x, ego.y)], ego.placed(plan)])
-    canvas.line(points, planned, 2)
+    canvas.line(points, PLAN, 2)
     for point in points[1:]:
         canvas.dot(point, PAPER, 4.0)
-        canvas.dot(point, planned, 3.0)
+        canvas.dot(point, PLAN, 3.0)
 
 
 def _vehicle(canvas: Canvas, corners: Floats, colour: Colour) -> None:

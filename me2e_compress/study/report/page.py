@@ -1,6 +1,5 @@
 """A report as one self-contained HTML page, built from a template."""
 
-import base64
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,7 +14,7 @@ from me2e_compress.registry import drafts
 from me2e_compress.registry.drafts import MARK
 from me2e_compress.runtime.atomic import write_bytes, write_document
 from me2e_compress.study.cells import number
-from me2e_compress.study.drive_record import Contrast, DriveRecord
+from me2e_compress.study.drive_record import DriveRecord
 from me2e_compress.study.report.figures import curves, forest, pareto
 from me2e_compress.study.study_result import StudyResult
 from me2e_compress.study.workspace import HTML, JSON, MARKDOWN
@@ -24,12 +23,11 @@ from me2e_compress.workflows.checks import writing
 
 @dataclass(frozen=True)
 class Drawing:
-    """A picture with a caption and words above it, and a note below."""
+    """A picture with a caption above it, and a note below."""
 
     picture: Markup
     note: str = ""
     caption: str = ""
-    words: str = ""
 
 
 @dataclass(frozen=True)
@@ -76,7 +74,6 @@ class Page:
 
 TIMES = "\N{MULTIPLICATION SIGN}"
 COSTS = "What a point of driving score costs"
-APART = "Where they part"
 
 
 def study_page(
@@ -143,10 +140,9 @@ def _sections(outcome: StudyResult) -> list[Section]:
         Drawing(front, caption=name if len(drawn) > 1 else "")
         for name, front in drawn.items()
     )
-    drawings[APART] = tuple(_contrast(each, baseline) for each in outcome.contrasts)
     # without a difference there is nothing to compare
     tables = dict(outcome.tables_by_section)
-    headings = [*tables, APART]
+    headings = list(tables)
     headings.insert(headings.index("Route by route"), COSTS)
     if gaps is None:
         tables["Paired differences"] = ()
@@ -154,10 +150,6 @@ def _sections(outcome: StudyResult) -> list[Section]:
         COSTS: "The line joins the variants that no other beats on both counts. Bars:"
         f" 95 % intervals of the driving score. Black: {baseline}. Where there are"
         f" many, only the front and {baseline} are named.",
-        APART: f"The front cameras of both, {baseline}'s above. From above: {baseline}"
-        " and its plan in grey; the other in blue, its plan in orange, with its"
-        " traffic; the route in pale blue; crosses mark infractions. A drive that was"
-        " over by then shows its last moment.",
     }
     return [
         Section(
@@ -191,24 +183,6 @@ def _lede(outcome: StudyResult) -> str:
         f"{said} {counted(driven, 'route')} cannot show a difference below {least:.1f}"
         " points of driving score."
     )
-
-
-def _contrast(contrast: Contrast, baseline: str) -> Drawing:
-    ends = []
-    for each in (contrast.route, contrast.other):
-        room = each.room_kept
-        kept = "" if room is None else f", room kept {room:.1f} %"
-        ends.append(f"driving score {each.driving_score:.1f}{kept}, {each.fate}")
-    variant, route = contrast.drive.variant, contrast.route
-    words = f"{baseline}, in grey: {ends[0]}; {variant}, in colour: {ends[1]}"
-    png = base64.b64encode(contrast.picture.read_bytes()).decode()
-    image = Markup('<img src="data:image/png;base64,{}" alt="{}">').format(png, words)
-    caption = (
-        f"{route.scenario}, {contrast.drive.condition}, "
-        f"{contrast.moment_us / 1e6:.1f} s into the route {route.route}; "
-        f"at most {contrast.apart.distance_m:.1f} m apart"
-    )
-    return Drawing(image, caption=caption, words=words)
 
 
 def findings(outcome: StudyResult) -> tuple[tuple[str, str], ...]:

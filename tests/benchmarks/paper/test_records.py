@@ -107,7 +107,7 @@ def test_a_study_that_was_driven_is_weighed_and_its_accident_kept(
     out = tmp_path / "out"
     with pytest.raises(StudyError, match="holds no records: drive the study first"):
         add_facts(study, out, (), SILENT)
-    run_study(study, out, Here(), pictures=0)
+    run_study(study, out, Here())
 
     add_facts(study, out, (), SILENT)
 

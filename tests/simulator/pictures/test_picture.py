@@ -12,11 +12,10 @@ from me2e_compress.simulator.camera_rig import CAMERA_NAMES
 from me2e_compress.simulator.pictures.route import (
     Moment,
     RoutePicture,
-    overlay,
     write_gif,
     write_png,
 )
-from me2e_compress.simulator.pictures.top_view import EGO, OTHER, PLAN, TRAIL
+from me2e_compress.simulator.pictures.top_view import EGO, PLAN, TRAIL
 from me2e_compress.simulator.scene import ActorKind, Event, EventKind, SignalState
 from tests.simulator.cameras import town
 
@@ -169,29 +168,3 @@ def test_two_infractions_at_one_place_are_both_named() -> None:
     again = picture(moment(0, red, replace(red, time_us=50_000)))
     assert two > one + 20
     assert count(above(again.frame(0)), mark) == one
-
-
-def test_an_overlay_shows_both_egos_and_both_cameras() -> None:
-    one, two = (
-        np.stack([np.full((96, 160, 3), shade, np.uint8) for _ in range(6)])
-        for shade in (40, 200)
-    )
-    drives = picture(moment(3, images=one)), picture(moment(9, images=two))
-
-    drawn = overlay(*drives)
-
-    view = drawn[:-64, 3 * 164 :]
-    assert count(view, EGO) > 20
-    assert count(view, OTHER) > 20
-    assert drawn[60, 80].tolist() == [200] * 3  # the other's camera is above
-    assert drawn[160, 80].tolist() == [40] * 3
-
-
-@pytest.mark.parametrize("far", [90, -60])
-def test_an_overlay_shows_more_where_the_other_is_far(far: int) -> None:
-    drives = [picture(moment(at), tile_width=640) for at in (0, far)]
-
-    view = overlay(*drives)[:-64, 3 * 644 :]
-
-    assert count(view, EGO) > 5
-    assert count(view, OTHER) > 5
