@@ -8,6 +8,7 @@ import numpy.typing as npt
 import onnx_ir as ir
 
 from me2e_compress import graph
+from me2e_compress.calibration.ranges import Ranges
 from me2e_compress.graph import provenance
 from me2e_compress.graph.modules import ModuleMap
 from me2e_compress.graph.provenance import Provenance
@@ -17,6 +18,7 @@ from me2e_compress.quantization.rules import RULE_SETS
 from me2e_compress.quantization.rules.rule_sets import PaperRules
 from me2e_compress.quantization.scheme import QuantScheme
 from me2e_compress.runtime.frames import Frame
+from me2e_compress.targets import TARGETS
 
 PAPER = PaperRules()
 """Rules under which graphs as small as these have int8: no kernel is asked."""
@@ -50,6 +52,9 @@ MODULES = ModuleMap.parse(
     """,
     "net",
 )
+
+
+FULL = QuantScheme.named("full", MODULES)
 
 
 def conv_attention(seed: int = 0) -> ir.Model:
@@ -86,6 +91,26 @@ def net(text: str, weights: Mapping[str, npt.NDArray[np.floating]]) -> ir.Model:
         provenance.stamp(node, Provenance(module, (name,)))
     graph.infer_shapes(model)
     return model
+
+
+def drawn(text: str, shapes: Mapping[str, tuple[int, ...]], seed: int = 0) -> ir.Model:
+    """Read a graph whose weights are normal numbers."""
+    generator = np.random.default_rng(seed)
+    return net(text, {n: generator.standard_normal(s) for n, s in shapes.items()})
+
+
+def placed(
+    model: ir.Model,
+    target: str = "tensorrt",
+    rules: str = "paper",
+    scheme: QuantScheme = FULL,
+    ends: tuple[float, float] = (-3.0, 3.0),
+) -> ir.Model:
+    """Place a plan, every tensor of one range."""
+    chosen = TARGETS.parse(target)
+    plan = make_plan(model, scheme, RULE_SETS.parse(rules))
+    ranges = dict.fromkeys(chosen.tensors(plan, model), ends)
+    return chosen.place(model, plan, Ranges(ranges, "max-min", 1, "", ""))
 
 
 def planned(model: ir.Model, rules: str = "safe") -> QuantPlan:

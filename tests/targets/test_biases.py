@@ -7,14 +7,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from me2e_compress import graph
-from me2e_compress.calibration.ranges import Ranges
 from me2e_compress.graph import producer_of
 from me2e_compress.graph.nodes import numbers_of
 from me2e_compress.quantization.decision import QuantPlan
 from me2e_compress.quantization.plan import make_plan
 from me2e_compress.quantization.rules import RULE_SETS
-from me2e_compress.quantization.scheme import QuantScheme
-from me2e_compress.targets import TARGETS
 from me2e_compress.targets.weights import (
     BIAS_MAX,
     QuantizedWeight,
@@ -27,7 +24,7 @@ from me2e_compress.targets.weights import (
     weights_of,
     with_room,
 )
-from tests.nets import MODULES, PAPER, net
+from tests.nets import FULL, drawn, net, placed
 from tests.profiles import scaled
 
 DEAD = """
@@ -68,11 +65,8 @@ def dead(seed: int, faint: float) -> ir.Model:
     return net(DEAD, weights)
 
 
-def placed(model: ir.Model, target: str) -> ir.Model:
-    plan = make_plan(model, QuantScheme.named("full", MODULES), PAPER)
-    runtime = TARGETS.parse(target)
-    ranges = dict.fromkeys(runtime.tensors(plan, model), (-3.0, 2.0))
-    return runtime.place(model, plan, Ranges(ranges, "max-min", 1, "", ""))
+def in_int8(model: ir.Model) -> ir.Model:
+    return placed(model, ends=(-3.0, 2.0))
 
 
 def counts(model: ir.Model) -> list[float]:
@@ -95,7 +89,7 @@ def counts(model: ir.Model) -> list[float]:
 @settings(max_examples=scaled(40))
 @given(seed=st.integers(0, 2**32 - 1), exponent=st.floats(-14, 0))
 def test_no_bias_of_a_placed_graph_wraps(seed: int, exponent: float) -> None:
-    model = placed(dead(seed, 10.0**exponent), "tensorrt")
+    model = in_int8(dead(seed, 10.0**exponent))
 
     steps = counts(model)
 
@@ -104,7 +98,7 @@ def test_no_bias_of_a_placed_graph_wraps(seed: int, exponent: float) -> None:
 
 
 def test_only_the_channel_that_needs_it_changes() -> None:
-    source, model = dead(0, 1e-12), placed(dead(0, 1e-12), "tensorrt")
+    source, model = dead(0, 1e-12), in_int8(dead(0, 1e-12))
     for name, axis in AXES.items():
         weight = graph.array_of(source.graph.initializers[name])
         assert weight is not None
@@ -198,7 +192,7 @@ def test_a_float16_graph_has_no_scale_of_zero(faint: float) -> None:
     for node in model.graph:
         node.outputs[0].type = ir.TensorType(ir.DataType.FLOAT16)
 
-    made = placed(model, "tensorrt")
+    made = in_int8(model)
 
     for name, axis in AXES.items():
         weight, scales, integers = (
@@ -232,14 +226,11 @@ LOOSE = "safe{without=[small-product,narrow-convolution]}"
 
 
 def made(reads: str = "u") -> ir.Model:
-    random = np.random.default_rng(0)
-    shapes = {"w": (16, 16, 3, 3), "v": (16, 16), "u": (16, 16)}
-    return net(NET % reads, {n: random.normal(size=s) for n, s in shapes.items()})
+    return drawn(NET % reads, {"w": (16, 16, 3, 3), "v": (16, 16), "u": (16, 16)})
 
 
 def stored(model: ir.Model, rules: str) -> tuple[QuantPlan, dict[str, QuantizedWeight]]:
-    scheme = QuantScheme.named("full", MODULES)
-    plan = make_plan(model, scheme, RULE_SETS.parse(rules))
+    plan = make_plan(model, FULL, RULE_SETS.parse(rules))
     return plan, weights_of(model, plan.chosen, balanced=plan.balanced)
 
 
@@ -329,10 +320,8 @@ def test_the_paper_rounds_to_nearest(rules: str) -> None:
 def test_targets_round_as_the_plan_says(target: str, rules: str) -> None:
     model = made()
     plan, found = stored(model, rules)
-    runtime = TARGETS.parse(target)
-    tensors = dict.fromkeys(runtime.tensors(plan, model), (-3.0, 3.0))
-    placed = runtime.place(model, plan, Ranges(tensors, "max-min", 1, "", ""))
-    arrays = map(graph.array_of, placed.graph.initializers.values())
+    small = placed(model, target, rules)
+    arrays = map(graph.array_of, small.graph.initializers.values())
     (filters,) = (a for a in arrays if a is not None and a.shape == (16, 16, 3, 3))
     assert (filters == found["c"].integers).all()
     assert bool((filters != nearest(model, "c")).any()) == plan.balanced

@@ -15,15 +15,13 @@ from me2e_compress.calibration.calibrator import Calibrator
 from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.calibration.ranges import Ranges
 from me2e_compress.quantization.plan import make_plan
-from me2e_compress.quantization.scheme import QuantScheme
 from me2e_compress.runtime.session import Session
 from me2e_compress.targets.onnxruntime import OnnxRuntime
 from tests.frames import record
-from tests.nets import MODULES, PAPER, net
+from tests.nets import FULL, PAPER, drawn, placed
 
 Floats = npt.NDArray[np.float32]
 Feeds = Mapping[str, Floats]
-FULL = QuantScheme.named("full", MODULES)
 
 BLOCK = """
 block (float[1,4,16,16] x, float[8,4,3,3] w1, float[8] b1, float[8,8,1,1] w2,
@@ -80,11 +78,6 @@ m (float[2,6,8] x) => (float[2,6,8] y)
 """A layer that is int8 in the file, and that onnxruntime runs in float."""
 
 
-def drawn(text: str, shapes: dict[str, tuple[int, ...]], seed: int = 0) -> ir.Model:
-    generator = np.random.default_rng(seed)
-    return net(text, {n: generator.standard_normal(s) for n, s in shapes.items()})
-
-
 def feeds(seed: int, **shapes: tuple[int, ...]) -> Feeds:
     generator = np.random.default_rng(seed)
     return {
@@ -107,9 +100,7 @@ TOKENS = feeds(1, x=(2, 12, 8), t=(6, 5))
 
 def lowered(model: ir.Model, reach: float = 3.0) -> ir.Model:
     """Lower with one range for all."""
-    plan = make_plan(model, FULL, PAPER)
-    ends = dict.fromkeys(OnnxRuntime().tensors(plan, model), (-reach, reach))
-    return OnnxRuntime().place(model, plan, Ranges(ends, "max-min", 1, "", ""))
+    return placed(model, "onnxruntime", ends=(-reach, reach))
 
 
 def measured(model: ir.Model, tensors: tuple[str, ...], feeds: Feeds) -> Ranges:

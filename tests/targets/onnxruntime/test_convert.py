@@ -8,15 +8,13 @@ from me2e_compress.errors import PreconditionError
 from me2e_compress.quantization.plan import make_plan
 from me2e_compress.targets.onnxruntime import convert, unranged
 from me2e_compress.targets.tensorrt import TensorRT
-from tests.nets import PAPER, conv_attention
+from tests.nets import FULL, PAPER, conv_attention, drawn
 from tests.targets.onnxruntime.lowered import (
-    FULL,
     IMAGE,
     TOKENS,
     Feeds,
     block,
     calibrated,
-    drawn,
     feeds,
     kernels,
     linear,

@@ -14,8 +14,8 @@ from me2e_compress.quantization.rules import RULE_SETS
 from me2e_compress.quantization.scheme import QuantScheme
 from me2e_compress.runtime.optimized import optimized
 from me2e_compress.targets.onnxruntime import OnnxRuntime
-from tests.nets import MODULES, net
-from tests.targets.onnxruntime.lowered import FULL, Feeds, feeds, measured, ran, sqnr_db
+from tests.nets import FULL, MODULES, drawn, net
+from tests.targets.onnxruntime.lowered import Feeds, feeds, measured, ran, sqnr_db
 
 HEAD = QuantScheme.of(("head",), MODULES)
 
@@ -182,17 +182,14 @@ net (float[1,3,4,6] x, float[12,3,3,3] w1, float[12,12,3,3] w2, float[1,50,5,1,2
 
 def attention(rows: int = 63, queries: int = 50) -> ir.Model:
     text = ATTENTION.replace("ROWS", str(rows)).replace("QUERIES", str(queries))
-    random = np.random.default_rng(0)
-    return net(text, {"w": random.normal(size=(24, 24)), "b": random.normal(size=24)})
+    return drawn(text, {"w": (24, 24), "b": (24,)})
 
 
 def aggregation() -> ir.Model:
-    random = np.random.default_rng(0)
-    shapes = {"w1": (12, 3, 3, 3), "w2": (12, 12, 3, 3)}
-    return net(AGGREGATION, {n: random.normal(size=s) for n, s in shapes.items()})
+    return drawn(AGGREGATION, {"w1": (12, 3, 3, 3), "w2": (12, 12, 3, 3)})
 
 
-def drawn(model: ir.Model) -> Feeds:
+def fed_to(model: ir.Model) -> Feeds:
     shapes = {
         str(value.name): tuple(value.shape.numpy())
         for value in model.graph.inputs
@@ -214,7 +211,7 @@ def priced(model: ir.Model, rules: str) -> QuantPlan:
 
 def quantized(model: ir.Model) -> ir.Model:
     plan = priced(model, ALL)
-    ranges = measured(model, OnnxRuntime().tensors(plan, model), drawn(model))
+    ranges = measured(model, OnnxRuntime().tensors(plan, model), fed_to(model))
     return OnnxRuntime().place(model, plan, ranges)
 
 
@@ -242,7 +239,7 @@ def test_positions_and_weights_stay_float(make: Callable[[], ir.Model]) -> None:
     model = make()
     small = quantized(model)
     node = next(each for each in small.graph if each.domain == "me2e")
-    fed = drawn(model)
+    fed = fed_to(model)
 
     want, got = ran(model, fed), ran(small, fed)
 

@@ -6,14 +6,11 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from me2e_compress.calibration.ranges import Ranges
 from me2e_compress.graph import array_of
-from me2e_compress.quantization.plan import make_plan
-from me2e_compress.quantization.scheme import QuantScheme
 from me2e_compress.runtime.optimized import optimized
 from me2e_compress.runtime.session import Session
 from me2e_compress.targets.onnxruntime import OnnxRuntime, int8_layers, int8_rewrites
-from tests.nets import MODULES, PAPER, net
+from tests.nets import net, placed
 from tests.profiles import scaled
 from tests.targets.onnxruntime.rewritten import SIZE, STEP, Drawn
 
@@ -161,17 +158,13 @@ def test_a_layer_that_stays_float_keeps_its_weight(bias: str) -> None:
     weights = {name: random.normal(0, 0.3, size) for name, size in sizes.items()}
     # one scale in all leaves little of the other channels
     weights["t"][:, 0] *= 300
-    model = net(UP % bias, weights)
-    plan = make_plan(model, QuantScheme.named("full", MODULES), PAPER)
-    target = OnnxRuntime()
-    ranges = dict.fromkeys(target.tensors(plan, model), (-3.0, 3.0))
 
-    placed = target.place(model, plan, Ranges(ranges, "max-min", 1, "", ""))
+    small = placed(net(UP % bias, weights), "onnxruntime")
 
-    assert [each.op_type for each in int8_layers(placed)] == ["Conv", "Conv"]
-    assert not list(int8_rewrites(placed))
-    assert "Sum" in [node.op_type for node in placed.graph]
-    (up,) = (n for n in optimized(placed).graph if n.op_type == "ConvTranspose")
+    assert [each.op_type for each in int8_layers(small)] == ["Conv", "Conv"]
+    assert not list(int8_rewrites(small))
+    assert "Sum" in [node.op_type for node in small.graph]
+    (up,) = (n for n in optimized(small).graph if n.op_type == "ConvTranspose")
     assert up.inputs[1] is not None
     assert array_of(up.inputs[1]) is not None  # not behind a DequantizeLinear
 

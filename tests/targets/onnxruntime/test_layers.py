@@ -17,12 +17,10 @@ from me2e_compress.targets.onnxruntime.lower import (
 )
 from me2e_compress.targets.weights import QuantizedWeight
 from me2e_compress.targets.writer import Writer
-from tests.nets import net
+from tests.nets import FULL, drawn, net
 from tests.profiles import scaled
 from tests.targets.onnxruntime.lowered import (
-    FULL,
     calibrated,
-    drawn,
     feeds,
     kernels,
     linear,

@@ -1,12 +1,8 @@
 import numpy as np
 import pytest
 
-from me2e_compress.calibration.ranges import Ranges
-from me2e_compress.quantization.plan import make_plan
-from me2e_compress.quantization.scheme import QuantScheme
-from me2e_compress.targets import TARGETS
 from me2e_compress.targets.onnxruntime import OnnxRuntime
-from tests.nets import MODULES, PAPER, net, parsed
+from tests.nets import net, parsed, placed
 
 LAYER = """
 m (float[1,1,4,4] x, %(kind)s[1,1,4,4] ignored) => (float[1,1,4,4] y)
@@ -91,13 +87,8 @@ def test_a_float_convolution_behind_an_int8_one_needs_no_answer() -> None:
     }
     """
     model = net(text, {"w": np.ones((8, 8, 1, 1)), "t": np.ones((8, 8, 2, 2))})
-    plan = make_plan(model, QuantScheme.named("full", MODULES), PAPER)
-    target = TARGETS.parse("onnxruntime")
-    ranges = dict.fromkeys(target.tensors(plan, model), (-3.0, 3.0))
 
-    placed = target.place(model, plan, Ranges(ranges, "max-min", 1, "", ""))
-
-    assert OnnxRuntime().lint(placed) == ()
+    assert OnnxRuntime().lint(placed(model, "onnxruntime")) == ()
 
 
 @pytest.mark.parametrize(

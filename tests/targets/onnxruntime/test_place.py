@@ -9,14 +9,12 @@ from me2e_compress.errors import FramesError
 from me2e_compress.graph import provenance
 from me2e_compress.quantization.plan import make_plan
 from me2e_compress.targets.onnxruntime import OnnxRuntime, int8_layers
-from tests.nets import PAPER, conv_attention, net
+from tests.nets import FULL, PAPER, conv_attention, drawn
 from tests.targets.onnxruntime.lowered import (
-    FULL,
     IMAGE,
     TOKENS,
     block,
     calibrated,
-    drawn,
     feeds,
     kernels,
     linear,
@@ -217,12 +215,10 @@ FED = feeds(3, fine=(1, 4, 8, 8), coarse=(1, 4, 4, 4))
 
 
 def neck(merge: str, mode: str = "nearest", channels: int = 6) -> ir.Model:
-    generator = np.random.default_rng(0)
     shapes = {"w1": (6, 4, 1, 1), "w2": (6, 4, 1, 1), "w3": (6, channels, 3, 3)}
     text = NECK.replace("MERGE", merge).replace('nearest", c', f'{mode}", c')
     text = text.replace("float[6,6,3,3]", f"float[6,{channels},3,3]")
-    weights = {name: generator.standard_normal(size) for name, size in shapes.items()}
-    return net(text, weights)
+    return drawn(text, shapes)
 
 
 @pytest.mark.parametrize(
@@ -276,10 +272,8 @@ body (float[1,4,8,8] fine, float[6,4,1,1] w1, float[6,6,1,1] w2)
 
 
 def test_a_relu_in_a_body_is_no_part_of_the_convolution_before_it() -> None:
-    generator = np.random.default_rng(0)
-    shapes = {"w1": (6, 4, 1, 1), "w2": (6, 6, 1, 1)}
-    weights = {name: generator.standard_normal(size) for name, size in shapes.items()}
-    model, fed = net(BODY, weights), feeds(3, fine=(1, 4, 8, 8))
+    model = drawn(BODY, {"w1": (6, 4, 1, 1), "w2": (6, 6, 1, 1)})
+    fed = feeds(3, fine=(1, 4, 8, 8))
 
     assert OnnxRuntime().tensors(make_plan(model, FULL, PAPER), model) == (
         "fine",
@@ -299,10 +293,7 @@ def test_a_bias_in_a_body_is_none_of_the_product_before_it() -> None:
                        else_branch = other () => (float[4,6] e) { e = MatMul(x, w) }>
     }
     """
-    generator = np.random.default_rng(1)
-    weights = {"w": generator.standard_normal((8, 6)), "b": np.ones(6)}
-
-    found = lowered(net(text, weights), 4.0)
+    found = lowered(drawn(text, {"w": (8, 6), "b": (6,)}), 4.0)
 
     assert [n.op_type for n in found.graph if n.op_type in ("Gemm", "MatMul")] == [
         "MatMul"

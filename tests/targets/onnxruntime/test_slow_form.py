@@ -14,22 +14,17 @@ from onnxruntime.quantization import (
 )
 
 from me2e_compress import graph
-from me2e_compress.calibration.ranges import Ranges
-from me2e_compress.quantization.plan import make_plan
-from me2e_compress.quantization.scheme import QuantScheme
 from me2e_compress.runtime.providers import (
     CpuProvider,
     CudaProvider,
     TensorRtProvider,
     TensorRtRtxProvider,
 )
-from me2e_compress.targets import TARGETS
 from me2e_compress.targets.onnxruntime import OnnxRuntime, slow_here
-from tests.nets import MODULES, PAPER, conv_attention, parsed, save_text
+from tests.nets import conv_attention, drawn, parsed, placed, save_text
 from tests.targets.onnxruntime.lowered import (
     MATMUL_RELU,
     calibrated,
-    drawn,
     feeds,
     kernels,
     ran,
@@ -289,14 +284,9 @@ def test_what_is_placed_for_the_cpu_is_not_slow_there(
     target: str, is_slow: bool
 ) -> None:
     model = conv_attention()
-    plan = make_plan(model, QuantScheme.named("full", MODULES), PAPER)
-    place = TARGETS.parse(target)
-    ranges = dict.fromkeys(place.tensors(plan, model), (-3.0, 3.0))
-
-    placed = place.place(model, plan, Ranges(ranges, "max-min", 1, "", ""))
 
     assert slow_here(model) is None
-    assert (slow_here(placed) is not None) == is_slow
+    assert (slow_here(placed(model, target)) is not None) == is_slow
 
 
 class Drawn(CalibrationDataReader):  # type: ignore[misc]

@@ -1,9 +1,8 @@
 """One layer of each kind that has int8."""
 
-import numpy as np
 import onnx_ir as ir
 
-from tests.nets import net
+from tests.nets import drawn
 
 LAYERS = """
 <ir_version: 9, opset_import: ["" : %d]>
@@ -24,6 +23,4 @@ SHAPES = {
 
 
 def layers(seed: int = 0, opset: int = 17) -> ir.Model:
-    generator = np.random.default_rng(seed)
-    weights = {name: generator.standard_normal(s) for name, s in SHAPES.items()}
-    return net(LAYERS % opset, weights)
+    return drawn(LAYERS % opset, SHAPES, seed)

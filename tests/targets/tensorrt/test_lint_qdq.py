@@ -8,16 +8,11 @@ import onnx_ir as ir
 import pytest
 from onnx import TensorProto, helper, numpy_helper
 
-from me2e_compress.calibration.ranges import Ranges
 from me2e_compress.graph import rewrite
-from me2e_compress.quantization.plan import make_plan, tensors_of
-from me2e_compress.quantization.rules import RULE_SETS
-from me2e_compress.quantization.scheme import QuantScheme
 from me2e_compress.targets import LintFinding
 from me2e_compress.targets.tensorrt import TensorRT
-from tests.nets import MODULES, conv_attention, net, parsed
+from tests.nets import conv_attention, net, parsed, placed
 
-FULL = QuantScheme.named("full", MODULES)
 RUNTIME = TensorRT(version="10.7")
 
 
@@ -30,16 +25,9 @@ def shown(finding: LintFinding) -> tuple[str, str, str]:
     return finding.severity, finding.rule, finding.message
 
 
-def placed(rules: str) -> ir.Model:
-    model = conv_attention()
-    plan = make_plan(model, FULL, RULE_SETS.parse(rules))
-    tensors = dict.fromkeys(tensors_of(plan, model), (-3.0, 3.0))
-    return TensorRT().place(model, plan, Ranges(tensors, "max-min", 1, "", ""))
-
-
 @pytest.mark.parametrize("rules", ["paper", "safe"])
 def test_what_we_place_has_no_findings(rules: str) -> None:
-    assert RUNTIME.lint(placed(rules)) == ()
+    assert RUNTIME.lint(placed(conv_attention(), rules=rules)) == ()
 
 
 def _scale(value: float) -> Callable[[ir.Model], None]:
@@ -128,7 +116,7 @@ def _dequantize(model: ir.Model, integers: str) -> ir.Node:
 def test_what_is_broken_is_found(
     change: Callable[[ir.Model], None], rule: str, message: str
 ) -> None:
-    model = placed("paper")
+    model = placed(conv_attention())
     change(model)
 
     ours = [each for each in RUNTIME.lint(model) if each.rule == rule]

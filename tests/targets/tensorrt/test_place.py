@@ -19,20 +19,17 @@ from me2e_compress.quantization.scheme import QuantScheme
 from me2e_compress.runtime.session import Session, run_once
 from me2e_compress.targets.tensorrt import TensorRT
 from me2e_compress.targets.tensorrt.rtx_check import check
-from tests.nets import MODULES, PAPER, conv_attention, net
+from tests import nets
+from tests.nets import FULL, MODULES, conv_attention, drawn, net
 from tests.profiles import scaled
 from tests.targets.tensorrt.layers import SHAPES, layers
-
-FULL = QuantScheme.named("full", MODULES)
 
 PARTS = ("int8", "scale", "zero")
 AXES = {"conv": 0, "up": 1, "right": 1, "turned": 0}
 
 
 def placed(model: ir.Model, reach: float = 3.0) -> ir.Model:
-    plan = make_plan(model, FULL, PAPER)
-    tensors = dict.fromkeys(tensors_of(plan, model), (-reach, reach / 2))
-    return TensorRT().place(model, plan, Ranges(tensors, "max-min", 1, "", ""))
+    return nets.placed(model, ends=(-reach, reach / 2))
 
 
 def test_weights_are_stored_as_int8_along_their_channels() -> None:
@@ -207,9 +204,8 @@ batched (float[3,4,32] x, float[2,32] t, float[1,32,16] one, float[3,32,16] many
 
 
 def batched() -> ir.Model:
-    generator = np.random.default_rng(5)
     shapes = {"one": (1, 32, 16), "many": (3, 32, 16), "lends": (1, 32, 8)}
-    return net(BATCHED, {n: generator.standard_normal(s) for n, s in shapes.items()})
+    return drawn(BATCHED, shapes, 5)
 
 
 def test_one_matrix_has_scales_by_column_and_a_batch_of_them_one_scale() -> None:
@@ -252,9 +248,8 @@ tied (float[8,8] x, float[8,8] w) => (float[8,8] y) {
 
 
 def test_what_is_new_is_called_like_nothing_that_is_there() -> None:
-    weights = {"w": np.random.default_rng(7).standard_normal((8, 8))}
     x = np.random.default_rng(8).standard_normal((8, 8)).astype(np.float32)
-    model = net(TIED, weights)
+    model = drawn(TIED, {"w": (8, 8)}, 7)
 
     result = placed(model, reach=12)
 

@@ -7,13 +7,11 @@ import onnx_ir as ir
 import pytest
 
 from me2e_compress import graph
-from me2e_compress.calibration.ranges import Ranges
 from me2e_compress.errors import MissingExtraError, PreconditionError, RecipeError
 from me2e_compress.graph.modules import map_of
 from me2e_compress.manager import PassManager, recipe
 from me2e_compress.passes import Context
-from me2e_compress.quantization.decision import stamp_plan
-from me2e_compress.quantization.plan import make_plan, tensors_of
+from me2e_compress.quantization.plan import make_plan, stamp_plan
 from me2e_compress.quantization.rules import RULE_SETS
 from me2e_compress.quantization.scheme import QuantScheme
 from me2e_compress.shipped.drivers import shipped
@@ -25,7 +23,7 @@ from me2e_compress.targets.tensorrt.rtx_check import (
     read_kernels,
     without_int8,
 )
-from tests.nets import MODULES, PAPER, conv_attention, net, parsed
+from tests.nets import FULL, PAPER, conv_attention, net, parsed, placed
 from tests.targets.tensorrt.layers import layers
 
 RTX = pytest.mark.skipif(
@@ -33,12 +31,13 @@ RTX = pytest.mark.skipif(
 )
 
 
-def quantized(model: ir.Model) -> ir.Model:
-    plan = make_plan(model, QuantScheme.named("full", MODULES), PAPER)
-    ranges = dict.fromkeys(tensors_of(plan, model), (-3.0, 3.0))
-    placed = TensorRT().place(model, plan, Ranges(ranges, "max-min", 1, "", ""))
-    stamp_plan(placed, plan)
-    return placed
+def quantized(
+    model: ir.Model, scheme: QuantScheme = FULL, rules: str = "paper"
+) -> ir.Model:
+    """Place int8; what is built does not hang on the values of the scales."""
+    small = placed(model, rules=rules, scheme=scheme)
+    stamp_plan(small, make_plan(model, scheme, RULE_SETS.parse(rules)))
+    return small
 
 
 @RTX
@@ -83,8 +82,7 @@ def test_a_float_graph_has_no_int8_kernel() -> None:
 @RTX
 def test_a_plan_that_the_graph_does_not_keep_is_found_out() -> None:
     model = conv_attention()
-    plan = make_plan(model, QuantScheme.named("full", MODULES), PAPER)
-    stamp_plan(model, plan)
+    stamp_plan(model, make_plan(model, FULL, PAPER))
 
     found = check(model)
 
@@ -249,13 +247,7 @@ def driver() -> ir.Model:
 
 
 def driver_in_int8(model: ir.Model, scheme: str, rules: str) -> ir.Model:
-    """Place int8; what is built does not hang on the values of the scales."""
-    chosen = QuantScheme.named(scheme, map_of(model, None))
-    plan = make_plan(model, chosen, RULE_SETS.parse(rules))
-    ranges = dict.fromkeys(tensors_of(plan, model), (-3.0, 3.0))
-    placed = TensorRT().place(model, plan, Ranges(ranges, "max-min", 1, "", ""))
-    stamp_plan(placed, plan)
-    return placed
+    return quantized(model, QuantScheme.named(scheme, map_of(model, None)), rules)
 
 
 @pytest.mark.parametrize("rules", ["safe", "paper"])
@@ -263,16 +255,14 @@ def driver_in_int8(model: ir.Model, scheme: str, rules: str) -> ir.Model:
 def test_every_scheme_passes_the_lint(
     driver: ir.Model, scheme: str, rules: str
 ) -> None:
-    placed = driver_in_int8(driver, scheme, rules)
+    small = driver_in_int8(driver, scheme, rules)
 
-    assert TensorRT(version="10.7").lint(placed) == ()
-    assert any(node.op_type == "QuantizeLinear" for node in placed.graph)
+    assert TensorRT(version="10.7").lint(small) == ()
+    assert any(node.op_type == "QuantizeLinear" for node in small.graph)
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(
-    importlib.util.find_spec("tensorrt_rtx") is None, reason="extra trt-check"
-)
+@RTX
 @pytest.mark.parametrize("scheme", SCHEMES)
 def test_every_scheme_is_built_with_int8_convolutions(
     driver: ir.Model, scheme: str
