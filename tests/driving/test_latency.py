@@ -71,6 +71,7 @@ def test_a_trace_is_drawn_by_seed_and_route(trace: Path) -> None:
     assert first == charges(source, "a")
     assert first != charges(source, "b")
     assert first != charges(parse_latency(f"trace:{trace}", seed=2), "a")
+    assert parse_latency("fps:10", seed=3) == FrameRate(10.0)  # draws nothing
 
 
 @pytest.mark.parametrize("in_order", [False, True])
@@ -126,10 +127,6 @@ def test_other_words_are_refused_on_one_line(text: str, words: str) -> None:
     with pytest.raises(EvaluationError, match=words) as caught:
         parse_latency(text)
     assert "\n" not in str(caught.value)
-
-
-def test_a_seed_is_of_everything_and_harms_no_source_without() -> None:
-    assert parse_latency("fps:10", seed=3) == FrameRate(10.0)
 
 
 def test_a_trace_comes_back_and_its_percentiles_are_samples(trace: Path) -> None:
@@ -226,12 +223,13 @@ def test_a_host_stage_is_charged_for_what_it_did() -> None:
 @pytest.mark.parametrize(
     "text",
     [
+        *("none", "fps:10", "fixed:3", "measured"),
         "limited{source=fps:20, fps=10}",
         "agents{source=limited{source=measured, fps=30}, per_agent_us=3000}",
         "host-stage{source=none, per_iteration_us=5}",
     ],
 )
-def test_layers_have_the_form_of_a_latency_source(text: str) -> None:
+def test_ours_have_the_form_of_a_latency_source(text: str) -> None:
     check_form(LATENCY_SOURCES.parse(text), LATENCY_SOURCES)
 
 

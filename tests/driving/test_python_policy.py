@@ -46,7 +46,9 @@ def write(
     return written
 
 
-def test_a_function_of_the_working_folder_makes_a_policy(write: Write) -> None:
+def test_a_function_of_the_working_folder_makes_a_policy_or_a_driver(
+    write: Write,
+) -> None:
     module = write(BLIND)
 
     driver = driver_named(f"{module}:make")
@@ -54,12 +56,7 @@ def test_a_function_of_the_working_folder_makes_a_policy(write: Write) -> None:
     assert driver == PythonDriver(f"{module}:make")
     assert driver.label == f"{module}:make"
     assert driver.open() == Blind(5.0)
-
-
-def test_it_keeps_the_contract_and_a_driver_is_opened(write: Write) -> None:
-    module = write(BLIND)
-
-    assert len(check_policy(driver_named(f"{module}:make"))) == 8
+    assert len(check_policy(driver)) == 8
     assert driver_named(f"{module}:driver").open() == Blind(6.0)
 
 

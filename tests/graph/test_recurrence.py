@@ -31,21 +31,19 @@ def test_a_pair_in_the_metadata_leaves_the_naming_rule_to_the_others() -> None:
     assert found == {"prev_bev": "bev_embed", **named}
 
 
-def test_prev_x_is_answered_by_next_x() -> None:
-    assert pairs("img prev_bev", "plan next_bev") == {"prev_bev": "next_bev"}
-
-
-def test_x_out_comes_before_next_x() -> None:
-    found = pairs("prev_bev", "next_bev prev_bev_out")
-    assert found == {"prev_bev": "prev_bev_out"}
-
-
-def test_metadata_s_null_keeps_an_input_from_being_fed_back() -> None:
-    assert pairs("a b", "a_out b_out", '{"a": null}') == {"b": "b_out"}
-
-
-def test_an_output_is_fed_back_once() -> None:
-    assert pairs("a b", "b_out", '{"a": "b_out"}') == {"a": "b_out"}
+@pytest.mark.parametrize(
+    ("inputs", "outputs", "metadata", "found"),
+    [
+        ("img prev_bev", "plan next_bev", None, {"prev_bev": "next_bev"}),
+        ("prev_bev", "next_bev prev_bev_out", None, {"prev_bev": "prev_bev_out"}),
+        ("a b", "a_out b_out", '{"a": null}', {"b": "b_out"}),
+        ("a b", "b_out", '{"a": "b_out"}', {"a": "b_out"}),  # an output answers once
+    ],
+)
+def test_names_and_metadata_say_what_is_fed_back(
+    inputs: str, outputs: str, metadata: str | None, found: dict[str, str]
+) -> None:
+    assert pairs(inputs, outputs, metadata) == found
 
 
 def test_ports_that_do_not_fit_are_named_with_what_they_are() -> None:

@@ -75,12 +75,14 @@ def test_a_collision_leaves_the_driving_score_alone() -> None:
     assert found.routes["a"] == pytest.approx([100 / 8, 100 / 4])
 
 
-def test_smallest_and_largest_of_all_routes_are_the_scale() -> None:
-    scale = eer(BY_HAND).scale
+def test_the_scale_is_of_all_routes_and_used_again_on_another_variant() -> None:
+    found = eer(BY_HAND)
 
-    assert scale is not None
-    assert (scale.offset, scale.span) == (EQUAL.offset, EQUAL.span)
-    assert sum(scale.weights) == pytest.approx(1.0)
+    assert found.scale is not None
+    assert (found.scale.offset, found.scale.span) == (EQUAL.offset, EQUAL.span)
+    assert sum(found.scale.weights) == pytest.approx(1.0)
+    alone = eer({"b": BY_HAND["b"]}, found.scale)
+    assert alone.routes["b"] == pytest.approx(found.routes["b"])
 
 
 def test_weights_come_from_critic_over_routes_and_variants() -> None:
@@ -91,14 +93,6 @@ def test_weights_come_from_critic_over_routes_and_variants() -> None:
     x = np.array([[1, 1 / 3, 1, 0], [0.5, 0, 1, 0], [1, 0.5, 0.5, 0], [1, 1, 0, 0]])
     content = x.std(axis=1) * (1 - np.abs(np.corrcoef(x))).sum(axis=1)
     assert found == pytest.approx(content / content.sum())
-
-
-def test_a_scale_is_used_again_on_another_variant() -> None:
-    scale = eer(BY_HAND).scale
-
-    alone = eer({"b": BY_HAND["b"]}, scale)
-
-    assert alone.routes["b"] == pytest.approx(eer(BY_HAND).routes["b"])
 
 
 @pytest.mark.parametrize("measure", range(4))

@@ -56,19 +56,6 @@ def test_means_over_the_routes_that_were_driven() -> None:
     assert [scores.each_ability[name].n for name in ABILITIES] == [1, 2, 1, 1, 1]
 
 
-def test_a_partial_set_is_said_so_and_never_divided_by_220() -> None:
-    scores = score(SET)
-
-    assert scores.partial
-    assert scores.to_json()["routes"] == {
-        "driven": 5,
-        "expected": 220,
-        "partial": True,
-        "failed": 0,
-    }
-    assert not score(SET, expected=5).partial
-
-
 def test_an_ability_that_was_not_driven_is_not_zero() -> None:
     scores = score(SET[:2])
 
@@ -79,13 +66,16 @@ def test_an_ability_that_was_not_driven_is_not_zero() -> None:
     assert scores.each_ability["Give_Way"].value is None
 
 
-def test_json_has_value_low_high_and_n_for_each_score() -> None:
+def test_json_has_value_low_high_and_n_for_each_score_and_says_a_partial_set() -> None:
     record = score(SET).to_json()
 
     for key in ("driving_score", "success_rate", "efficiency", "comfort", "abilities"):
         assert {"value", "low", "high", "n"} <= set(record[key])
     assert set(record["abilities"]["each"]) == set(ABILITIES)
     assert set(record["bench2drive"]) == {"efficiency", "smoothness"}
+    counted = {"driven": 5, "expected": 220, "partial": True, "failed": 0}
+    assert record["routes"] == counted
+    assert not score(SET, expected=5).partial
 
 
 def test_the_order_of_the_routes_changes_no_mean_and_without_any_there_is_none() -> (
@@ -241,10 +231,7 @@ def test_percentiles_and_the_share_over_budget() -> None:
         "critical_mean_ms": None,
         "other_mean_ms": None,
     }
-
-
-def test_exactly_the_budget_is_in_time() -> None:
-    assert deadlines([50_000, 50_001]).over_percent.value == 50.0
+    assert deadlines([50_000, 50_001]).over_percent.value == 50.0  # in time
 
 
 def test_a_percentile_of_too_few_is_not_measured() -> None:
@@ -305,9 +292,5 @@ def test_a_tail_in_critical_frames_shows() -> None:
         "mean, TTC below 1.5 s",
         "mean, other frames",
     ]
-
-
-def test_decisions_that_cost_nothing_have_no_deadlines() -> None:
     free = replace(drive(), decisions=(InferenceRecord(0, 0),))
-
-    assert charged([free]) is None
+    assert charged([free]) is None  # decisions that cost nothing

@@ -43,48 +43,38 @@ def test_no_such_target() -> None:
 HEAD = '<ir_version: 9, opset_import: ["" : 17, "com.microsoft" : 1]>\n'
 
 
-def read(text: str) -> ir.Model:
-    return ir.from_onnx_text(HEAD + text)
-
-
-def test_a_float_graph_is_not() -> None:
-    model = read("m (float[2] x) => (float[2] y) { y = Relu(x) }")
-
-    assert describe_quantized(model) is None
+VECTOR = "m (float[2] x) => (float[2] y)"
+PAIR = "{ q = QuantizeLinear(x, s%s) y = DequantizeLinear(q, s%s) }"
+COUNTED = "1 DequantizeLinear, 1 QuantizeLinear; "
 
 
 @pytest.mark.parametrize(
-    ("zero", "grid"),
+    ("text", "said"),
     [
-        ("int8 z = {0}", "int8 with zero points 0"),
-        ("uint8 z = {128}", "uint8 with zero points that are not 0"),
+        (f"{VECTOR} {{ y = Relu(x) }}", None),
+        (
+            f"{VECTOR} <float s = {{0.5}}, int8 z = {{0}}> {PAIR % (', z', ', z')}",
+            f"{COUNTED}int8 with zero points 0; made by onnx.quantize",
+        ),
+        (
+            f"{VECTOR} <float s = {{0.5}}, uint8 z = {{128}}> {PAIR % (', z', ', z')}",
+            f"{COUNTED}uint8 with zero points that are not 0; made by onnx.quantize",
+        ),
+        (
+            f"{VECTOR} <float s = {{0.5}}> {PAIR % ('', '')}",
+            f"{COUNTED}uint8 with zero points 0; made by onnx.quantize",
+        ),
+        (  # an integer operator of a runtime
+            "m (float[2,2] x, int8[2,2] w, float s) => (float[2,2] y)"
+            " { y = com.microsoft.DynamicQuantizeMatMul(x, w, s) }",
+            "1 DynamicQuantizeMatMul; made by onnx.quantize",
+        ),
     ],
 )
-def test_pairs_say_their_grid(zero: str, grid: str) -> None:
-    model = read(
-        f"m (float[2] x) => (float[2] y) <float s = {{0.5}}, {zero}>"
-        " { q = QuantizeLinear(x, s, z) y = DequantizeLinear(q, s, z) }"
-    )
-    assert describe_quantized(model) == (
-        f"1 DequantizeLinear, 1 QuantizeLinear; {grid}"
-    )
-
-
-def test_integer_operators_of_a_runtime_are_counted_and_the_maker_named() -> None:
-    model = read(
-        "m (float[2,2] x, int8[2,2] w, float s) => (float[2,2] y)"
-        " { y = com.microsoft.DynamicQuantizeMatMul(x, w, s) }"
-    )
+def test_what_is_quantized_says_its_grid_and_its_maker(
+    text: str, said: str | None
+) -> None:
+    model = ir.from_onnx_text(HEAD + text)
     model.producer_name = "onnx.quantize"
 
-    assert describe_quantized(model) == (
-        "1 DynamicQuantizeMatMul; made by onnx.quantize"
-    )
-
-
-def test_a_pair_without_a_zero_point_is_uint8() -> None:
-    model = read(
-        "m (float[2] x) => (float[2] y) <float s = {0.5}>"
-        " { q = QuantizeLinear(x, s) y = DequantizeLinear(q, s) }"
-    )
-    assert "uint8 with zero points 0" in str(describe_quantized(model))
+    assert describe_quantized(model) == said

@@ -3,7 +3,6 @@ from typing import Any, ClassVar
 
 import pytest
 
-from me2e_compress.driving.latency import LATENCY_SOURCES
 from me2e_compress.errors import StudyError, VerificationError
 from me2e_compress.quantization.rules import RULE_SETS, RULES
 from me2e_compress.registry import Registry
@@ -33,11 +32,6 @@ def test_a_thing_holds() -> None:
 def test_ours_hold(registry: Registry[Any]) -> None:
     for name in registry.names():
         check_form(registry.build(name, {}), registry)
-
-
-@pytest.mark.parametrize("text", ["none", "fps:10", "fixed:3", "measured"])
-def test_our_latency_sources_hold(text: str) -> None:
-    check_form(LATENCY_SOURCES.parse(text), LATENCY_SOURCES)
 
 
 class Undecorated(Good):

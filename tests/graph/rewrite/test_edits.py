@@ -1,7 +1,6 @@
 import numpy as np
 import onnx_ir as ir
 
-from me2e_compress import graph
 from me2e_compress.graph import provenance, rewrite
 
 
@@ -13,10 +12,6 @@ def test_a_constant_takes_a_free_name(driver: ir.Model) -> None:
     ]
 
     assert [value.name for value in made] == [*(f"{n}_1" for n in taken), "c", "c_1"]
-
-
-def test_the_array_of_a_computed_value_is_not_known(driver: ir.Model) -> None:
-    assert graph.array_of(driver.graph[0].outputs[0]) is None
 
 
 def test_an_heir_unites_the_origins(driver: ir.Model) -> None:

@@ -80,21 +80,6 @@ def test_what_others_read_is_not_inner_unless_it_is_shared() -> None:
         assert match(shared, model.graph[1]) is not None
 
 
-def test_what_a_body_reads_is_made_elsewhere() -> None:
-    text = """
-    g (float[2] x, bool seen) => (float[2] y) {
-        a = Relu(x)
-        y = If (seen) <then_branch = then () => (float[2] t) { t = Relu(a) },
-                       else_branch = other () => (float[2] e) { e = Neg(x) }>
-    }
-    """
-    model = read(text)
-    inner = next(
-        node for node in model.graph.all_nodes() if node.outputs[0].name == "t"
-    )
-    assert match(TWICE, inner) is None
-
-
 @pytest.mark.parametrize(
     ("pattern", "value", "matches"),
     [
@@ -221,18 +206,3 @@ def test_a_fusion_may_complete_another() -> None:
     assert fuse(model, [silent], by="test").notes() == ()
     assert fuse(model, [ONCE], by="test").notes() == ("fused: Relu of Relu (3)",)
     assert ops(model) == ["Relu"]
-
-
-def test_bodies_are_fused_too() -> None:
-    text = """
-    g (float[2] x, bool seen) => (float[2] y) {
-        y = If (seen) <
-            then_branch = then () => (float[2] t) { a = Relu(x) t = Relu(a) },
-            else_branch = other () => (float[2] e) { e = Neg(x) }
-        >
-    }
-    """
-    model = read(text)
-    assert fuse(model, [ONCE], by="test").changes == 1
-    left = sorted(node.op_type for node in model.graph.all_nodes())
-    assert left == ["If", "Neg", "Relu"]

@@ -245,17 +245,12 @@ def test_a_positive_angle_turns_left(heading: float, radius: float) -> None:
     assert (end.x, end.y) == pytest.approx((left.x, left.y), abs=1e-6)
 
 
-def test_lanes_lie_to_the_right_of_the_first() -> None:
-    network = winding(Pose(0.0, 0.0, 0.0), 30.0, 0.9)
-
-    assert network.pose(("a", "b", 1), 10.0).y == pytest.approx(-3.5)
-    assert network.length(("b", "c", 1)) == pytest.approx(33.5 * 0.9)
-
-
-def test_the_rest_of_a_chain_begins_in_the_lane_of_the_arc_length() -> None:
+def test_lanes_lie_to_the_right_and_the_rest_of_a_chain_begins_at_its_length() -> None:
     network = winding(Pose(0.0, 0.0, 0.0), 30.0, 0.9)
     chain = [("a", "b", 0), ("b", "c", 0), ("c", "d", 0)]
 
+    assert network.pose(("a", "b", 1), 10.0).y == pytest.approx(-3.5)
+    assert network.length(("b", "c", 1)) == pytest.approx(33.5 * 0.9)
     assert network.rest(chain, 39.0) == (chain, 39.0)
     lanes, s_m = network.rest(chain, 45.0)
     assert lanes == chain[1:]

@@ -226,20 +226,21 @@ def test_only_red_is_run(state: SignalState, found: list[EventKind]) -> None:
     assert drive(regulator(SignalKind.TRAFFIC_LIGHT, state)) == found
 
 
-def test_the_tail_alone_decides_as_in_carla() -> None:
-    light = regulator(SignalKind.TRAFFIC_LIGHT, SignalState.YELLOW)
+@pytest.mark.parametrize(
+    ("before", "after", "found"),
+    [
+        (SignalState.YELLOW, SignalState.RED, [EventKind.RED_LIGHT]),
+        (SignalState.RED, SignalState.GREEN, []),  # who waited with the nose over it
+    ],
+)
+def test_the_tail_alone_decides_as_in_carla(
+    before: SignalState, after: SignalState, found: list[EventKind]
+) -> None:
+    light = regulator(SignalKind.TRAFFIC_LIGHT, before)
     drive(light, 40.0, 48.0)
-    light.state = SignalState.RED
+    light.state = after
 
-    assert drive(light, 48.0, 60.0) == [EventKind.RED_LIGHT]
-
-
-def test_who_waits_with_the_nose_over_the_line_may_go_on_green() -> None:
-    light = regulator(SignalKind.TRAFFIC_LIGHT, SignalState.RED)
-    drive(light, 40.0, 48.0)
-    light.state = SignalState.GREEN
-
-    assert drive(light, 48.0, 60.0) == []
+    assert drive(light, 48.0, 60.0) == found
 
 
 @pytest.mark.parametrize(

@@ -146,40 +146,38 @@ def test_a_bias_stored_as_integers_is_read() -> None:
     np.testing.assert_allclose(got, [[1.0, -2.0, 0.0]] * 4, atol=1e-6)
 
 
+SIX = (("axis=1>(wq", "axis=0>(wq"),
+       ("float[3] ws = {0.01, 0.02, 0.03}", "float[6] ws = {1., 1., 1., 1., 1., 1.}"),
+       ("int8[3] wz = {0, 0, 0}", "int8[6] wz = {0, 0, 0, 0, 0, 0}"))  # fmt: skip
+
+
 @pytest.mark.parametrize(
-    ("old", "new", "message"),
+    ("changes", "message"),
     [
-        ("int8 z = {0}", "int8 z = {3}", "zero point 3: only symmetric int8"),
-        ("int8 z = {0}", "uint8 z = {128}", "quantizes to uint8: only symmetric int8"),
-        ("float s = {0.02}", "float16 s = {9503}", "float16 scale, expected float32"),
-        ("axis=1>(w", "axis=0>(w", r"scales of shape \[6\] along axis 0, expected one"),
+        ([("int8 z = {0}", "int8 z = {3}")], "zero point 3: only symmetric int8"),
+        ([("int8 z = {0}", "uint8 z = {128}")], "quantizes to uint8: only symmetric"),
+        ([("float s = {0.02}", "float16 s = {9503}")], "float16 scale, expected float"),
+        (
+            [("axis=1>(w,", "axis=0>(w,"), *SIX],
+            r"scales of shape \[6\] along axis 0, expected one",
+        ),
+        (
+            [
+                *(("(x, s, z)", "<axis=0>(x, s, z)"), ("(xq, s", "<axis=0>(xq, s")),
+                ("float s = {0.02}", "float[4] s = {1., 1., 1., 1.}"),
+                ("int8 z = {0}", "int8[4] z = {0, 0, 0, 0}"),
+            ],
+            r"4 scales: .* take one",
+        ),
     ],
 )
-def test_other_grids_are_refused(old: str, new: str, message: str) -> None:
-    text = PAIRED.replace(old, new)
-    if "axis=0" in new:
-        text = (
-            text.replace("axis=1>(wq", "axis=0>(wq")
-            .replace(
-                "float[3] ws = {0.01, 0.02, 0.03}",
-                "float[6] ws = {1., 1., 1., 1., 1., 1.}",
-            )
-            .replace("int8[3] wz = {0, 0, 0}", "int8[6] wz = {0, 0, 0, 0, 0, 0}")
-        )
+def test_other_grids_are_refused(changes: list[tuple[str, str]], message: str) -> None:
+    text = PAIRED
+    for old, new in changes:
+        assert old in text
+        text = text.replace(old, new)
 
     with pytest.raises(PreconditionError, match=message):
-        convert(ir.from_onnx_text(text))
-
-
-def test_an_activation_with_several_scales_is_refused() -> None:
-    text = (
-        PAIRED.replace("(x, s, z)", "<axis=0>(x, s, z)")
-        .replace("(xq, s, z)", "<axis=0>(xq, s, z)")
-        .replace("float s = {0.02}", "float[4] s = {1., 1., 1., 1.}")
-        .replace("int8 z = {0}", "int8[4] z = {0, 0, 0, 0}")
-    )
-
-    with pytest.raises(PreconditionError, match=r"4 scales: .* take one"):
         convert(ir.from_onnx_text(text))
 
 
@@ -214,10 +212,8 @@ def test_a_matrix_with_scales_along_its_rows_stays_float() -> None:
             "float[4,6] x) => (float[4,3] y)", "float[1,4,6] x) => (float[1,4,3] y)"
         )
         .replace("float[6,3] w", "float[1,6,3] w")
-        .replace(
-            "float[3] ws = {0.01, 0.02, 0.03}", "float[6] ws = {1., 1., 1., 1., 1., 1.}"
-        )
-        .replace("int8[3] wz = {0, 0, 0}", "int8[6] wz = {0, 0, 0, 0, 0, 0}")
+        .replace(*SIX[1])
+        .replace(*SIX[2])
     )
     source = ir.from_onnx_text(text)
     x = np.random.default_rng(0).uniform(-0.3, 0.3, (1, 4, 6)).astype(np.float32)

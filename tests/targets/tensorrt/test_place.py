@@ -48,32 +48,19 @@ def test_weights_are_stored_as_int8_along_their_channels() -> None:
         assert graph.static_shape(stored[f"{name}_scale"]) == (SHAPES[name][axis],)
         assert producers[f"{name}_int8"].attributes["axis"].as_int() == axis
     assert stored["bias"].dtype == ir.DataType.FLOAT
-
-
-def test_readers_of_a_tensor_share_one_pair() -> None:
-    model = placed(layers())
-    quantized = [
-        node.inputs[0].name
-        for node in model.graph
-        if node.op_type == "QuantizeLinear" and node.inputs[0] is not None
-    ]
-
-    assert sorted(str(name) for name in quantized) == ["a", "t", "x"]
+    # readers of a tensor share one pair
+    pairs = [n.inputs[0] for n in model.graph if n.op_type == "QuantizeLinear"]
+    assert sorted(str(value.name) for value in pairs if value) == ["a", "t", "x"]
 
 
 def test_the_result_is_a_valid_graph_and_the_source_untouched() -> None:
-    model = layers()
+    model = conv_attention()
     before = graph.digest(model)
 
     result = placed(model)
 
     onnx.checker.check_model(ir.to_proto(result), full_check=True)
     assert graph.digest(model) == before
-
-
-def test_new_nodes_belong_to_the_module_that_reads_them() -> None:
-    result = placed(conv_attention())
-
     assert not provenance.missing(result)
     for node in result.graph:
         past = provenance.read(node)
@@ -117,29 +104,23 @@ def test_numbers_are_those_of_rounding_both_operands(seed: int, reach: float) ->
     np.testing.assert_allclose(got, want, rtol=1e-5, atol=1e-5)
 
 
-def test_a_weight_two_layers_share_is_stored_once() -> None:
-    text = """
-    twice (float[3,4] x, float[4,4] w) => (float[3,4] y) {
-        h = MatMul(x, w)
-        y = MatMul(h, w)
-    }
-    """
-    model = placed(net(text, {"w": np.ones((4, 4))}))
-
-    stored = [name for name in model.graph.initializers if name.endswith("_int8")]
-    assert stored == ["w_int8"]
-
-
-def test_a_weight_that_is_also_read_in_float_stays() -> None:
-    text = """
-    tied (float[3,4] x, float[4,4] w) => (float[3,4] y, float[4,4] z) {
+@pytest.mark.parametrize(
+    ("reader", "left"), [("z = MatMul(y, w)", set()), ("z = Relu(w)", {"w"})]
+)
+def test_a_weight_two_layers_share_is_stored_once_and_stays_where_it_is_read_in_float(
+    reader: str, left: set[str]
+) -> None:
+    text = f"""
+    tied (float[4,4] x, float[4,4] w) => (float[4,4] y, float[4,4] z) {{
         y = MatMul(x, w)
-        z = Relu(w)
-    }
+        {reader}
+    }}
     """
     model = placed(net(text, {"w": np.ones((4, 4))}))
 
-    assert {"w", "w_int8"} <= set(model.graph.initializers)
+    stored = {name for name in model.graph.initializers if name.endswith("_int8")}
+    assert stored == {"w_int8"}
+    assert {"w"} & set(model.graph.initializers) == left
 
 
 BLOCK = """
@@ -152,20 +133,16 @@ block (float[1,4,5,5] x, float[4,4,3,3] w, float[4,4,1,1] v) => (float[1,4,5,5] 
 """
 
 
-def test_only_the_residual_branch_of_an_add_is_quantized() -> None:
+@pytest.mark.parametrize("branch", ["x", "r"])
+def test_only_the_residual_branch_of_an_add_is_quantized(branch: str) -> None:
     weights = {"w": np.ones((4, 4, 3, 3)), "v": np.ones((4, 4, 1, 1))}
-    model = placed(net(BLOCK % "x", weights))
+    model = placed(net(BLOCK % branch, weights))
 
     (add,) = (node for node in model.graph if node.op_type == "Add")
     makers = [value.producer() for value in add.inputs if value is not None]
     assert [node.op_type for node in makers if node] == ["Conv", "DequantizeLinear"]
-
-
-def test_a_residual_branch_shares_the_pair_of_its_other_readers() -> None:
-    weights = {"w": np.ones((4, 4, 3, 3)), "v": np.ones((4, 4, 1, 1))}
-    model = placed(net(BLOCK % "r", weights))
-
-    assert [n.op_type for n in model.graph].count("QuantizeLinear") == 1
+    pairs = [n.op_type for n in model.graph].count("QuantizeLinear")
+    assert pairs == (1 if branch == "r" else 2)  # its other readers share a pair
 
 
 def test_what_a_concat_joins_is_on_one_scale() -> None:
