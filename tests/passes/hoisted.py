@@ -5,15 +5,9 @@ from typing import Any
 import numpy as np
 import onnx_ir as ir
 
-from me2e_compress.graph import macs, static_shape
+from me2e_compress.graph import macs
 from me2e_compress.passes.hoist_linear import HoistLinear
-from tests.passes.small import apply, compute, read
-
-RANDOM = np.random.default_rng(3)
-
-
-def normal(*shape: int) -> Any:
-    return RANDOM.normal(size=shape).astype(np.float32)
+from tests.passes.small import apply, compute, fed, read
 
 
 def integers(*values: int) -> Any:
@@ -36,10 +30,7 @@ def difference(model: ir.Model, text: str, weights: dict[str, Any]) -> float:
         name: array.astype(np.float64) if array.dtype == np.float32 else array
         for name, array in weights.items()
     }
-    feeds = {
-        port.name or "": normal(*(static_shape(port) or ()))
-        for port in model.graph.inputs
-    }
+    feeds = fed(model)
     wide = {name: array.astype(np.float64) for name, array in feeds.items()}
     wanted = compute(read(text.replace("float[", "double["), **double), wide)
     worst = 0.0

@@ -13,7 +13,9 @@ import onnxruntime
 from me2e_compress import graph
 from me2e_compress.graph import provenance, static_shape
 from me2e_compress.graph.modules import ModuleMap
+from me2e_compress.graph.summary import weight_bytes
 from me2e_compress.passes.base import Context, Pass, PassResult
+from me2e_compress.passes.fold_constants import ENTRY_BYTES
 from me2e_compress.passes.fuse_basic import FuseBasic
 from me2e_compress.passes.import_normalize import ImportNormalize
 from tests.nets import net
@@ -109,16 +111,27 @@ def normal(*shape: int) -> Any:
     return RANDOM.normal(size=shape).astype(np.float32)
 
 
+def fed(model: ir.Model, seed: int | None = None) -> dict[str, Any]:
+    """Draw normal numbers for the inputs of a graph of static shapes."""
+    random = RANDOM if seed is None else np.random.default_rng(seed)
+    return {
+        str(port.name): random.normal(size=static_shape(port) or ()).astype(np.float32)
+        for port in model.graph.inputs
+    }
+
+
+def file_bytes(model: ir.Model) -> int:
+    """Return what the weights take in a file."""
+    return weight_bytes(model) + ENTRY_BYTES * len(model.graph.initializers)
+
+
 def preserved(
     current: Pass, text: str, within: float = 0.0, **weights: Any
 ) -> tuple[ir.Model, PassResult]:
     """Apply a pass; outputs of drawn inputs stay within a share of their largest."""
     before, after = read(text, **weights), read(text, **weights)
     result = apply(current, after)
-    feeds = {
-        port.name or "": normal(*(static_shape(port) or ()))
-        for port in before.graph.inputs
-    }
+    feeds = fed(before)
     for want, got in zip(compute(before, feeds), compute(after, feeds), strict=True):
         atol = within * np.abs(want).max(initial=0.0) if within else 0.0
         np.testing.assert_allclose(got, want, rtol=0, atol=atol)

@@ -158,11 +158,8 @@ def test_a_cast_that_another_module_shares_stays() -> None:
         *("backbone", "agents", "planner")
     }
     assert [note for note in result.notes if "g reads" in note] == []
-
-
-def test_a_layout_of_its_own_results_goes(stack: ir.Model) -> None:
-    """``lanes`` is a reshape too, of what the map itself made."""
-    assert "lanes reads as zeros" in NO_MAP.run(stack, context()).notes
+    # lanes is a reshape too, of what the map itself made
+    assert "lanes reads as zeros" in NO_MAP.run(net(STACK, {}), context()).notes
 
 
 @pytest.fixture

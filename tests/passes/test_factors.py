@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 
 from me2e_compress.graph.rewrite import remove_dead
 from me2e_compress.passes.fuse_basic import FuseBasic
+from tests.passes.hoisted import integers
 from tests.passes.small import apply, compute, ops, preserved, read
 
 RANDOM = np.random.default_rng(5)
@@ -33,10 +34,6 @@ FORMS = {  # of offsets [batch, rows, heads * points * 2], and where the heads s
 
 def normal(*shape: int) -> Any:
     return RANDOM.normal(size=shape)
-
-
-def integers(*values: int) -> Any:
-    return np.array(values, np.int64)
 
 
 def fused(body: str, ports: str, feeds: dict[str, Any], **weights: Any) -> list[str]:

@@ -11,13 +11,12 @@ from hypothesis import strategies as st
 
 from me2e_compress.graph import static_shape
 from me2e_compress.graph.modules import ModuleMap
-from me2e_compress.graph.nodes import Array
-from me2e_compress.graph.summary import weight_bytes
+from me2e_compress.graph.rewrite import Array
 from me2e_compress.passes import Context
-from me2e_compress.passes.fold_constants import ENTRY_BYTES, FoldConstants, knowledge
+from me2e_compress.passes.fold_constants import FoldConstants, knowledge
 from me2e_compress.passes.fold_constants.knowledge import Knowledge
 from me2e_compress.runtime.session import REFUSALS
-from tests.passes.small import NO_MODULES, apply, compute, ops, read
+from tests.passes.small import NO_MODULES, apply, compute, file_bytes, ops, read
 
 
 def attention(tokens: int) -> ir.Model:
@@ -56,11 +55,11 @@ def test_weights_grow_by_at_most_the_limit_for_each_node_that_goes(
     limit: int, tokens: int
 ) -> None:
     model = attention(tokens)
-    before, nodes = _file_bytes(model), len(model.graph)
+    before, nodes = file_bytes(model), len(model.graph)
 
     apply(FoldConstants(limit), model)
 
-    assert _file_bytes(model) - before <= limit * (nodes - len(model.graph))
+    assert file_bytes(model) - before <= limit * (nodes - len(model.graph))
     assert ops(model).count("Slice") == 0  # what shrinks the weights is done
 
 
@@ -73,10 +72,6 @@ def test_an_attention_of_constants_is_folded_within_the_limit_alone() -> None:
 
     assert "Softmax" in ops(small)
     assert ops(large) == ["Add", "Mul", "MatMul"]
-
-
-def _file_bytes(model: ir.Model) -> int:
-    return weight_bytes(model) + ENTRY_BYTES * len(model.graph.initializers)
 
 
 def test_slices_of_a_packed_weight_are_folded_beside_what_stays_computed() -> None:

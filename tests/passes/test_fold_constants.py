@@ -8,26 +8,9 @@ import pytest
 from hypothesis import given, settings
 
 from me2e_compress import graph
-from me2e_compress.passes.fold_constants import ENTRY_BYTES, FoldConstants
-from tests.passes.small import apply, compute, ops, preserved, read
+from me2e_compress.passes.fold_constants import FoldConstants
+from tests.passes.small import apply, compute, file_bytes, ops, preserved, read
 from tests.profiles import scaled
-
-
-def test_a_weight_is_transposed_ahead_and_not_stored_twice() -> None:
-    text = """
-    g (float[5,3] x) => (float[5,4] y) {
-        turned = Transpose<perm = [1, 0]>(weight)
-        y = MatMul(x, turned)
-    }
-    """
-    weight = np.arange(12, dtype=np.float32).reshape(4, 3)
-    model = read(text, weight=weight)
-    apply(FoldConstants(), model)
-    assert list(model.graph.initializers) == ["turned"]
-    np.testing.assert_array_equal(
-        graph.array_of(model.graph.initializers["turned"]), weight.T
-    )
-
 
 SHAPE_CHAIN = """
 g (float[2,3,4] x) => (float[2,12] y) {
@@ -243,9 +226,5 @@ def test_random_programs_keep_their_meaning_and_the_limit(
     text, weights = program
     before = read(text, **weights)
     after, _ = preserved(FoldConstants(bytes_per_node), text, **weights)
-    growth = _file_bytes(after) - _file_bytes(before)
+    growth = file_bytes(after) - file_bytes(before)
     assert growth <= bytes_per_node * (len(before.graph) - len(after.graph))
-
-
-def _file_bytes(model: ir.Model) -> int:
-    return graph.size(model).weight_bytes + ENTRY_BYTES * len(model.graph.initializers)

@@ -1,7 +1,5 @@
 """Attention becomes one node with a kernel, in every layout; near misses stay."""
 
-from typing import Any
-
 import numpy as np
 import onnx_ir as ir
 import pytest
@@ -12,7 +10,7 @@ from me2e_compress.operators import find
 from me2e_compress.passes.fuse_kernels import FuseKernels
 from me2e_compress.runtime import runnable
 from me2e_compress.runtime.session import Session
-from tests.passes.small import apply, compute, ops, read
+from tests.passes.small import apply, compute, fed, ops, read
 from tests.profiles import scaled
 
 Q, K, H, C = 9, 70, 2, 16
@@ -74,15 +72,6 @@ def written(layout: str, scaled_by: str = "query", scale: float = C**-0.5) -> ir
     return read(text.replace("SCALE", str(scale)).replace("TIMES", str(1 / scale)))
 
 
-def drawn(model: ir.Model, seed: int = 0) -> dict[str, Any]:
-    random = np.random.default_rng(seed)
-    return {
-        str(port.name): random.normal(size=port.shape.numpy()).astype(np.float32)
-        for port in model.graph.inputs
-        if port.shape is not None
-    }
-
-
 def widened(model: ir.Model) -> ir.Model:
     """Return a graph of standard operators, in float64."""
     copy, _ = runnable.compiled_or_expanded(model.clone(), compiled=False)
@@ -114,7 +103,7 @@ def test_fused_attention_is_the_same_in_float64(
     layout: str, scaled_by: str, scale: float, seed: int
 ) -> None:
     model = written(layout, scaled_by, scale)
-    feeds = {name: each.astype(np.float64) for name, each in drawn(model, seed).items()}
+    feeds = {name: each.astype(np.float64) for name, each in fed(model, seed).items()}
     plain = model.clone()
     plain.graph.opset_imports["me2e"] = 1
     wanted = compute(widened(plain), feeds)[0]
@@ -127,7 +116,7 @@ def test_fused_attention_is_the_same_in_float64(
 @pytest.mark.parametrize("layout", sorted(LAYOUTS))
 def test_fused_attention_runs_as_its_nodes_do(layout: str) -> None:
     model = written(layout)
-    feeds = drawn(model)
+    feeds = fed(model, 0)
     wanted = Session(model.clone(), threads=1).run(feeds)["y"]
 
     apply(FuseKernels(), model)

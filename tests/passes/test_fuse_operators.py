@@ -5,7 +5,6 @@ import math
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import onnx_ir as ir
 import pytest
 from hypothesis import given, settings
@@ -19,29 +18,20 @@ from me2e_compress.operators.deformable_attention import DeformableAttention
 from me2e_compress.passes.base import PassResult
 from me2e_compress.passes.fuse_operators import FuseOperators, numeric_check
 from tests.passes.decomposed import FUSED, Sizes, decomposed, inferred, plain
-from tests.passes.small import NO_MODULES, apply, compute, ops, read
+from tests.passes.small import NO_MODULES, apply, compute, fed, ops, read
 from tests.profiles import scaled
 
 SEED = 3
 
 
-def feeds(model: ir.Model) -> dict[str, npt.NDArray[np.float32]]:
-    """Normal numbers; positions are inside and outside alike."""
-    random = np.random.default_rng(SEED)
-    return {
-        str(port.name): random.standard_normal(static_shape(port)).astype(np.float32)
-        for port in model.graph.inputs
-    }
-
-
 def fused(model: ir.Model) -> PassResult:
     """Fuse; the outputs stay within 1e-4 of their largest, the node as its body."""
-    before = compute(model, feeds(model))
+    before = compute(model, fed(model, SEED))
     result = apply(FuseOperators(), model)
     whole = model.clone()
     for node in [node for node in whole.graph if node.domain == "me2e"]:
         expand(node, opset=opset_of(whole), by="test")
-    for want, got in zip(before, compute(whole, feeds(model)), strict=True):
+    for want, got in zip(before, compute(whole, fed(model, SEED)), strict=True):
         np.testing.assert_allclose(got, want, rtol=0, atol=1e-4 * np.abs(want).max())
     return result
 

@@ -12,15 +12,8 @@ from hypothesis import strategies as st
 from me2e_compress.graph import infer_shapes, static_shape
 from me2e_compress.passes import work
 from me2e_compress.passes.hoist_linear import HoistLinear, repeats, sums
-from tests.passes.hoisted import (
-    RANDOM,
-    difference,
-    graph_of,
-    integers,
-    normal,
-    products,
-)
-from tests.passes.small import NO_MODULES, compute, read
+from tests.passes.hoisted import difference, graph_of, integers, products
+from tests.passes.small import NO_MODULES, RANDOM, compute, normal, read
 from tests.profiles import scaled
 
 MOVES = (

@@ -7,11 +7,10 @@ import onnx_ir as ir
 import pytest
 
 from me2e_compress.graph import infer_shapes, provenance
-from me2e_compress.passes.fold_constants import FoldConstants
 from me2e_compress.passes.hoist_linear import HoistLinear
 from tests.calls import calls
-from tests.passes.hoisted import difference, graph_of, hoist, integers, normal, products
-from tests.passes.small import NO_MODULES, apply, ops, read
+from tests.passes.hoisted import graph_of, hoist, integers, products
+from tests.passes.small import NO_MODULES, apply, normal, ops, read
 
 ROWS, TIMES, WIDE = 101, 60, 32
 
@@ -37,61 +36,6 @@ def test_the_keys_and_values_of_a_motion_decoder() -> None:
 
 
 CAMERAS, QUERIES = 6, 500
-
-SAMPLING = (
-    f"(float[1,{QUERIES},{WIDE}] x) => (float[{CAMERAS},{QUERIES},16] offsets,"
-    f" float[{CAMERAS},{QUERIES},8] weights)",
-    " placed = Add(many, position)"
-    " query = LayerNormalization<axis = -1>(placed, gamma, beta)"
-    " flat = Reshape(query, rows)"
-    " off = Gemm<transB = 1>(flat, wo, bo)  offsets = Reshape(off, offset_shape)"
-    " product = MatMul(query, ww)  weights = Add(product, bw)",
-)
-
-
-REPEATS = {
-    "Expand": "many = Expand(x, cameras)",
-    "Tile": "many = Tile(x, times)",
-    "stack": "many = Concat<axis = 0>(x, x, x, x, x, x)",
-}
-
-
-@pytest.mark.parametrize("repeat", REPEATS)
-def test_sampling_offsets_and_weights_of_queries_repeated_for_cameras(
-    repeat: str,
-) -> None:
-    model = hoist(
-        graph_of(SAMPLING[0], REPEATS[repeat] + SAMPLING[1]),
-        times=integers(CAMERAS, 1, 1),
-        cameras=integers(CAMERAS, QUERIES, WIDE), position=normal(QUERIES, WIDE),
-        gamma=normal(WIDE), beta=normal(WIDE), rows=integers(-1, WIDE),
-        wo=normal(16, WIDE), bo=normal(16), ww=normal(WIDE, 8), bw=normal(8),
-        offset_shape=integers(CAMERAS, QUERIES, 16),
-    )  # fmt: skip
-    assert products(model) == QUERIES * WIDE * (16 + 8)
-    assert ops(model)[:2] == ["Add", "LayerNormalization"]
-
-
-def test_a_self_attention_of_constants_is_folded_and_its_product_not_repeated() -> None:
-    text = graph_of(
-        f"(float[1,1,{WIDE}] memory) => (float[1,200,{WIDE}] y)",
-        "q = MatMul(queries, wq)  turned = Transpose<perm = [0, 2, 1]>(queries)"
-        " scores = MatMul(q, turned)  p = Softmax<axis = -1>(scores)"
-        " mixed = MatMul(p, queries)  seen = Expand(memory, many)"
-        " both = Add(mixed, seen)  y = MatMul(both, w)",
-    )
-    weights = {
-        "queries": normal(1, 200, WIDE),
-        "wq": normal(WIDE, WIDE) / WIDE,
-        "many": integers(1, 200, WIDE),
-        "w": normal(WIDE, WIDE),
-    }
-    model = read(text, **weights)
-    apply(FoldConstants(), model)
-    apply(HoistLinear(), model)
-    assert products(model) == WIDE**2
-    assert difference(model, text, weights) < 1e-5
-
 
 HOISTED: dict[str, tuple[str, str, dict[str, Any], int, list[str]]] = {
     "two layers in a row become one": (

@@ -1,10 +1,8 @@
 """What an import names, stamps and moves; float64 becomes float32 inside."""
 
 import numpy as np
-import numpy.typing as npt
 import onnx
 import onnx_ir as ir
-import onnxruntime as ort
 import pytest
 
 from me2e_compress import graph
@@ -19,7 +17,7 @@ from me2e_compress.passes.import_normalize import (
     needs_import,
     with_own_domains,
 )
-from tests.passes.small import EVERYTHING, normalise, settled, unstamped
+from tests.passes.small import EVERYTHING, compute, normalise, settled, unstamped
 from tests.plugins import exported
 
 
@@ -170,16 +168,6 @@ def test_a_map_of_another_stack_is_refused() -> None:
         ImportNormalize().run(model, Context(ModuleMap.load("vad")))
 
 
-Array = npt.NDArray[np.float32]
-
-
-def run(model: ir.Model, **feeds: Array) -> Array:
-    session = ort.InferenceSession(
-        ir.to_proto(model).SerializeToString(), providers=["CPUExecutionProvider"]
-    )
-    return np.asarray(session.run(None, feeds)[0])
-
-
 def double_grid() -> ir.Model:
     return unstamped(
         "g (float[1, 1, 4, 4] x, float[1, 3, 3, 2] p) => (float[1, 1, 3, 3] y) {"
@@ -196,18 +184,15 @@ def test_a_double_grid_that_onnxruntime_refuses_runs_afterwards() -> None:
     x = rng.standard_normal((1, 1, 4, 4), np.float32)
     p = rng.uniform(-1, 1, (1, 3, 3, 2)).astype(np.float32)
     with pytest.raises(Exception, match="GridSample"):
-        run(model, x=x, p=p)
+        compute(model, {"x": x, "p": p})
     normalise(model)
     reference = unstamped(
         "g (float[1, 1, 4, 4] x, float[1, 3, 3, 2] g) => (float[1, 1, 3, 3] y) {"
         " y = GridSample (x, g) }"
     )
-    np.testing.assert_allclose(
-        run(model, x=x, p=p),
-        run(reference, x=x, g=p / np.float32(2)),
-        rtol=0,
-        atol=1e-6,
-    )
+    (found,) = compute(model, {"x": x, "p": p})
+    (wanted,) = compute(reference, {"x": x, "g": p / np.float32(2)})
+    np.testing.assert_allclose(found, wanted, rtol=0, atol=1e-6)
     assert settled(model)
 
 
@@ -229,9 +214,8 @@ def test_no_double_is_left_in_types_weights_branches_and_functions() -> None:
     assert "DOUBLE" not in str(ir.to_proto(model))
     assert _doubles_of(ir.to_proto(model)) == 0
     x = np.array([1, 2], np.float32)
-    session = ort.InferenceSession(ir.to_proto(model).SerializeToString())
     for chosen, wanted in ((True, [6, 12]), (False, [4, 8])):
-        (y,) = session.run(None, {"c": np.array(chosen), "x": x})
+        (y,) = compute(model, {"c": np.array(chosen), "x": x})
         np.testing.assert_array_equal(y, wanted)
     assert settled(model)
 
@@ -250,9 +234,8 @@ def test_resize_scales_computed_in_double_become_float32() -> None:
     )
     normalise(model)
     x = np.arange(4, dtype=np.float32).reshape(1, 1, 2, 2)
-    np.testing.assert_array_equal(
-        run(model, x=x), x.repeat(2, axis=2).repeat(2, axis=3)
-    )
+    (found,) = compute(model, {"x": x})
+    np.testing.assert_array_equal(found, x.repeat(2, axis=2).repeat(2, axis=3))
 
 
 def test_numbers_beyond_float32_stay_finite_and_infinities_stay_infinite() -> None:

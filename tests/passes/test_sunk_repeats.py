@@ -6,8 +6,8 @@ import pytest
 
 from me2e_compress.graph import static_shape
 from me2e_compress.passes.hoist_linear import HoistLinear
-from tests.passes.hoisted import graph_of, hoist, integers, normal, products
-from tests.passes.small import apply, ops, read
+from tests.passes.hoisted import graph_of, hoist, integers, products
+from tests.passes.small import apply, normal, ops, read
 
 CAMERAS, CELLS, WIDE = 6, 200, 32
 FORMS = {
