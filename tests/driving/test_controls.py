@@ -102,44 +102,29 @@ def read(control: dict[str, Any], **outputs: Any) -> PedalsAndWheel:
 THREE = {"throttle": "gas", "steer": "wheel", "brake": "stop"}
 
 
-def test_three_outputs_or_one_vector() -> None:
-    found = read(THREE, gas=[[0.5]], wheel=[-0.25], stop=0.0)
-    control = {"throttle": "c[1]", "steer": "c[0]"}
-
-    assert found == PedalsAndWheel(0.5, -0.25, 0.0)
-    assert read(control, c=[[0.25, 0.5]]) == PedalsAndWheel(0.5, 0.25, 0.0)
+PUSHED = {"acceleration": "a[0]", "steer": "a[1]"}
+PERCENT = {**THREE, "steer_range": [1.0, 0.0], "throttle_range": [0.0, 100.0]}
+"""A sigmoid of steer that is 1 at full left; a throttle in percent."""
+BEYOND = {"gas": [1.25], "wheel": [-2.0], "stop": [-0.5]}
 
 
 @pytest.mark.parametrize(
-    ("said", "expected"),
+    ("control", "said", "expected"),
     [
-        ([0.5, 0.0], PedalsAndWheel(0.5, 0.0, 0.0)),
-        ([-0.25, 0.0], PedalsAndWheel(0.0, 0.0, 0.25)),
-        ([0.0, 1.0], PedalsAndWheel(0.0, 1.0, 0.0)),
+        (THREE, {"gas": [[0.5]], "wheel": [-0.25], "stop": 0.0}, (0.5, -0.25, 0.0)),
+        ({"throttle": "c[1]", "steer": "c[0]"}, {"c": [[0.25, 0.5]]}, (0.5, 0.25, 0.0)),
+        (PUSHED, {"a": [[0.5, 0.0]]}, (0.5, 0.0, 0.0)),
+        (PUSHED, {"a": [[-0.25, 0.0]]}, (0.0, 0.0, 0.25)),  # it brakes below zero
+        (PUSHED, {"a": [[0.0, 1.0]]}, (0.0, 1.0, 0.0)),
+        (PERCENT, {"gas": [25.0], "wheel": [0.75], "stop": [1.0]}, (0.25, -0.5, 1.0)),
+        (THREE, BEYOND, (1.25, -2.0, -0.5)),
+        ({**THREE, "clip": True}, BEYOND, (1.0, -1.0, 0.0)),
     ],
 )
-def test_an_acceleration_brakes_below_zero(
-    said: list[float], expected: PedalsAndWheel
+def test_a_control_is_what_the_outputs_say(
+    control: dict[str, Any], said: dict[str, Any], expected: tuple[float, float, float]
 ) -> None:
-    control = {"acceleration": "a[0]", "steer": "a[1]"}
-
-    assert read(control, a=[said]) == expected
-
-
-def test_ranges_are_what_the_model_says_at_their_ends() -> None:
-    """A sigmoid of steer that is 1 at full left; a throttle in percent."""
-    control = {**THREE, "steer_range": [1.0, 0.0], "throttle_range": [0.0, 100.0]}
-
-    found = read(control, gas=[25.0], wheel=[0.75], stop=[1.0])
-
-    assert found == PedalsAndWheel(0.25, -0.5, 1.0)
-
-
-def test_what_is_beyond_its_range_is_clipped_only_if_asked() -> None:
-    said = {"gas": [1.25], "wheel": [-2.0], "stop": [-0.5]}
-
-    assert read(THREE, **said) == PedalsAndWheel(1.25, -2.0, -0.5)
-    assert read({**THREE, "clip": True}, **said) == PedalsAndWheel(1.0, -1.0, 0.0)
+    assert read(control, **said) == PedalsAndWheel(*expected)
 
 
 @pytest.mark.parametrize(

@@ -6,7 +6,7 @@ import numpy as np
 import onnx
 import onnx_ir as ir
 import pytest
-from onnx import TensorProto, helper
+from onnx import TensorProto
 
 from me2e_compress import graph
 from me2e_compress.errors import GraphError
@@ -14,36 +14,21 @@ from me2e_compress.graph.shapes import can_carry, infer_shapes, static_shape
 from me2e_compress.graph.summary import macs
 from me2e_compress.manager.equivalence import random_outputs
 from tests.calls import calls
+from tests.nets import parsed
 
-OPSETS = [helper.make_opsetid("", 17), helper.make_opsetid("own", 1)]
-
-
-def port(name: str, *shape: int) -> onnx.ValueInfoProto:
-    return helper.make_tensor_value_info(name, TensorProto.FLOAT, shape)
-
-
-def saved(body: onnx.GraphProto, path: Path, *functions: onnx.FunctionProto) -> Path:
-    model = helper.make_model(
-        body, functions=functions, opset_imports=OPSETS, ir_version=9
-    )
-    onnx.save(model, path)
-    return path
+OPSETS = 'opset_import: ["" : 17, "own" : 1]'
 
 
 def calling(count: int, times: int, path: Path) -> Path:
     """Write a graph of functions, each of which calls the next so many times."""
-    functions = [helper.make_function("own", f"f{count}", ["a0"], ["y"], [], OPSETS)]
-    functions[0].node.append(helper.make_node("Relu", ["a0"], ["y"]))
-    for at in range(count):
-        nodes = [
-            helper.make_node(f"f{at + 1}", [f"a{i}"], [f"a{i + 1}"], domain="own")
-            for i in range(times)
-        ]
-        made = (["a0"], [f"a{times}"], nodes, OPSETS)
-        functions.append(helper.make_function("own", f"f{at}", *made))
-    first = helper.make_node("f0", ["x"], ["y"], domain="own")
-    body = helper.make_graph([first], "g", [port("x", 4)], [port("y", 4)])
-    return saved(body, path, *functions)
+    text = f"<ir_version: 9, {OPSETS}>\n"
+    text += "g (float[4] x) => (float[4] y) { y = own.f0(x) }"
+    for at in range(count + 1):
+        asked = [f"a{i + 1} = own.f{at + 1}(a{i})" for i in range(times)]
+        body = " ".join(asked if at < count else [f"a{times} = Relu(a0)"])
+        text += f'\n<domain: "own", {OPSETS}>\nf{at} (a0) => (a{times}) {{ {body} }}'
+    onnx.save(onnx.parser.parse_model(text), path)
+    return path
 
 
 @pytest.mark.parametrize(
@@ -63,17 +48,15 @@ def test_functions_beyond_the_bounds_are_not_read(
 
 def nested(depth: int) -> ir.Model:
     """Return a Scan of a Scan of ... of a Relu."""
-    node, shape = helper.make_node("Relu", ["a0"], ["b0"]), [4]
+    body, shape = "b0 = Relu(a0)", "4"
     for at in range(1, depth + 1):
-        ports = [port(f"a{at - 1}", *shape)], [port(f"b{at - 1}", *shape)]
-        body = helper.make_graph([node], f"body{at}", *ports)
-        node = helper.make_node(
-            "Scan", [f"a{at}"], [f"b{at}"], body=body, num_scan_inputs=1
-        )
-        shape = [1, *shape]
-    ports = [port(f"a{depth}", *shape)], [port(f"b{depth}", *shape)]
-    whole = helper.make_graph([node], "g", *ports)
-    return ir.from_proto(helper.make_model(whole, opset_imports=OPSETS, ir_version=9))
+        ports = f"(float[{shape}] a{at - 1}) => (float[{shape}] b{at - 1})"
+        body = f"""b{at} = Scan<num_scan_inputs = 1, body = body{at} {ports}
+            {{ {body} }}>(a{at})"""
+        shape = f"1,{shape}"
+    return parsed(
+        f"g (float[{shape}] a{depth}) => (float[{shape}] b{depth}) {{ {body} }}"
+    )
 
 
 def test_macs_and_draws_of_nested_loops_take_a_walk_a_level() -> None:
@@ -118,12 +101,15 @@ def with_tensors(path: Path) -> Path:
     tensor = TensorProto(name="k", data_type=TensorProto.FLOAT, dims=[3])
     tensor.data_location = TensorProto.EXTERNAL
     tensor.external_data.add(key="location", value="k.data")
-    node = helper.make_node("Foo", ["x"], ["y"], domain="own", name="foo")
-    node.attribute.add(
+    model = onnx.parser.parse_model(
+        f"<ir_version: 9, {OPSETS}>"
+        'g (float[3] x) => (float[3] y) { ["foo"] y = own.Foo(x) }'
+    )
+    model.graph.node[0].attribute.add(
         name="tables", type=onnx.AttributeProto.TENSORS, tensors=[tensor]
     )
-    body = helper.make_graph([node], "g", [port("x", 3)], [port("y", 3)])
-    return saved(body, path)
+    onnx.save(model, path)
+    return path
 
 
 def test_tensors_of_a_list_are_read_from_their_file(tmp_path: Path) -> None:

@@ -35,20 +35,6 @@ def test_equal_names_are_joined_and_state_runs_by_its_names(tmp_path: Path) -> N
     assert bevs(path, True, False, False, True) == [2.0, 3.0, 3.5, 2.0]
 
 
-def test_two_outputs_of_one_name_are_called_by_their_parts(tmp_path: Path) -> None:
-    path = write_stack(
-        tmp_path,
-        TWO_PARTS + "[edges]\nimg_feats = 'backbone.plan'\n",
-        head=HEAD.replace("feats", "img_feats"),
-        backbone="""<ir_version: 9, opset_import: ["" : 17]>
-        backbone (float[1,4] img) => (float[1,4] plan) { plan = Add(img, img) }""",
-    )
-
-    assert list(JoinedStack.load(path).names.values()) == [
-        *("next_bev", "head.plan", "backbone.plan")
-    ]
-
-
 def test_what_a_frame_holds_is_the_first_value(tmp_path: Path) -> None:
     session = joined(write_stack(tmp_path))
     (frame,) = ones(True)

@@ -166,20 +166,15 @@ def test_the_ranking_under_every_normalization() -> None:
 
 
 def test_joules_of_a_route_are_those_of_its_decisions() -> None:
+    """Without a log of them, as of a real run, each recorded step is one."""
     found = measured([drive(driven=cruise(traffic=5.0))], 2.5)
+    told = Given("Completed", 100.0, 1.0, 100.0)
+    eight = drive(driven=cruise()[:8])
+    real = dataclasses.replace(eight, decisions=(), given=told)
 
     assert np.isnan(measured([drive()], None).table[0, 3])
     # a drive by hand has one decision
     assert found.table.tolist() == [pytest.approx([100.0, 200.0, 1.0, 2.5])]
-
-
-def test_without_a_log_of_decisions_a_recorded_step_of_a_real_run_is_one() -> None:
-    real = dataclasses.replace(
-        drive(driven=cruise()[:8]),
-        decisions=(),
-        given=Given("Completed", 100.0, 1.0, 100.0),
-    )
-
     assert measured([real], 2.5).table[0, 3] == 20.0
 
 
@@ -220,23 +215,18 @@ def weights_of(rows: np.ndarray) -> np.ndarray | None:
         return None
 
 
-def test_weights_of_the_example_by_hand() -> None:
-    outer, middle = (2 - 1 / math.sqrt(3)) / 2, (math.sqrt(3) - 1) / 2
-    contents = np.array([outer, middle, outer])
-
-    assert critic_weights(ROWS) == pytest.approx(contents / contents.sum())
-
-
 @pytest.mark.parametrize("unit", [1e-15, 1e15])
 def test_the_unit_of_all_measures_does_not_matter(unit: float) -> None:
     assert critic_weights(unit * ROWS) == pytest.approx(critic_weights(ROWS))
 
 
-def test_a_constant_measure_weighs_nothing_and_changes_nothing() -> None:
-    constant = np.full((4, 1), 0.7)
+def test_the_example_by_hand_beside_a_constant_that_weighs_nothing() -> None:
+    outer, middle = (2 - 1 / math.sqrt(3)) / 2, (math.sqrt(3) - 1) / 2
+    contents = np.array([outer, middle, outer])
 
-    found = critic_weights(np.hstack([constant, ROWS]))
+    found = critic_weights(np.hstack([np.full((4, 1), 0.7), ROWS]))
 
+    assert critic_weights(ROWS) == pytest.approx(contents / contents.sum())
     assert found[0] == 0.0
     assert found[1:] == pytest.approx(critic_weights(ROWS))
 

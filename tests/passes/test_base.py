@@ -1,29 +1,11 @@
-from dataclasses import dataclass
 from pathlib import Path
-from typing import ClassVar
 
-import onnx_ir as ir
 import pytest
 
-from me2e_compress.passes import Context, Pass, PassResult
+from me2e_compress.passes import Pass
 from me2e_compress.passes.ablate_modules import AblateModules
 from me2e_compress.passes.quantize_int8 import QuantizeInt8
-
-
-@dataclass(frozen=True)
-class Sample(Pass):
-    """Does nothing.
-
-    Given:   x
-    Result:  x
-    """
-
-    name: ClassVar[str] = "sample"
-    exact: ClassVar[bool] = True
-    means: Path | None = None
-
-    def run(self, model: ir.Model, context: Context) -> PassResult:
-        return PassResult(model, 0)
+from tests.test_recipes import Sample
 
 
 def test_files_are_the_paths_that_are_set() -> None:

@@ -195,15 +195,6 @@ def test_a_required_pattern_may_match_and_lose() -> None:
     assert placed(assign(model, mine)) == {"y": ("plan", "scope")}
 
 
-def test_a_graph_without_any_name_is_one_module() -> None:
-    model = ir.from_onnx_text(
-        '<ir_version: 9, opset_import: ["" : 17]>\n'
-        "m (float[2] x) => (float[2] y) { a = Relu(x)\n y = Neg(a) }"
-    )
-    placed = assign(model, ModuleMap.whole())
-    assert [placed.module_of(node) for node in model.graph] == ["model", "model"]
-
-
 def test_a_copy_of_an_equal_parameter_goes_by_its_own_name() -> None:
     """What the exporter writes where a norm of ``det`` has the numbers of ``neck``."""
     model = read(

@@ -43,30 +43,19 @@ def test_what_a_dead_body_read_is_dead_and_what_is_read_is_not() -> None:
     assert rewrite.remove_dead(model.graph) == 0
 
 
-def test_what_only_the_other_branch_read_goes_with_it() -> None:
-    model = read(
-        """
-        g (float[2] x) => (float[2] y) <bool yes = {1}> {
-            a = Neg(x)
-            y = If (yes) <then_branch = t () => (float[2] t) { t = Relu(x) },
-                          else_branch = e () => (float[2] e) { e = Abs(a) }>
-        }"""
-    )
-
-    assert ops(apply(FoldConstants(), model).model) == ["Relu"]
-
-
-def test_a_branch_in_place_of_its_if_knows_its_shapes() -> None:
+def test_a_branch_in_place_of_its_if_knows_its_shapes_and_the_other_is_gone() -> None:
     text = """
     g (float[4] x) => (float[2,2] y) <bool yes = {1}, int64[2] two = {2, 2}> {
+        n = Neg(x)
         a = Reshape(x, two)
         y = If (yes) <then_branch = t () => (float[2,2] t) {
                           b = Reshape(a, two) t = Relu(b)
                       },
-                      else_branch = e () => (float[2,2] e) { e = Neg(a) }>
+                      else_branch = e () => (float[2,2] e) { e = Reshape(n, two) }>
     }"""
 
     taken = apply(FoldConstants(), read(text)).model
+    assert ops(taken) == ["Reshape", "Reshape", "Relu"]
     assert ops(apply(EliminateRedundant(), taken).model) == ["Reshape", "Relu"]
 
 
