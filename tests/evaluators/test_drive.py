@@ -18,7 +18,7 @@ from me2e_compress.evaluators.contract import Listener, evaluator_named
 from me2e_compress.evaluators.highway.evaluator import Highway
 from me2e_compress.metrics.episode import Episode
 from me2e_compress.registry import registry
-from me2e_compress.workflows.evaluate import drive_of
+from tests.evaluators.lanes import Lane
 
 
 def test_words_reach_the_drive() -> None:
@@ -99,11 +99,6 @@ def test_who_declares_what_it_does_not_have_is_refused(
 
 
 def test_routes_of_another_kind_are_not_highways() -> None:
-    @dataclass(frozen=True)
-    class Lane:
-        id: str
-        seed: int
-
     lanes: Sequence[RouteInfo] = [Lane("lane", 0)]
     with pytest.raises(EvaluationError, match="highway drives routes of its own kind"):
         Highway().expected_s(lanes[0])

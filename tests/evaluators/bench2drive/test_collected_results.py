@@ -259,35 +259,40 @@ def test_recordings_are_found_by_the_name_of_the_drive(
     assert found.unrecorded == []
 
 
-def test_the_recording_of_another_drive_is_not_taken(tmp_path: Path) -> None:
+NAME = str(GOOD["save_name"])
+STEPS = recording(30)
+
+
+@pytest.mark.parametrize(
+    ("beside", "frames", "named", "note"),
+    [
+        ({f"{NAME.replace('_36', '_11')}/m.json": STEPS}, 0, 0, "of no record"),
+        ({"saved/7/metric_info.json": STEPS}, 0, 0, "of no record"),
+        (
+            {f"a/{NAME}/m.json": STEPS, f"b/{NAME}/m.json": recording(40)},
+            *(30, 0, "one of 2 of the same drive"),
+        ),
+        (
+            {f"a/{NAME}/metric_info.json": {}, f"b/{NAME}/m.json": STEPS},
+            *(30, 1, "one of 2 of the same drive"),  # the other is broken
+        ),
+        (
+            {f"{NAME}/m.json": {step: STEPS[step] for step in sorted(STEPS)}},
+            *(30, 0, "steps out of order: comfort is of no drive"),
+        ),
+    ],
+)
+def test_which_of_the_recordings_is_taken_and_what_is_said_of_it(
+    tmp_path: Path, beside: dict[str, Json], frames: int, named: int, note: str
+) -> None:
     write(tmp_path / "r.json", checkpoint(GOOD))
-    earlier = GOOD["save_name"].replace("_36", "_11")
-    write(tmp_path / earlier / "metric_info.json", recording())
+    files = [write(tmp_path / name, steps) for name, steps in beside.items()]
 
-    assert collect(tmp_path).unrecorded == ["RouteScenario_1711_rep0"]
+    found = collect(tmp_path)
 
-
-def test_a_recording_of_no_record_is_named(tmp_path: Path) -> None:
-    write(tmp_path / "r.json", checkpoint(GOOD))
-    stray = write(tmp_path / "saved" / "7" / "metric_info.json", recording())
-
-    assert collect(tmp_path).notes == [f"{stray}: of no record"]
-
-
-def test_of_two_recordings_one_counts_and_is_named(tmp_path: Path) -> None:
-    write(tmp_path / "r.json", checkpoint(GOOD))
-    first = write(tmp_path / "a" / GOOD["save_name"] / "m.json", recording(30))
-    write(tmp_path / "b" / GOOD["save_name"] / "m.json", recording(40))
-
-    assert collect(tmp_path).notes == [f"{first}: one of 2 of the same drive"]
-
-
-def test_a_whole_recording_stands_in_for_a_broken_one(tmp_path: Path) -> None:
-    write(tmp_path / "r.json", checkpoint(GOOD))
-    write(tmp_path / "a" / GOOD["save_name"] / "metric_info.json", {})
-    write(tmp_path / "b" / GOOD["save_name"] / "metric_info.json", recording(40))
-
-    assert len(collect(tmp_path).episodes[0].frames) == 40
+    assert len(found.episodes[0].frames) == frames
+    assert bool(found.unrecorded) == (frames == 0)
+    assert found.notes == [f"{files[named]}: {note}"]
 
 
 @pytest.mark.parametrize(
@@ -326,17 +331,6 @@ def test_a_log_of_decisions_that_is_cut_off_is_named(tmp_path: Path) -> None:
     assert collect(tmp_path).broken == {str(log): "line 2 is no decision"}
 
 
-def test_steps_out_of_order_are_named(tmp_path: Path) -> None:
-    write(tmp_path / "r.json", checkpoint(GOOD))
-    steps = recording(30)
-    as_text = {step: steps[step] for step in sorted(steps)}
-    file = write(tmp_path / GOOD["save_name"] / "metric_info.json", as_text)
-
-    assert collect(tmp_path).notes == [
-        f"{file}: steps out of order: comfort is of no drive",
-    ]
-
-
 def test_a_byte_order_mark_hides_nothing(tmp_path: Path) -> None:
     write(tmp_path / "r.json", checkpoint(GOOD))
     write(tmp_path / GOOD["save_name"] / "m.json", recording(40))
@@ -346,20 +340,13 @@ def test_a_byte_order_mark_hides_nothing(tmp_path: Path) -> None:
     assert len(collect(tmp_path).episodes[0].frames) == 40
 
 
-def test_recordings_in_both_folders_are_one(tmp_path: Path) -> None:
-    write(tmp_path / "r.json", checkpoint(GOOD))
-    write(tmp_path / "metric_info.json", recording(25))
+def test_recordings_in_both_folders_are_one_and_may_lie_apart(tmp_path: Path) -> None:
+    results, saved = tmp_path / "results", tmp_path / "saved"
+    for folder in (results, saved):
+        write(folder / "r.json", checkpoint(GOOD))
+    write(saved / NAME / "m.json", recording(25, 0.5))
 
-    found = Bench2DriveResults(tmp_path, tmp_path).collect()
-
-    assert len(found.episodes[0].frames) == 25
-
-
-def test_recordings_may_lie_apart(tmp_path: Path) -> None:
-    write(tmp_path / "results" / "r.json", checkpoint(GOOD))
-    write(tmp_path / "saved" / GOOD["save_name"] / "m.json", recording(25, 0.5))
-
-    found = Bench2DriveResults(tmp_path / "results", tmp_path / "saved").collect()
-
-    assert len(found.episodes[0].frames) == 25
-    assert found.off_rate == {"RouteScenario_1711_rep0": 0.5}
+    for place in (saved, results):
+        found = Bench2DriveResults(place, saved).collect()
+        assert len(found.episodes[0].frames) == 25
+        assert found.off_rate == {"RouteScenario_1711_rep0": 0.5}

@@ -41,6 +41,7 @@ def test_a_record_becomes_an_episode() -> None:
 
     episode = read.episode
     assert (episode.route, read.number) == ("RouteScenario_1711_rep0", "1711")
+    assert number_of("17") == "17"
     assert (episode.scenario, episode.abilities) == (
         "ParkingCutIn",
         ("Emergency_Brake",),
@@ -89,16 +90,12 @@ def test_a_crash_before_the_first_tick() -> None:
     assert read.duration_s is None
 
 
-def test_speeds_beyond_all_bounds_stay_finite() -> None:
+def test_speeds_beyond_all_bounds_stay_finite_and_none_is_named() -> None:
     huge = "9" * 400
     read = read_record(record(min_speed_infractions=[speed(12.5), f"{huge}% of it"]))
 
     assert read.episode.speed_ratios_percent == (12.5, 1e9)
-
-
-def test_a_message_without_a_percentage_is_named() -> None:
     read = read_record(record(min_speed_infractions=["Average speed is nan% of it"]))
-
     assert read.notes == (
         "min_speed_infractions: no percentage in 'Average speed is nan% of it': "
         "left out",
@@ -142,11 +139,6 @@ def test_a_broken_record_is_one_line(raw: object, message: str) -> None:
     assert "\n" not in str(caught.value)
 
 
-def test_numbers_are_found_as_the_tools_find_them() -> None:
-    assert number_of("RouteScenario_1711_rep0") == "1711"
-    assert number_of("17") == "17"
-
-
 @pytest.mark.parametrize("kind", InfractionKind)
 def test_every_list_of_the_leaderboard_is_read(kind: InfractionKind) -> None:
     raw = {**record(), "infractions": {kind.value: ["it happened (5.0% of it)"]}}
@@ -173,15 +165,6 @@ def test_a_turn_to_the_right_is_clockwise() -> None:
     assert second.steering_rad is None
 
 
-@pytest.mark.parametrize("interval_s", [0.05, 0.1, 0.5])
-def test_the_rate_follows_from_the_motion(interval_s: float) -> None:
-    read = read_recording(recording(interval_s=interval_s))
-
-    assert read.interval_s() == interval_s
-    # a duration of something else does not decide
-    assert read.interval_s(duration_s=1000.0) == interval_s
-
-
 def brake(interval_s: float) -> Json:
     """Straight ahead from 20 m/s with an acceleration that wavers."""
     raw = recording(steps=80, yaw_degps=0.0)
@@ -196,7 +179,14 @@ def brake(interval_s: float) -> Json:
 
 
 @pytest.mark.parametrize("interval_s", [0.05, 0.1, 0.5])
-def test_the_rate_follows_from_braking_alone(interval_s: float) -> None:
+def test_the_rate_follows_from_the_motion_or_from_braking_alone(
+    interval_s: float,
+) -> None:
+    read = read_recording(recording(interval_s=interval_s))
+
+    assert read.interval_s() == interval_s
+    # a duration of something else does not decide
+    assert read.interval_s(duration_s=1000.0) == interval_s
     assert read_recording(brake(interval_s)).interval_s() == interval_s
 
 

@@ -98,3 +98,14 @@ def straight_on(
         model.metadata_props.add(key=key, value=value)
     onnx.save(model, path)
     return path
+
+
+def slow_here(path: Path) -> Path:
+    """Write one that plans the same, quantized in TensorRT's form."""
+    return straight_on(
+        path,
+        body="""q = QuantizeLinear(ahead, s, z) d = DequantizeLinear(q, s, z)
+            v = DequantizeLinear(w, s, z) m = MatMul(d, v) plan = Add(m, b)""",
+        initializers=", float s = {0.1}, int8 z = {0}, int8[2,2] w = {10, 0, 0, 10},"
+        " float[2] b = {0, 0}",
+    )

@@ -67,25 +67,23 @@ def crossing(late_s: float) -> ConflictRecord:
     )
 
 
-def test_a_standing_car_ahead() -> None:
-    # outlines 20 m apart, closing at 8 m/s
-    found = recorded((ego_at(0.0), (actor(20.0 + 2.5 + 2.3),)))
+@pytest.mark.parametrize(
+    ("ego", "others", "nearest_m", "ttc_s"),
+    [
+        # outlines 20 m apart, closing at 8 m/s
+        (ego_at(0.0), (actor(20.0 + 2.5 + 2.3),), 20.0, 2.5),
+        (ego_at(0.0), (actor(30.0, speed=9.0),), 25.2, None),  # it drives away
+        (ego_at(0.0, speed=1.0), (actor(11.0 + 4.8),), 11.0, None),  # in 11 s
+        (ego_at(0.4), (), None, None),
+    ],
+)
+def test_how_near_others_are_and_when_they_are_met(
+    ego: Ego, others: tuple[Actor, ...], nearest_m: float | None, ttc_s: float | None
+) -> None:
+    found = recorded((ego, others))
 
-    assert found.nearest_m == (20.0,)
-    assert found.ttc_s == (2.5,)
-
-
-def test_who_drives_away_is_never_met_and_nobody_is_nowhere() -> None:
-    found = recorded((ego_at(0.0), (actor(30.0, speed=9.0),)), (ego_at(0.4), ()))
-
-    assert found.ttc_s == (None, None)
-    assert found.nearest_m[1] is None
-
-
-def test_a_contact_in_eleven_seconds_is_beyond_the_horizon() -> None:
-    found = recorded((ego_at(0.0, speed=1.0), (actor(11.0 + 4.8),)))
-
-    assert found.ttc_s == (None,)
+    assert found.nearest_m == (pytest.approx(nearest_m),)
+    assert found.ttc_s == (ttc_s,)
 
 
 @pytest.mark.parametrize(("late_s", "ego_first"), [(2.5, True), (-2.5, False)])
@@ -101,13 +99,9 @@ def test_paths_that_cross_one_after_the_other(late_s: float, ego_first: bool) ->
     assert found.angle_rad == pytest.approx(LEFT, abs=1e-3)
 
 
-def test_more_than_five_seconds_apart_is_no_encounter() -> None:
+def test_no_encounter_is_five_seconds_apart_or_with_who_stands() -> None:
     assert not crossing(6.5).encounters
-
-
-def test_a_standing_actor_encroaches_on_nothing() -> None:
     frames = [(ego_at(8.0 * k), (actor(40.0),)) for k in range(6)]
-
     assert not recorded(*frames).encounters
 
 
@@ -261,32 +255,28 @@ def traffic_speed(*actors: Actor) -> float | None:
     return frame.traffic_speed_mps
 
 
-@pytest.mark.parametrize(
-    ("x", "y"), [(7.0, 3.0), (26.0, 0.0), (54.9, 0.0), (-44.9, 0.0), (34.0, 40.0)]
-)
-def test_vehicles_within_50_m_are_the_traffic(x: float, y: float) -> None:
-    assert traffic_speed(actor(x, y, speed=6.0)) == 6.0
-
-
-@pytest.mark.parametrize(("x", "y"), [(55.1, 0.0), (-45.1, 0.0), (45.0, 40.0)])
-def test_vehicles_farther_away_are_not(x: float, y: float) -> None:
-    near = actor(40.0, speed=4.0)
-
-    assert traffic_speed(actor(x, y, speed=6.0)) is None
-    assert traffic_speed(near, actor(x, y, speed=6.0, number=2)) == 4.0
-
-
-def test_the_traffic_is_the_mean_of_moving_and_standing_vehicles() -> None:
-    near, far = actor(10.0, speed=9.0), actor(50.0, number=2)
-
-    assert traffic_speed(near, far) == 4.5
+WITHIN = [(7.0, 3.0), (26.0, 0.0), (54.9, 0.0), (-44.9, 0.0), (34.0, 40.0)]
+BEYOND = [(55.1, 0.0), (-45.1, 0.0), (45.0, 40.0)]
+NO_TRAFFIC = (ActorKind.PEDESTRIAN, ActorKind.PARKED, ActorKind.CONE)
 
 
 @pytest.mark.parametrize(
-    "kind", [ActorKind.PEDESTRIAN, ActorKind.PARKED, ActorKind.CONE]
+    ("actors", "speed"),
+    [
+        *(([actor(*place, speed=6.0)], 6.0) for place in WITHIN),
+        *(([actor(*place, speed=6.0)], None) for place in BEYOND),
+        *(
+            ([actor(40.0, speed=4.0), actor(*place, speed=6.0, number=2)], 4.0)
+            for place in BEYOND
+        ),
+        ([actor(10.0, speed=9.0), actor(50.0, number=2)], 4.5),
+        *(([actor(10.0, speed=1.0, kind=kind)], None) for kind in NO_TRAFFIC),
+    ],
 )
-def test_what_is_no_vehicle_in_traffic_is_left_out(kind: ActorKind) -> None:
-    assert traffic_speed(actor(10.0, speed=1.0, kind=kind)) is None
+def test_vehicles_within_50_m_moving_or_not_are_the_traffic(
+    actors: list[Actor], speed: float | None
+) -> None:
+    assert traffic_speed(*actors) == speed
 
 
 @pytest.mark.parametrize(

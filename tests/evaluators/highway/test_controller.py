@@ -34,6 +34,7 @@ from tests.evaluators.highway.tiny_world import (
 from tests.profiles import scaled
 
 LENGTH_M = 5.0
+AHEAD = np.array([[4.0 * k, 0.0] for k in range(1, 7)])
 STEPS = st.tuples(st.floats(0.3, 8.0), st.floats(-3.0, 3.0))
 
 
@@ -115,18 +116,12 @@ def test_the_circle_agrees_with_highway_env() -> None:
     assert heading == pytest.approx(speed * curvature_of(steering, LENGTH_M), abs=1e-9)
 
 
-def test_a_plan_is_anchored_where_it_was_made() -> None:
-    waypoints = np.array([[4.0 * k, 0.0] for k in range(1, 7)])
-    plan = AnchoredPlan.of(waypoints, ego_at(10.0, -3.0, math.pi / 2), 0)
+def test_a_plan_is_anchored_where_it_was_made_and_goes_on() -> None:
+    plan = AnchoredPlan.of(AHEAD, ego_at(10.0, -3.0, math.pi / 2), 0)
     assert plan.point(8.0) == pytest.approx((10.0, 5.0), abs=1e-6)
     np.testing.assert_allclose(plan.travel_m, 4.0 * np.arange(7))
     assert plan.nearest(10.4, 2.0) == pytest.approx(5.0, abs=1e-6)
-
-
-def test_a_plan_goes_on_at_its_last_speed() -> None:
-    waypoints = np.array([[4.0 * k, 0.0] for k in range(1, 7)])
-    plan = AnchoredPlan.of(waypoints, ego_at(), 0)
-    assert plan.travel_at(4.0) == pytest.approx(32.0)
+    assert plan.travel_at(4.0) == pytest.approx(32.0)  # on at its last speed
 
 
 def test_the_curve_leaves_on_the_course_not_on_the_heading() -> None:
@@ -180,8 +175,7 @@ def test_a_steady_acceleration_is_asked_for_exactly(rate: float) -> None:
 
 def test_an_old_plan_is_followed_from_where_it_has_got_to() -> None:
     """After 0.5 s on plan the same control is due as if it were planned anew."""
-    waypoints = np.array([[4.0 * k, 0.0] for k in range(1, 7)])
-    plan = AnchoredPlan.of(waypoints, ego_at(0.0), 0)
+    plan = AnchoredPlan.of(AHEAD, ego_at(0.0), 0)
     control = plan.control(ego_at(4.0), 500_000)
     assert control.acceleration_mps2 == pytest.approx(0.0, abs=1e-6)
     late = plan.control(ego_at(2.0), 500_000)

@@ -29,24 +29,25 @@ def shown(*actors: Actor, ego: Ego = EGO) -> list[int]:
     return [each.id for each in seen(Scene(0, ego, actors, ())).actors]
 
 
-def test_a_pedestrian_behind_a_van_is_not_seen_and_beside_it_is() -> None:
-    van = actor(1, ActorKind.VAN, 20.0, -3.0)
-
-    assert shown(van, actor(2, ActorKind.PEDESTRIAN, 24.0, -3.6)) == [1]
-    assert shown(van, actor(2, ActorKind.PEDESTRIAN, 24.0, 0.0)) == [1, 2]
+VAN = (ActorKind.VAN, 20.0, -3.0)
 
 
-def test_the_lane_behind_a_truck_is_hidden_all_around() -> None:
-    for side in (1.0, -1.0):
-        truck = actor(1, ActorKind.TRUCK, side * 12.0, 0.0)
-        hidden = actor(2, ActorKind.CAR, side * 30.0, 0.0)
-        assert shown(truck, hidden) == [1]
-
-
-def test_over_a_cone_one_sees_a_truck() -> None:
-    cone = actor(1, ActorKind.CONE, 20.0, 0.0)
-
-    assert shown(cone, actor(2, ActorKind.TRUCK, 40.0, 0.0)) == [1, 2]
+@pytest.mark.parametrize(
+    ("near", "far", "seen"),
+    [
+        (VAN, (ActorKind.PEDESTRIAN, 24.0, -3.6), False),
+        (VAN, (ActorKind.PEDESTRIAN, 24.0, 0.0), True),  # beside it
+        ((ActorKind.TRUCK, 12.0, 0.0), (ActorKind.CAR, 30.0, 0.0), False),
+        ((ActorKind.TRUCK, -12.0, 0.0), (ActorKind.CAR, -30.0, 0.0), False),
+        ((ActorKind.CONE, 20.0, 0.0), (ActorKind.TRUCK, 40.0, 0.0), True),  # over it
+    ],
+)
+def test_who_is_hidden_behind_whom(
+    near: tuple[ActorKind, float, float],
+    far: tuple[ActorKind, float, float],
+    seen: bool,
+) -> None:
+    assert shown(actor(1, *near), actor(2, *far)) == ([1, 2] if seen else [1])
 
 
 def test_who_steps_out_halfway_is_seen() -> None:
@@ -68,6 +69,7 @@ def test_far_away_nothing_is_seen_signals_included() -> None:
     scene = seen(Scene(0, EGO, (far,), (light, near)))
 
     assert scene.actors == ()
+    assert shown() == []
     assert [each.id for each in scene.signals] == [2]
 
 
@@ -92,10 +94,6 @@ def test_one_more_hides_others_and_never_shows_them(
     if cars:
         fewer = shown(*cars[:-1], ego=ego)
         assert set(fewer) >= set(shown(*cars, ego=ego)) - {cars[-1].id}
-
-
-def test_nobody_is_no_problem() -> None:
-    assert shown() == []
 
 
 def path_of(commands: list[int]) -> RoutePath:
@@ -123,18 +121,13 @@ def test_nodes_stand_where_the_command_changes_and_never_far_apart() -> None:
 
 
 @pytest.mark.parametrize(
-    ("y", "ahead"), [(0.0, (35, 70)), (60.0, (10, 30)), (67.0, (23, 58))]
+    ("y", "ahead"),
+    [(0.0, (35, 70)), (60.0, (10, 30)), (67.0, (23, 58)), (158.0, (2, 2))],
 )
-def test_the_next_node_lies_at_least_four_metres_ahead(
+def test_the_next_node_lies_at_least_four_metres_ahead_till_the_last(
     y: float, ahead: tuple[float, float]
 ) -> None:
     """One metre to the left, since the ego is to the right of the path."""
     found = NODES.ahead(y, ego_at(y))
 
     np.testing.assert_allclose(found, [[each, 1.0] for each in ahead], atol=1e-5)
-
-
-def test_at_the_end_both_are_the_last_one() -> None:
-    found = NODES.ahead(158.0, ego_at(158.0))
-
-    np.testing.assert_allclose(found, [[2.0, 1.0]] * 2, atol=1e-5)

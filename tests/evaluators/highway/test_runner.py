@@ -3,7 +3,7 @@ import math
 import re
 from dataclasses import dataclass, field, replace
 from types import SimpleNamespace
-from typing import cast
+from typing import Any, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -19,7 +19,6 @@ from me2e_compress.evaluators.highway.runner import EndingRules, Listeners, driv
 from me2e_compress.metrics.episode import COLLISIONS, Ending, Episode, InfractionKind
 from me2e_compress.metrics.route_scores import route_score, score_to_first_collision
 from me2e_compress.simulator.pictures.route import Moment
-from me2e_compress.simulator.routes import Route
 from me2e_compress.simulator.scene import ActorKind, Ego
 from me2e_compress.simulator.traffic.bodies import Contacts, EgoVehicle, depth
 from me2e_compress.simulator.traffic.network import Pose
@@ -133,6 +132,7 @@ def test_a_late_control_acts_late() -> None:
 @pytest.mark.parametrize(
     ("way", "reason"),
     [
+        ("no-reset", "RuntimeError: will not start"),
         ("raise", r"KeyError: 'lost\\nmy way'"),
         ("not-finite", "the plan is not finite"),
         ("shape", r"the plan has shape \[5, 2\], it must be \[6, 2\]"),
@@ -147,16 +147,10 @@ def test_a_policy_that_breaks_its_contract_has_failed(way: str, reason: str) -> 
 
     assert episode.ending is Ending.POLICY_FAILED
     assert episode.failure is not None
-    assert len(episode.decisions) == 19
+    assert len(episode.decisions) == (0 if way == "no-reset" else 19)
+    assert bool(episode.completion_percent) == bool(episode.decisions)
     assert not episode.succeeded
     assert re.fullmatch(reason, episode.failure)
-
-
-def test_a_policy_that_cannot_reset_has_failed() -> None:
-    episode = drive(EXIT, Misbehaving("no-reset"), IDEAL)
-
-    assert episode.failure == "RuntimeError: will not start"
-    assert episode.completion_percent == 0.0
 
 
 def test_a_policy_sees_what_it_may() -> None:
@@ -304,16 +298,25 @@ def ending_after(track: Track, seconds: float) -> tuple[Ending | None, float]:
     return None, track.time_us / 1e6
 
 
-def test_a_normal_drive_goes_on_for_200_seconds() -> None:
-    assert ending_after(Track(), 300.0) == (Ending.TIMEOUT, 200.0)
-
-
-@pytest.mark.parametrize(("speed", "ended"), [(0.1, True), (0.11, False)])
-def test_a_minute_at_walking_away_pace_is_blocked(speed: float, ended: bool) -> None:
-    ending, seconds = ending_after(Track(speed), 100.0)
-
-    assert (ending is Ending.BLOCKED) is ended
-    assert seconds == (60.05 if ended else 100.0)
+@pytest.mark.parametrize(
+    ("track", "seconds", "expected"),
+    [
+        ({}, 300.0, (Ending.TIMEOUT, 200.0)),
+        ({"speed_mps": 0.1}, 100.0, (Ending.BLOCKED, 60.05)),
+        ({"speed_mps": 0.11}, 100.0, (None, 100.0)),
+        ({"lateral_m": 29.9}, 0.2, (None, 0.2)),
+        ({"lateral_m": -30.0}, 0.2, (Ending.DEVIATION, 0.05)),
+        # far from it for 60 m, 30 % of 200 m, at 5 m/s
+        ({"lateral_m": 14.9}, 20.0, (None, 20.0)),
+        ({"lateral_m": 15.0}, 20.0, (Ending.DEVIATION, 12.05)),
+        ({"reason": EndReason.GOAL}, 1.0, (Ending.COMPLETED, 0.05)),
+        ({"reason": EndReason.COLLISION}, 1.0, (Ending.COLLISION, 0.05)),
+    ],
+)
+def test_when_a_drive_ends(
+    track: dict[str, Any], seconds: float, expected: tuple[Ending | None, float]
+) -> None:
+    assert ending_after(Track(**track), seconds) == expected
 
 
 def test_moving_on_starts_the_minute_again() -> None:
@@ -324,45 +327,16 @@ def test_moving_on_starts_the_minute_again() -> None:
         assert rules.ending(cast(World, track), track.speed_mps) is None
 
 
-@pytest.mark.parametrize(("away", "ended"), [(29.9, None), (-30.0, Ending.DEVIATION)])
-def test_30_metres_from_the_route_is_a_deviation(
-    away: float, ended: Ending | None
-) -> None:
-    assert ending_after(Track(lateral_m=away), 0.2)[0] is ended
-
-
-@pytest.mark.parametrize(
-    ("away", "expected"), [(14.9, (None, 20.0)), (15.0, (Ending.DEVIATION, 12.05))]
-)
-def test_a_third_of_the_route_far_from_it_is_a_deviation(
-    away: float, expected: tuple[Ending | None, float]
-) -> None:
-    # 60 m, 30 % of 200 m, at 5 m/s.
-    assert ending_after(Track(lateral_m=away), 20.0) == expected
-
-
-@pytest.mark.parametrize(
-    ("reason", "ending"),
-    [(EndReason.GOAL, Ending.COMPLETED), (EndReason.COLLISION, Ending.COLLISION)],
-)
-def test_the_world_may_end_by_itself(reason: EndReason, ending: Ending) -> None:
-    assert ending_after(Track(reason=reason), 1.0) == (ending, 0.05)
-
-
 # Driving on after a collision, scored by both rules from one drive.
 
 
 ON = Drive(drive_on=True)
 
 
-def both(route: Route, speed_mps: float) -> tuple[Episode, Episode]:
-    ended = drive(route, Blind(speed_mps), Drive())
-    return ended, drive(route, Blind(speed_mps), ON)
-
-
 @pytest.fixture(scope="module")
 def drives() -> tuple[Episode, Episode]:
-    return both(route_of("HighwayCutIn", 5), 12.0)
+    route, blind = route_of("HighwayCutIn", 5), Blind(12.0)
+    return drive(route, blind, IDEAL), drive(route, blind, ON)
 
 
 def test_one_drive_is_scored_by_both_rules(drives: tuple[Episode, Episode]) -> None:
@@ -374,17 +348,11 @@ def test_one_drive_is_scored_by_both_rules(drives: tuple[Episode, Episode]) -> N
     assert score_to_first_collision(went_on) == route_score(ended)
     assert score_to_first_collision(ended) == route_score(ended)
     assert went_on.frames[: len(ended.frames) - 1] == ended.frames[:-1]
-
-
-def test_the_first_collision_is_judged_as_it_was(
-    drives: tuple[Episode, Episode],
-) -> None:
     first, again = (
         next(each for each in one.infractions if each.kind in COLLISIONS)
         for one in drives
     )
-
-    assert first == again
+    assert first == again  # it is judged as it was
     assert first.contact is not None
 
 
@@ -398,13 +366,6 @@ def test_every_collision_multiplies_and_the_route_goes_on(
     assert len(went_on.frames) > len(ended.frames)
     assert went_on.completion_percent >= ended.completion_percent
     assert not went_on.succeeded
-
-
-def test_it_is_written_only_of_drives_that_went_on(
-    drives: tuple[Episode, Episode],
-) -> None:
-    ended, went_on = drives
-
     assert "first_collision" not in ended.to_json()
     assert Episode.from_json(went_on.to_json()) == went_on
     assert Episode.from_json(ended.to_json()) == ended
