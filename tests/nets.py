@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -72,19 +73,23 @@ def parsed(text: str) -> ir.Model:
     return ir.from_onnx_text(head + text)
 
 
+def stored(model: ir.Model, weights: Mapping[str, npt.NDArray[Any]]) -> ir.Model:
+    """Make weights of some inputs."""
+    for value in list(model.graph.inputs):
+        if (name := str(value.name)) in weights:
+            model.graph.inputs.remove(value)
+            value.const_value = ir.tensor(weights[name], name=name)
+            model.graph.register_initializer(value)
+    return model
+
+
 def net(text: str, weights: Mapping[str, npt.NDArray[np.floating]]) -> ir.Model:
     """Read a graph, make weights of some inputs, stamp modules, infer shapes.
 
     A node belongs to the module that its name begins with, else to ``head``.
     """
-    model = parsed(text)
-    for value in list(model.graph.inputs):
-        name = str(value.name)
-        if name in weights:
-            model.graph.inputs.remove(value)
-            array = weights[name].astype(np.float32)
-            value.const_value = ir.tensor(array, name=name)
-            model.graph.register_initializer(value)
+    floats = {name: array.astype(np.float32) for name, array in weights.items()}
+    model = stored(parsed(text), floats)
     for node in model.graph.all_nodes():
         name = node.name or ""
         module = name.split("/")[1] if name.startswith("/") else "head"

@@ -120,41 +120,12 @@ def test_what_cpp_writes_of_no_number_is_read(tmp_path: Path) -> None:
     assert found[2:].tolist() == [np.inf, -np.inf]
 
 
-def test_no_dump(tmp_path: Path) -> None:
-    assert refused(tmp_path / "none").endswith("none: no such folder or file")
-
-
-def test_a_folder_of_both_forms(tmp_path: Path) -> None:
-    as_npz(tmp_path)
-    (tmp_path / "a.json").write_text("[]")
-    assert "holds both .npz and .json" in refused(tmp_path)
-
-
 @pytest.mark.parametrize("form", ["npz", "json"])
 def test_a_file_that_is_cut(form: str, tmp_path: Path, frames: CalibrationSet) -> None:
     write = as_npz if form == "npz" else as_trtexec
     file = write(tmp_path / "dump") / f"000001.{form}"
     file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
     assert str(file) in refused(tmp_path / "dump", frames)
-
-
-def test_run_results_that_are_cut(tmp_path: Path) -> None:
-    file = as_polygraphy(tmp_path / "dump.json")
-    file.write_text(file.read_text()[:-40])
-    assert f"{file}: not the JSON of an engine's answers" in refused(file)
-
-
-def test_an_array_that_is_cut(tmp_path: Path) -> None:
-    file = as_polygraphy(tmp_path / "dump.json")
-    text = json.loads(file.read_text())
-    held = text["lst"][0][1][0]["outputs"]["plan"]["values"]
-    held["array"] = held["array"][:40]
-    file.write_text(json.dumps(text))
-    assert "not the RunResults that polygraphy" in refused(file)
-
-
-def test_results_of_two_runners(tmp_path: Path) -> None:
-    assert "2 runners, expected one" in refused(as_polygraphy(tmp_path / "d.json", 2))
 
 
 @pytest.mark.parametrize(
@@ -188,25 +159,50 @@ def test_arrays_of_no_numbers(
     )
 
 
-def test_fewer_frames(tmp_path: Path, frames: CalibrationSet) -> None:
-    as_npz(tmp_path / "dump", ANSWERS[:2])
-    assert refused(tmp_path / "dump", frames).endswith(
-        f"answers to 2 frames, {frames.folder} has 3: the dump is of other frames"
-    )
+def cut_text(dump: Path) -> None:
+    as_polygraphy(dump)
+    dump.write_text(dump.read_text()[:-40])
 
 
-def test_a_frame_that_is_not_answered_is_named(
-    tmp_path: Path, frames: CalibrationSet
+def cut_array(dump: Path) -> None:
+    text = json.loads(as_polygraphy(dump).read_text())
+    held = text["lst"][0][1][0]["outputs"]["plan"]["values"]
+    held["array"] = held["array"][:40]
+    dump.write_text(json.dumps(text))
+
+
+@pytest.mark.parametrize(
+    ("spoil", "said"),
+    [
+        (lambda dump: None, "DUMP: no such folder or file"),
+        (
+            lambda dump: (as_npz(dump) / "a.json").write_text("[]"),
+            "holds both .npz and .json",
+        ),
+        (cut_text, "DUMP: not the JSON of an engine's answers"),
+        (cut_array, "not the RunResults that polygraphy"),
+        (lambda dump: as_polygraphy(dump, 2), "2 runners, expected one"),
+        (
+            lambda dump: as_npz(dump, ANSWERS[:2]),
+            "answers to 2 frames, FRAMES has 3: the dump is of other frames",
+        ),
+        (
+            lambda dump: (as_npz(dump) / "000001.npz").unlink(),
+            "DUMP: 000001 is not answered: answers to 2",
+        ),
+        (
+            lambda dump: (as_npz(dump) / "000002.npz").rename(dump / "000009.npz"),
+            "000009 is answered and is no frame of",
+        ),
+    ],
+)
+def test_what_is_no_whole_dump_of_the_frames(
+    spoil: Callable[[Path], object], said: str, tmp_path: Path, frames: CalibrationSet
 ) -> None:
-    (as_npz(tmp_path / "dump") / "000001.npz").unlink()
-    said = refused(tmp_path / "dump", frames)
-    assert said.startswith(f"{tmp_path}/dump: 000001 is not answered: answers to 2")
-
-
-def test_frames_of_another_name(tmp_path: Path, frames: CalibrationSet) -> None:
-    as_npz(tmp_path / "dump")
-    (tmp_path / "dump" / "000002.npz").rename(tmp_path / "dump" / "000009.npz")
-    assert "000009 is answered and is no frame of" in refused(tmp_path / "dump", frames)
+    dump = tmp_path / "dump"
+    spoil(dump)
+    said = said.replace("DUMP", str(dump)).replace("FRAMES", str(frames.folder))
+    assert said in refused(dump, frames)
 
 
 @pytest.mark.parametrize("lacks", [0, 2])

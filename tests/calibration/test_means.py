@@ -92,11 +92,10 @@ def test_the_type_stays(tmp_path: Path) -> None:
     assert means["half"].tolist() == [[1.5, 2.0, 2.5, 3.0]]
 
 
-def test_nothing_asked_nothing_run() -> None:
+def test_an_unknown_value_no_frames_and_no_question() -> None:
     assert token_means(kinds(), rows(), []) == {}
-
-
-def test_an_unknown_value() -> None:
+    with pytest.raises(FramesError, match="no frames: y has no mean"):
+        token_means(kinds(), rows(), ["y"])
     with pytest.raises(GraphError, match="no value bev"):
         token_means(kinds(), rows([1, 2, 3, 4]), ["y", "bev"])
 
@@ -117,11 +116,6 @@ def test_one_value_one_shape() -> None:
 
     with pytest.raises(FramesError, match=r"frame 1 makes where \[2, 1\], it was"):
         token_means(model, rows([1, 2, 3, 4], [0, 0, 0, 4]), ["where"])
-
-
-def test_no_frames_no_mean() -> None:
-    with pytest.raises(FramesError, match="no frames: y has no mean"):
-        token_means(kinds(), rows(), ["y"])
 
 
 def test_means_are_read_by_the_names_of_exporters(tmp_path: Path) -> None:

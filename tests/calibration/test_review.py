@@ -4,9 +4,7 @@ import dataclasses
 import json
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
-from typing import ClassVar
 
 import numpy as np
 import numpy.typing as npt
@@ -18,9 +16,7 @@ from me2e_compress.calibration.calibrator import Calibrator
 from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.calibration.observers import (
     OBSERVERS,
-    Bounds,
     MeanSquaredError,
-    Observer,
     Percentile,
     scale_of,
     within,
@@ -33,6 +29,7 @@ from tests.frames import record
 from tests.installed import install
 from tests.nets import conv_attention, image, parsed
 from tests.profiles import scaled
+from tests.testing.test_check_observer import RootMeanSquare
 
 GOOD = Ranges(
     {"a": (-1.0, 4.0), "b": (0.0, 2.0)},
@@ -390,22 +387,10 @@ def test_what_is_no_method_is_refused(text: str, message: str) -> None:
         OBSERVERS.parse(text)
 
 
-@dataclass(frozen=True)
-class RootMeanSquare(Observer):
-    """Some root mean squares to each side."""
-
-    name: ClassVar[str] = "rms"
-    times: float = 3.0
-
-    def ranges(self, seen: Statistics) -> tuple[Bounds, Bounds]:
-        reach = self.times * np.sqrt(seen.mean_squares.mean(axis=0))
-        return -reach, reach
-
-
 def test_a_number_goes_to_the_observer_that_it_is_written_behind(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    entry = {"rms": f"{__name__}:RootMeanSquare"}
+    entry = {"rms": "tests.testing.test_check_observer:RootMeanSquare"}
     install(monkeypatch, tmp_path, "an-rms", "me2e_compress.observers", entry)
 
     assert OBSERVERS.parse("rms:4") == RootMeanSquare(4.0)

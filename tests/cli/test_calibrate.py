@@ -32,20 +32,6 @@ def digests(*files: Path) -> set[str]:
     return {graph.digest(graph.load(each)) for each in files}
 
 
-@pytest.mark.parametrize("method", ["max-min", "mse"])
-def test_saved_ranges_make_the_file_that_frames_make(
-    cli: Cli, folder: Path, method: str
-) -> None:
-    cli.done(f"{RANGES} --method {method} -o r.json")
-    how = f"--scheme prediction --method {method} --measure-frames 0 {MAP}"
-    cli.done(f"compress dense.onnx {how} --ranges r.json -o a.onnx")
-    cli.done(f"compress dense.onnx {how} --frames scenes -o b.onnx")
-
-    made = graph.load(folder / "a.onnx").graph
-    assert "QuantizeLinear" in [node.op_type for node in made]
-    assert len(digests(folder / "a.onnx", folder / "b.onnx")) == 1
-
-
 def test_another_tools_cache_comes_and_goes(cli: Cli, folder: Path) -> None:
     cli.done(f"{RANGES} --tensorrt-cache c --onnxruntime-table table -o r.json")
     ours = json.loads((folder / "r.json").read_text())

@@ -171,13 +171,6 @@ def test_an_engine_is_written_once_and_not_over_a_file_of_the_users(
     assert asked == [EngineSettings("fp16")]
 
 
-def test_an_exported_stack_is_a_document(cli: Cli, tmp_path: Path) -> None:
-    found = cli.document("export highway -o m.onnx")
-
-    assert found["output"] == "m.onnx"
-    assert (tmp_path / "m.onnx").is_file()
-
-
 def test_frames_that_there_are_count_not_those_asked_for(
     cli: Cli, tmp_path: Path
 ) -> None:

@@ -9,10 +9,9 @@ import onnx_ir as ir
 import pytest
 
 from me2e_compress import graph
-from me2e_compress.graph import rewrite
 from tests.command import Cli, write_frames
 from tests.frames import record
-from tests.nets import save_text
+from tests.nets import parsed, save_text, stored
 
 ABLATE = "compress in.onnx --passes ablate-modules{drop=[occ]} --map map.toml"
 INT8 = "--scheme full --frames frames --map map.toml"
@@ -136,20 +135,17 @@ def test_an_open_dimension_is_proven_at_drawn_sizes_unless_nobody_asks(
 def test_an_open_batch_gets_one_size_for_every_command(
     cli: Cli, tmp_path: Path
 ) -> None:
-    model = ir.from_onnx_text(
-        '<ir_version: 9, opset_import: ["" : 17]>\n'
-        "m (float[batch,16,8,8] image) => (float[batch,64] y)"
-        " <int64[2] flat = {-1, 32}> { a = Conv(image, w)"
-        " p = GlobalAveragePool(a) f = Reshape(p, flat) y = Gemm<transB=1>(f, l) }"
-    )
     draws = np.random.default_rng(0)
-    for node, name, shape in (
-        (model.graph[0], "w", (32, 16, 3, 3)),
-        (model.graph[3], "l", (64, 32)),
-    ):
-        weight = draws.normal(size=shape).astype(np.float32)
-        made = rewrite.add_constant(model.graph, weight, name)
-        node.replace_input_with(1, made)
+    weights = {"w": draws.normal(size=(32, 16, 3, 3)), "l": draws.normal(size=(64, 32))}
+    model = stored(
+        parsed(
+            """m (float[batch,16,8,8] image, float[32,16,3,3] w, float[64,32] l)
+            => (float[batch,64] y) <int64[2] flat = {-1, 32}> {
+        a = Conv(image, w) p = GlobalAveragePool(a)
+        f = Reshape(p, flat) y = Gemm<transB=1>(f, l) }"""
+        ),
+        {name: array.astype(np.float32) for name, array in weights.items()},
+    )
     graph.save(model, tmp_path / "m.onnx")
     frame = draws.normal(size=(1, 16, 8, 8)).astype(np.float32)
     record(tmp_path / "frames", [{"image": frame}] * 2)

@@ -51,7 +51,9 @@ def installed(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     save_text(tmp_path / "m.onnx", MODEL)
 
 
-def test_a_log_of_another_package_becomes_frames(cli: Cli, tmp_path: Path) -> None:
+def test_a_log_of_another_package_becomes_the_frames_that_it_is_asked_for(
+    cli: Cli, tmp_path: Path
+) -> None:
     found = cli.document("frames m.onnx --from rides:log -n 3 -o out")
 
     assert (found["frames"], found["seed"]) == (3, None)
@@ -59,12 +61,8 @@ def test_a_log_of_another_package_becomes_frames(cli: Cli, tmp_path: Path) -> No
     recording = CalibrationSet(tmp_path / "out")
     assert recording.scenes == (0, 2)
     assert [each.arrays["img"][0, 0, 0, 0] for each in recording] == [4.0, 4.5, 5.0]
-
-
-def test_a_log_is_told_what_is_asked_for(cli: Cli, tmp_path: Path) -> None:
     line = "--from rides:log --adapter vad-tiny -n 2 --scene-length 1"
-    cli.done(f"frames m.onnx {line} -o out")
-
+    cli.done(f"frames m.onnx {line} -o other")
     assert Rides.requests[-1] == LogRequest(
         Path("m.onnx"), 2, 1, adapter_file(Path("vad-tiny"))
     )

@@ -92,7 +92,7 @@ def test_evaluate_drives_it_and_names_everything_that_could_drive(
 
 @pytest.mark.parametrize("name", shipped.SHIPPED)
 def test_export_copies_it(cli: Cli, weights: Path, name: str) -> None:
-    cli.done(f"export {name} -o mine.onnx")
+    assert cli.document(f"export {name} -o mine.onnx")["output"] == "mine.onnx"
 
     mine = (cli.folder / "mine.onnx").read_bytes()
     assert mine == (weights / f"{name}.onnx").read_bytes()

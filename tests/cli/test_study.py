@@ -62,7 +62,7 @@ def toml(tmp_path: Path) -> Path:
 
 
 @pytest.mark.usefixtures("toml")
-def test_a_study_leaves_a_report_and_prints_its_tables(
+def test_a_study_leaves_a_report_prints_its_tables_and_json_is_the_file(
     cli: Cli, tmp_path: Path
 ) -> None:
     shown = cli.done("study study.toml -o out").out
@@ -73,15 +73,10 @@ def test_a_study_leaves_a_report_and_prints_its_tables(
     assert files >= {"study.json", "tables.md", "report.html", "records", "traces"}
     text = (tmp_path / "out" / "report.html").read_text()
     assert "me2e-compress study study.toml -o" in text
-
-
-@pytest.mark.usefixtures("toml")
-def test_json_is_the_file(cli: Cli, tmp_path: Path) -> None:
-    shown = cli.document("study study.toml -o out")
-
+    shown_json = cli.document("study study.toml -o out")
     saved = json.loads((tmp_path / "out" / "study.json").read_text())
-    assert saved == IN_JSON | {key: shown[key] for key in saved if key in shown}
-    assert [each["scheme"] for each in shown["drives"]] == ["float", "exact"]
+    assert saved == IN_JSON | {k: shown_json[k] for k in saved if k in shown_json}
+    assert [each["scheme"] for each in shown_json["drives"]] == ["float", "exact"]
 
 
 @pytest.mark.parametrize(

@@ -19,7 +19,7 @@ from me2e_compress.simulator.routes import save_routes
 from me2e_compress.workflows.lint import asked_of
 from me2e_compress.workflows.options import LintOptions
 from tests.command import Cli, write_frames
-from tests.evaluators.highway.drivers import PARKED, straight_on
+from tests.evaluators.highway.drivers import PARKED, slow_here, straight_on
 
 CONVOLUTIONS = """
     <ir_version: 9, opset_import: ["" : 17]>
@@ -160,17 +160,9 @@ def test_profile_and_compare_say_it_of_files_of_whoever(cli: Cli, model: Path) -
     assert cli.document("compare m.onnx out.onnx frames")["slow_here"] == {}
 
 
-TURNED = """
-    q = QuantizeLinear(ahead, s, z) d = DequantizeLinear(q, s, z)
-    v = DequantizeLinear(w, s, z) m = MatMul(d, v) plan = Add(m, b)"""
-GRID = (
-    ", float s = {0.1}, int8 z = {0}, int8[2,2] w = {10, 0, 0, 10}, float[2] b = {0, 0}"
-)
-
-
 def test_evaluate_says_it_of_the_file_that_drives(cli: Cli, tmp_path: Path) -> None:
     save_routes((PARKED,), tmp_path / "routes.json")
-    straight_on(tmp_path / "slow.onnx", body=TURNED, initializers=GRID)
+    slow_here(tmp_path / "slow.onnx")
     straight_on(tmp_path / "float.onnx")
 
     line = "--routes routes.json --latency none -o"

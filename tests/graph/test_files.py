@@ -10,20 +10,14 @@ from me2e_compress import graph
 from me2e_compress.errors import GraphError
 from me2e_compress.graph import files
 from me2e_compress.registry.drafts import BYTES
+from tests.nets import parsed, stored
 
 
 def weighted(rows: int = 64) -> ir.Model:
     """x @ w with a weight that is worth a file of its own."""
-    model = ir.from_onnx_text(
-        '<ir_version: 9, opset_import: ["" : 17]>\n'
-        f"m (float[1,{rows}] x, float[{rows},8] w) => (float[1,8] y)"
-        " { y = MatMul(x, w) }"
-    )
-    w = model.graph.inputs.pop(1)
+    ports = f"(float[1,{rows}] x, float[{rows},8] w) => (float[1,8] y)"
     draws = np.random.default_rng(0).normal(size=(rows, 8)).astype(np.float32)
-    w.const_value = ir.tensor(draws, name="w")
-    model.graph.register_initializer(w)
-    return model
+    return stored(parsed(f"m {ports} {{ y = MatMul(x, w) }}"), {"w": draws})
 
 
 def test_a_saved_graph_comes_back_as_it_was(tmp_path: Path) -> None:

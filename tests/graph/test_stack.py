@@ -9,6 +9,7 @@ import pytest
 from me2e_compress import graph
 from me2e_compress.errors import GraphError
 from me2e_compress.graph.modules import ModuleMap
+from me2e_compress.graph.rewrite import add_constant
 from me2e_compress.graph.stack.join import End, JoinedStack
 from me2e_compress.graph.stack.split import split_stack
 from me2e_compress.manager import PassManager, recipe
@@ -278,11 +279,8 @@ def test_what_a_pass_took_away_is_missing_from_its_part(tmp_path: Path) -> None:
     body = stack.model.graph
     (add,) = (each for each in body if each.op_type == "Add")
     (state,) = (each for each in body.inputs if each.name == "prev_bev")
-    zeros = ir.tensor(np.zeros((1, 4), np.float32), name="zeros")
-    value = ir.Value(name="zeros", type=state.type, shape=state.shape)
-    value.const_value = zeros
-    body.register_initializer(value)
-    add.replace_input_with(1, value)
+    zeros = add_constant(body, np.zeros((1, 4), np.float32), "zeros")
+    add.replace_input_with(1, zeros)
     body.remove(
         [each for each in body if each.op_type == "Mul" and each.name == "/head/Mul"]
     )

@@ -21,7 +21,7 @@ from me2e_compress.runtime.providers import CpuProvider
 from me2e_compress.runtime.session import run_once
 from me2e_compress.testing import check_pass
 from tests.frames import record
-from tests.nets import MODULES, conv_attention
+from tests.nets import MODULES, conv_attention, parsed, stored
 from tests.passes.small import bare, casts, compute, fed, types_of
 
 OPSET = '<ir_version: 9, opset_import: ["" : 17, "trt" : 1]>\n'
@@ -160,13 +160,8 @@ def test_no_scale_becomes_zero_or_loses_its_digits(faint: float) -> None:
     scales = random.uniform(0.002, 0.004, 32).astype(np.float32)
     scales[::4] = random.uniform(0.5, 1, 8) * faint
     integers = random.integers(-127, 128, (32, 8, 3, 3)).astype(np.int8)
-    model = ir.from_onnx_text(FAINT)
-    stored: dict[str, Any] = {"w": integers, "s": scales, "z": np.zeros(32, np.int8)}
-    for value in list(model.graph.inputs):
-        if value.name in stored:
-            model.graph.inputs.remove(value)
-            value.const_value = ir.tensor(stored[value.name], name=value.name)
-            model.graph.register_initializer(value)
+    weights: dict[str, Any] = {"w": integers, "s": scales, "z": np.zeros(32, np.int8)}
+    model = stored(parsed(FAINT), weights)
     graph.infer_shapes(model)
     exact = integers * scales.astype(np.float64).reshape(-1, 1, 1, 1)
 

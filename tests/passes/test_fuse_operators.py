@@ -17,6 +17,7 @@ from me2e_compress.operators import expand
 from me2e_compress.operators.deformable_attention import DeformableAttention
 from me2e_compress.passes.base import PassResult
 from me2e_compress.passes.fuse_operators import FuseOperators, numeric_check
+from tests.nets import stored
 from tests.passes.decomposed import FUSED, Sizes, decomposed, inferred, plain
 from tests.passes.small import NO_MODULES, apply, compute, fed, ops, read
 from tests.profiles import scaled
@@ -198,13 +199,12 @@ def test_images_side_by_side_are_one_level() -> None:
 def test_operands_of_constants_are_computed() -> None:
     model = decomposed(Sizes(n=1))
     random = np.random.default_rng(SEED)
-    for name in ("locations", "weights"):
-        (port,) = (port for port in model.graph.inputs if port.name == name)
-        array = random.uniform(size=static_shape(port)).astype(np.float32)
-        model.graph.inputs.remove(port)
-        port.const_value = ir.tensor(array, name=name)
-        model.graph.register_initializer(port)
-    fused(model)
+    known = {
+        str(port.name): random.uniform(size=static_shape(port)).astype(np.float32)
+        for port in model.graph.inputs
+        if port.name in ("locations", "weights")
+    }
+    fused(stored(model, known))
     assert ops(model) == [FUSED, "Reshape"]
 
 

@@ -46,7 +46,7 @@ def context(frames: CalibrationSet) -> Context:
     return Context(MODULES, frames)
 
 
-def test_the_quantized_graph_runs_and_stays_close(
+def test_the_quantized_graph_runs_stays_close_and_carries_its_plan(
     context: Context, frames: CalibrationSet
 ) -> None:
     model = conv_attention()
@@ -57,6 +57,10 @@ def test_the_quantized_graph_runs_and_stays_close(
     assert result.changes == 4
     # 8 bits give about 6 dB each; two attention products and two layers cost some
     assert all(20 < each.sqnr_db < 60 for each in found.outputs)
+    plan = plan_of(result.model)
+    assert plan is not None
+    assert (plan.rules, plan.target) == ("paper", "tensorrt")
+    assert len(plan.decisions) == 10
 
 
 ATTENTION, SAFE = {"rules": "paper", "target": "tensorrt"}, {"target": "tensorrt"}
@@ -154,14 +158,6 @@ def test_a_quantized_graph_is_not_quantized_again(context: Context) -> None:
     message = str(caught.value)
     assert "quantized already: 7 DequantizeLinear, 5 QuantizeLinear" in message
     assert "int8 with zero points 0; it carries the plan it was made by" in message
-
-
-def test_the_graph_carries_its_plan(context: Context) -> None:
-    plan = plan_of(QuantizeInt8(target="tensorrt").run(conv_attention(), context).model)
-
-    assert plan is not None
-    assert (plan.rules, plan.target) == ("safe", "tensorrt")
-    assert len(plan.decisions) == 10
 
 
 def test_overrides_are_read_from_a_file(context: Context, tmp_path: Path) -> None:
@@ -294,24 +290,21 @@ def scales(model: ir.Model) -> set[str]:
     }
 
 
-def test_scales_are_of_the_type_of_the_graph(context: Context) -> None:
-    source = half(19, context)
-    placed = check_pass(PAPER, source, context).model
-
-    assert scales(placed) == {"FLOAT16"}
-    assert TensorRT(version="10.7").lint(placed) == ()
-    found = compare(Session(source), Session(placed), list(context.frames or ()))
+def test_scales_are_of_the_type_of_the_graph_and_so_if_float16_comes_behind(
+    context: Context,
+) -> None:
+    wide = half(19, context)
+    placed = check_pass(PAPER, wide, context).model
+    found = compare(Session(wide), Session(placed), list(context.frames or ()))
     assert min(each.sqnr_db for each in found.outputs) > 20
-
-
-def test_int8_first_and_float16_then_gives_the_same_types(context: Context) -> None:
     source = conv_attention()
     source.opset_imports[""] = 19
     int8 = check_pass(PAPER, source, context).model
     both = check_pass(ConvertFloat16(), int8, context).model
 
-    assert scales(both) == {"FLOAT16"}
-    assert TensorRT(version="10.7").lint(both) == ()
+    for made in (placed, both):
+        assert scales(made) == {"FLOAT16"}
+        assert TensorRT(version="10.7").lint(made) == ()
     weights = {v.dtype.name for v in both.graph.initializers.values() if v.dtype}
     assert weights == {"FLOAT16", "INT8", "INT64"}
 

@@ -24,9 +24,7 @@ def found(text: str, domain: str = HEAD) -> dict[str, Attention]:
     return {str(node.outputs[0].name): each for node, each in attention.items()}
 
 
-def test_attentions_that_share_a_mask_keep_their_own_lengths() -> None:
-    """The mask is made of a product of its own, reached from both."""
-    text = """
+SHARED_MASK = """
     two (float[1,2,30,8] a, float[1,2,8,700] b, float[1,2,700,8] c,
          float[1,2,30,8] d, float[1,2,8,40] e, float[1,2,40,8] f,
          float[1,1,4] m, float[1,4,1] n) => (float[1,2,30,8] y, float[1,2,30,8] z) {
@@ -40,17 +38,9 @@ def test_attentions_that_share_a_mask_keep_their_own_lengths() -> None:
         q = Softmax(covered)
         z = MatMul(q, f)
     }
-    """
-    assert found(text) == {
-        "s": Attention(30, 700),
-        "y": Attention(30, 700),
-        "t": Attention(30, 40),
-        "z": Attention(30, 40),
-    }
-
-
-def test_an_attention_that_reads_another_is_told_apart() -> None:
-    text = """
+"""
+"""The mask is made of a product of its own, reached from both."""
+CHAIN = """
     chain (float[2,8] x, float[8,9] k, float[9,8] v, float[8,7] l, float[7,5] w)
         => (float[2,5] y) {
         s = MatMul(x, k)
@@ -60,13 +50,21 @@ def test_an_attention_that_reads_another_is_told_apart() -> None:
         q = Softmax(t)
         y = MatMul(q, w)
     }
-    """
-    assert found(text) == {
-        "s": Attention(2, 9),
-        "mixed": Attention(2, 9),
-        "t": Attention(2, 7),
-        "y": Attention(2, 7),
-    }
+"""
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        (SHARED_MASK, {"s": (30, 700), "y": (30, 700), "t": (30, 40), "z": (30, 40)}),
+        (CHAIN, {"s": (2, 9), "mixed": (2, 9), "t": (2, 7), "y": (2, 7)}),
+    ],
+)
+def test_attentions_beside_or_behind_each_other_keep_their_own_lengths(
+    text: str, expected: dict[str, tuple[int, int]]
+) -> None:
+    told = {name: (each.queries, each.keys) for name, each in found(text).items()}
+    assert told == expected
 
 
 def test_two_products_added_up_are_one_attention() -> None:

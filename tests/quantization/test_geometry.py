@@ -129,42 +129,49 @@ BEHIND = """c (float[1,6,4,4] lidar2img, float[1,6,32,9,9] image, float[4,200] p
 LEARNED = {"points": (4, 200), "w": (32, 32), "v": (32, 32), "embed": (2, 32)}
 
 
-def test_layers_on_sampled_or_embedded_features_are_no_geometry() -> None:
-    found = by_output(planned(BEHIND, LEARNED, ALONE))
-
-    rules = {name: found[name].rule for name in ("p", "h", "e", "y", "s")}
-    assert rules == {
-        "p": "geometry",  # the projection
-        "h": "layer",  # reads what was sampled there
-        "e": "geometry",  # reads pixels
-        "y": "layer",  # reads what the layer before made of them
-        "s": "layer",  # reads sines
-    }
-
-
-def test_an_encoder_of_flat_matrices_is_the_last_to_read_them() -> None:
-    text = """c (float[6,4,4] lidar2img, float[16,64] w, float[64,64] v) => (float y)
-        <int64[2] flat = {6, 16}> {
-        f = Reshape(lidar2img, flat) a = MatMul(f, w) r = Relu(a) y = MatMul(r, v)
-    }"""
-    found = by_output(planned(text, {"w": (16, 64), "v": (64, 64)}, ALONE))
-
-    assert (found["a"].rule, found["y"].rule) == ("geometry", "layer")
+FLAT = """c (float[6,4,4] lidar2img, float[16,64] w, float[64,64] v) => (float y)
+    <int64[2] flat = {6, 16}> {
+    f = Reshape(lidar2img, flat) a = MatMul(f, w) r = Relu(a) y = MatMul(r, v)
+}"""
+PIXELS = """c (float[6,4,4] lidar2img, float[6,50,32] query, float[32,3] to_points,
+    float[6,50,1] one, float[4,32] embed, float[32,32] w) => (float y) {
+    l = MatMul(query, to_points) h = Concat<axis = 2>(l, one)
+    t = Transpose<perm = [0,2,1]>(h) p = MatMul(lidar2img, t)
+    rows = Transpose<perm = [0,2,1]>(p) e = MatMul(rows, embed)
+    both = Add(e, query) y = MatMul(both, w)
+}"""
 
 
-def test_learned_points_become_pixels_and_end_in_the_layer_that_reads_them() -> None:
-    text = """c (float[6,4,4] lidar2img, float[6,50,32] query, float[32,3] to_points,
-        float[6,50,1] one, float[4,32] embed, float[32,32] w) => (float y) {
-        l = MatMul(query, to_points) h = Concat<axis = 2>(l, one)
-        t = Transpose<perm = [0,2,1]>(h) p = MatMul(lidar2img, t)
-        rows = Transpose<perm = [0,2,1]>(p) e = MatMul(rows, embed)
-        both = Add(e, query) y = MatMul(both, w)
-    }"""
-    shapes = {"to_points": (32, 3), "embed": (4, 32), "w": (32, 32)}
+@pytest.mark.parametrize(
+    ("text", "shapes", "rules"),
+    [
+        (
+            BEHIND,
+            LEARNED,
+            {
+                "p": "geometry",  # the projection
+                "h": "layer",  # reads what was sampled there
+                "e": "geometry",  # reads pixels
+                "y": "layer",  # reads what the layer before made of them
+                "s": "layer",  # reads sines
+            },
+        ),
+        # an encoder of flat matrices is the last to read them
+        (FLAT, {"w": (16, 64), "v": (64, 64)}, {"a": "geometry", "y": "layer"}),
+        # learned points become pixels and end in the layer that reads them
+        (
+            PIXELS,
+            {"to_points": (32, 3), "embed": (4, 32), "w": (32, 32)},
+            {"l": "layer", "p": "weight", "e": "geometry", "y": "layer"},
+        ),
+    ],
+)
+def test_where_geometry_ends(
+    text: str, shapes: dict[str, tuple[int, ...]], rules: dict[str, str]
+) -> None:
     found = by_output(planned(text, shapes, ALONE))
 
-    rules = {name: found[name].rule for name in ("l", "p", "e", "y")}
-    assert rules == {"l": "layer", "p": "weight", "e": "geometry", "y": "layer"}
+    assert {name: found[name].rule for name in rules} == rules
 
 
 @pytest.mark.parametrize(

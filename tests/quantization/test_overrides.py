@@ -11,9 +11,7 @@ from me2e_compress.graph.provenance import Provenance
 from me2e_compress.quantization.decision import Overrides, QuantPlan
 from me2e_compress.quantization.plan import make_plan
 from me2e_compress.quantization.scheme import QuantScheme
-from tests.nets import MODULES, PAPER, conv_attention
-
-FULL = QuantScheme.named("full", MODULES)
+from tests.nets import FULL, MODULES, PAPER, conv_attention
 
 
 def planned(text: str, scheme: str = "full") -> QuantPlan:
@@ -38,28 +36,28 @@ def test_nodes_are_kept_in_float_by_glob_module_and_operator(matcher: str) -> No
     assert [each.reason for each in said] == ["loses 3 dB"] * 2
 
 
-def test_all_readers_of_a_tensor_are_one_group() -> None:
-    plan = planned('[[override]]\nreads = "q"\ndtype = "float"')
-
-    # the product of queries and keys reads it, and so does that with the values
-    assert chosen(plan) == ["/backbone/Conv", "/head/Linear"]
+HEAD = '[[override]]\nmodule = "head"\ndtype = '
 
 
-def test_an_override_beats_the_scheme() -> None:
-    text = '[[override]]\nmodule = "head"\ndtype = "int8"'
-
-    plan = planned(text, "feature-ext")
-
-    # what can be int8 in that module is; softmax and reshapes stay what they are
-    assert chosen(plan) == ["/backbone/Conv", "/head/QK", "/head/AV", "/head/Linear"]
-
-
-def test_the_later_of_two_overrides_counts() -> None:
-    text = (
-        '[[override]]\nmodule = "head"\ndtype = "float"\n'
-        '[[override]]\nnodes = "*Linear"\ndtype = "int8"'
-    )
-    assert chosen(planned(text)) == ["/backbone/Conv", "/head/Linear"]
+@pytest.mark.parametrize(
+    ("text", "scheme", "left"),
+    [
+        # the product of queries and keys reads it, and so does that with the values
+        ('[[override]]\nreads = "q"\ndtype = "float"', "full", ["Linear"]),
+        # it beats the scheme: what can be int8 in that module is
+        (f'{HEAD}"int8"', "feature-ext", ["QK", "AV", "Linear"]),
+        # the later of two counts
+        (
+            f'{HEAD}"float"\n[[override]]\nnodes = "*Linear"\ndtype = "int8"',
+            *("full", ["Linear"]),
+        ),
+    ],
+)
+def test_what_overrides_of_readers_modules_and_names_leave(
+    text: str, scheme: str, left: list[str]
+) -> None:
+    names = [f"/head/{name}" for name in left]
+    assert chosen(planned(text, scheme)) == ["/backbone/Conv", *names]
 
 
 def test_names_of_the_source_file_match_too() -> None:

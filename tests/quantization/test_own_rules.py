@@ -55,13 +55,9 @@ def test_they_decide(rules: RuleSet) -> None:
 
     assert plan.counts()["no-convolution"] == 1
     assert plan.rules == str(rules)
-
-
-def test_options_of_the_pass_reach_them() -> None:
-    quantizer = QuantizeInt8(rules=Mine(), without=("gemv", "no-convolution"))
-
+    # options of the pass reach them
+    quantizer = QuantizeInt8(rules=rules, without=("gemv", "no-convolution"))
     plan = quantizer.plan(conv_attention(), Context(MODULES))
-
     assert "no-convolution" not in plan.counts()
 
 
@@ -172,17 +168,13 @@ def test_a_layer_that_pays_more_than_it_saves_stays_float() -> None:
         " dequantize on a slow bus"
     )
     assert decisions["MatMul"].dtype == "int8"
+    plan = priced(dear, '[[override]]\nop = "Conv"\ndtype = "int8"')  # it beats it
+    assert [each.rule for each in plan.chosen if each.op == "Conv"] == ["override"]
 
 
 def test_a_target_that_knows_no_costs_keeps_everything() -> None:
     assert priced(None).chosen == priced(lambda model, layers: None).chosen
     assert "cost" not in priced(None).counts()
-
-
-def test_an_override_beats_it() -> None:
-    plan = priced(dear, '[[override]]\nop = "Conv"\ndtype = "int8"')
-
-    assert [each.rule for each in plan.chosen if each.op == "Conv"] == ["override"]
 
 
 @pytest.mark.parametrize(
@@ -213,29 +205,37 @@ def test_a_join_is_int8_between_int8(int8: set[ir.Node], paid: float) -> None:
     assert border.paid_s(int8) == paid
 
 
-def test_a_slow_layer_between_fast_ones_stays_int8() -> None:
-    saved = {A: 9.0, B: -1.0, C: 9.0}
-    borders = (
-        Border(1.0, 1.0, frozenset({A}), frozenset({B})),
-        Border(1.0, 1.0, frozenset({B}), frozenset({C})),
+def between(costs: float, readers: set[ir.Node], *makers: ir.Node) -> Border:
+    return Border(
+        costs, costs if makers else 0.0, frozenset(makers), frozenset(readers)
     )
 
-    assert Costs("", saved, borders).losses([A, B, C]) == {}
 
+@pytest.mark.parametrize(
+    ("saved", "borders", "lost"),
+    [
+        # a slow layer between fast ones stays int8
+        (
+            {A: 9.0, B: -1.0, C: 9.0},
+            (between(1.0, {B}, A), between(1.0, {C}, B)),
+            {},
+        ),
+        # layers that only pay each other go together
+        (
+            {A: 1.0, B: 1.0, C: 9.0},
+            (between(3.0, {A}), between(3.0, {B}, A)),
+            dict.fromkeys((A, B), "(2 layers together)"),
+        ),
+        # a layer of unknown cost is not judged
+        ({}, (Border(5.0, 5.0, readers=frozenset({A})),), {}),
+    ],
+)
+def test_layers_that_lose_go(
+    saved: dict[ir.Node, float],
+    borders: tuple[Border, ...],
+    lost: dict[ir.Node, str],
+) -> None:
+    losses = Costs("", saved, borders).losses(list(saved) or [A])
 
-def test_layers_that_only_pay_each_other_go_together() -> None:
-    saved = {A: 1.0, B: 1.0, C: 9.0}
-    borders = (
-        Border(3.0, 0.0, readers=frozenset({A})),
-        Border(3.0, 3.0, frozenset({A}), frozenset({B})),
-    )
-    losses = Costs("", saved, borders).losses([A, B, C])
-
-    assert list(losses) == [A, B]
-    assert "(2 layers together)" in str(losses[A])
-
-
-def test_a_layer_of_unknown_cost_is_not_judged() -> None:
-    borders = (Border(5.0, 5.0, readers=frozenset({A})),)
-
-    assert Costs("", {}, borders).losses([A]) == {}
+    assert list(losses) == list(lost)
+    assert all(words in str(losses[node]) for node, words in lost.items())

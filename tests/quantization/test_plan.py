@@ -24,7 +24,7 @@ from me2e_compress.quantization.rules.rule_sets import PaperRules, SafeRules
 from me2e_compress.quantization.scheme import QuantScheme
 from me2e_compress.workflows.int8_outcome import FloatWeight, float_weights
 from tests.calls import calls
-from tests.nets import MODULES, PAPER, conv_attention, net
+from tests.nets import FULL, MODULES, PAPER, conv_attention, net
 
 HEAD = QuantScheme.of(("head",), MODULES)
 
@@ -182,7 +182,7 @@ def test_a_constant_on_the_left_is_coordinate_arithmetic() -> None:
 def test_every_node_has_a_decision_a_module_and_a_reason() -> None:
     model = conv_attention()
 
-    plan = make_plan(model, QuantScheme.named("full", MODULES), PAPER)
+    plan = make_plan(model, FULL, PAPER)
 
     assert [each.node for each in plan.decisions] == [node.name for node in model.graph]
     assert all(each.reason and each.module for each in plan.decisions)
@@ -263,29 +263,19 @@ def test_an_open_batch_changes_no_decision(
 # Plans on disk, in a model, and side by side.
 
 
-FULL = QuantScheme.named("full", MODULES)
-
-
-def test_a_saved_plan_reads_back_the_same(tmp_path: Path) -> None:
-    plan = make_plan(conv_attention(), FULL, PAPER)
-
-    save_plan(plan, tmp_path / "plan.json")
-
-    assert load_plan(tmp_path / "plan.json") == plan
-
-
-def test_a_model_carries_its_plan_through_a_file(tmp_path: Path) -> None:
+def test_a_saved_plan_reads_back_the_same_and_a_model_carries_it(
+    tmp_path: Path,
+) -> None:
     model = conv_attention()
     plan = make_plan(model, FULL, PAPER)
+    assert plan_of(model) is None
 
+    save_plan(plan, tmp_path / "plan.json")
     stamp_plan(model, plan)
     graph.save(model, tmp_path / "m.onnx")
 
+    assert load_plan(tmp_path / "plan.json") == plan
     assert plan_of(graph.load(tmp_path / "m.onnx")) == plan
-
-
-def test_a_model_without_a_plan_has_none() -> None:
-    assert plan_of(conv_attention()) is None
 
 
 def test_differences_name_what_changed_and_by_which_rule() -> None:

@@ -7,13 +7,17 @@ import onnx_ir as ir
 import pytest
 
 from me2e_compress.calibration.ranges import Ranges
-from me2e_compress.quantization.decision import Decision, Overrides, QuantPlan
-from me2e_compress.quantization.plan import make_plan, share_scales, sharing_costs
+from me2e_compress.graph.rewrite import add_constant
+from me2e_compress.quantization.plan import (
+    Decision,
+    Overrides,
+    QuantPlan,
+    make_plan,
+    share_scales,
+    sharing_costs,
+)
 from me2e_compress.quantization.rules import RULE_SETS
-from me2e_compress.quantization.scheme import QuantScheme
-from tests.nets import MODULES, PAPER, net
-
-FULL = QuantScheme.named("full", MODULES)
+from tests.nets import FULL, PAPER, net
 
 BLOCK = """
 block (float[1,16,8,8] x, float[16,16,1,1] w1, float[16,16,1,1] w2,
@@ -74,10 +78,8 @@ def test_other_adds_stay_float(branch: str, operands: str) -> None:
 def test_an_add_of_a_constant_is_no_residual() -> None:
     model = block("same = Identity(x)", "main, x")
     node = next(each for each in model.graph if each.op_type == "Add")
-    table = ir.tensor(np.ones((1, 16, 8, 8), np.float32), name="table")
-    value = ir.Value(name="table", const_value=table, shape=ir.Shape((1, 16, 8, 8)))
-    model.graph.register_initializer(value)
-    node.replace_input_with(1, value)
+    table = add_constant(model.graph, np.ones((1, 16, 8, 8), np.float32), "table")
+    node.replace_input_with(1, table)
 
     assert addition(make_plan(model, FULL, PAPER)).dtype == "float"
 
@@ -90,25 +92,19 @@ def test_a_batch_normalization_does_not_hide_the_convolution() -> None:
     assert (found.rule, found.activations) == ("residual", (1,))
 
 
-def test_the_add_goes_with_its_convolution() -> None:
-    overrides = Overrides.parse('[[override]]\nnodes = "/backbone/3"\ndtype = "float"')
+@pytest.mark.parametrize(
+    ("kept", "rule", "layers"),
+    [('nodes = "/backbone/3"', "operator", 1), ('op = "Add"', "override", 2)],
+)
+def test_the_add_goes_with_its_convolution_and_can_be_kept_in_float_alone(
+    kept: str, rule: str, layers: int
+) -> None:
+    overrides = Overrides.parse(f'[[override]]\n{kept}\ndtype = "float"')
 
-    plan = make_plan(
-        block("i = Identity(x)", "main, x"), FULL, PAPER, overrides=overrides
-    )
+    plan = make_plan(block("i = Identity(x)", "main, x"), FULL, PAPER, overrides)
 
-    assert addition(plan).dtype == "float"
-
-
-def test_the_add_alone_can_be_kept_in_float() -> None:
-    overrides = Overrides.parse('[[override]]\nop = "Add"\ndtype = "float"')
-
-    plan = make_plan(
-        block("i = Identity(x)", "main, x"), FULL, PAPER, overrides=overrides
-    )
-
-    assert (addition(plan).dtype, addition(plan).rule) == ("float", "override")
-    assert plan.counts() == {"layer": 2}
+    assert (addition(plan).dtype, addition(plan).rule) == ("float", rule)
+    assert plan.counts()["layer"] == layers
 
 
 def test_readers_of_a_tensor_are_a_group() -> None:

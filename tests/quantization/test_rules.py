@@ -305,26 +305,21 @@ def rules(height: int, rule_set: str) -> dict[str, str]:
     return {name: each.rule for name, each in decisions(height, rule_set).items()}
 
 
-def test_layers_that_see_the_status_alone_stay_float() -> None:
-    found = rules(32, "safe")
-
-    assert (found["e"], found["f"]) == ("ego-input", "ego-input")
-
-
 @pytest.mark.parametrize(
-    ("output", "why"),
+    ("output", "rule", "why"),
     [
-        ("m", "a memory is no status"),
-        ("y", "a map that the status was added to is a map"),
-        ("z", "it sees the image too"),
+        ("e", "ego-input", "it sees the status alone"),
+        ("f", "ego-input", "it sees the status alone"),
+        ("m", "layer", "a memory is no status"),
+        ("y", "layer", "a map that the status was added to is a map"),
+        ("z", "layer", "it sees the image too"),
     ],
 )
-def test_other_layers_do_not(output: str, why: str) -> None:
-    assert rules(32, "safe")[output] == "layer", why
-
-
-def test_a_graph_without_sensors_has_no_status() -> None:
-    assert rules(1, "safe")["e"] == "layer"
+def test_layers_that_see_the_status_alone_stay_float(
+    output: str, rule: str, why: str
+) -> None:
+    assert rules(32, "safe")[output] == rule, why
+    assert rules(1, "safe")["e"] == "layer"  # without sensors there is no status
 
 
 def test_other_rules_flag_it() -> None:

@@ -27,6 +27,7 @@ from me2e_compress.runtime.runnable import runnable
 from me2e_compress.runtime.session import Session
 from tests.frames import record
 from tests.manager.transformer import transformer
+from tests.nets import parsed, stored
 from tests.passes.small import EVERYTHING, read
 from tests.targets.onnxruntime.rewritten import Drawn
 
@@ -59,13 +60,7 @@ def layer(product: str = PRODUCT, seed: int = 0) -> ir.Model:
         "b": random.integers(-9999, 9999, 5).astype(np.int32),
         "bs": scales * np.float32(0.031),
     }
-    model = ir.from_onnx_text(LAYER.replace("PRODUCT", product))
-    for value in list(model.graph.inputs):
-        if str(value.name) in arrays:
-            model.graph.inputs.remove(value)
-            value.const_value = ir.tensor(arrays[str(value.name)], name=value.name)
-            model.graph.register_initializer(value)
-    return model
+    return stored(parsed(LAYER.replace("PRODUCT", product)), arrays)
 
 
 def drawn(seed: int = 1) -> dict[str, npt.NDArray[np.float32]]:
@@ -82,7 +77,7 @@ def ran(
 
 def test_a_product_gives_what_rounding_both_operands_gives() -> None:
     model, fed = layer(), drawn()
-    stored = {
+    held = {
         name: value.const_value.numpy().astype(np.float64)
         for name, value in model.graph.initializers.items()
         if value.const_value is not None
@@ -94,7 +89,7 @@ def test_a_product_gives_what_rounding_both_operands_gives() -> None:
     step = float(np.float32(0.031))
     integers = np.clip(np.rint(fed["x"].astype(np.float64) / step) + 120, 0, 255)
     rounded = (integers.reshape(6, 8) - 120) * step
-    want = rounded @ (stored["w"] * stored["ws"]) + stored["b"] * stored["bs"]
+    want = rounded @ (held["w"] * held["ws"]) + held["b"] * held["bs"]
     np.testing.assert_allclose(got, want, rtol=1e-5, atol=1e-5)
     assert not any(node.op_type == "DequantizeLinear" for node in model.graph)
 

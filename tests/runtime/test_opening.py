@@ -11,7 +11,7 @@ from me2e_compress.graph.files import external_tensors
 from me2e_compress.graph.rewrite import add_constant
 from me2e_compress.runtime.kernel_types import without_kernel
 from me2e_compress.runtime.session import Session, open_graph
-from tests.nets import net, parsed
+from tests.nets import net, parsed, stored
 from tests.passes import onnx_cases
 
 TEXT = """
@@ -119,11 +119,7 @@ def test_int8_activations_run_at_every_opset(opset: int) -> None:
     random = np.random.default_rng(opset)
     w, b = random.integers(-127, 128, (32, 64)).astype(np.int8), random.normal(size=64)
     x = random.uniform(-3, 3, (1, 8, 32)).astype(np.float32)
-    model = net(text, {"b": b})
-    port = next(value for value in model.graph.inputs if value.name == "w")
-    model.graph.inputs.remove(port)
-    port.const_value = ir.tensor(w, name="w")
-    model.graph.register_initializer(port)
+    model = stored(net(text, {"b": b}), {"w": w})
 
     found = Session(model, threads=1).run({"x": x})["y"]
 

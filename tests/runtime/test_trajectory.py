@@ -15,25 +15,28 @@ def read(adapter: PlanAdapter, way: np.ndarray, **inputs: np.ndarray) -> Traject
     return adapter.trajectory(adapter.plan({"way": way}, inputs))
 
 
-def test_four_waypoints_every_half_second() -> None:
-    """TCP's."""
-    found = read(PlanAdapter(output="way", step_s=0.5), OUT["way"])
-
-    assert found.points.tolist() == OUT["way"][0].tolist()
-    assert found.times_s.tolist() == [0.5, 1.0, 1.5, 2.0]
+THIRTY = np.zeros((1, 30, 2))
 
 
-def test_times_are_whole_microseconds() -> None:
-    found = read(PlanAdapter(output="way", step_s=0.1), np.zeros((1, 30, 2)))
+@pytest.mark.parametrize(
+    ("step_s", "first_s", "way", "left", "times_s"),
+    [
+        (0.5, None, OUT["way"], 4, {0: 0.5, 1: 1.0, 2: 1.5, 3: 2.0}),  # TCP's
+        (0.1, None, THIRTY, 30, {2: 0.3, 29: 3.0}),  # whole microseconds
+        (0.2, -0.2, OUT["way"], 2, {0: 0.2, 1: 0.4}),  # without now and before
+    ],
+)
+def test_waypoints_have_their_times(
+    step_s: float,
+    first_s: float | None,
+    way: np.ndarray,
+    left: int,
+    times_s: dict[int, float],
+) -> None:
+    found = read(PlanAdapter(output="way", step_s=step_s, first_s=first_s), way)
 
-    assert found.times_s[[2, 29]].tolist() == [0.3, 3.0]
-
-
-def test_waypoints_of_now_and_before_are_dropped() -> None:
-    found = read(PlanAdapter(output="way", step_s=0.2, first_s=-0.2), OUT["way"])
-
-    assert found.points.tolist() == [[4.0, 5.0], [6.0, 7.0]]
-    assert found.times_s.tolist() == [0.2, 0.4]
+    assert found.points.tolist() == way[0, -left:].tolist()
+    assert {at: found.times_s[at] for at in times_s} == times_s
 
 
 def test_six_alone_need_no_spacing() -> None:

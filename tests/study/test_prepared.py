@@ -13,7 +13,7 @@ from me2e_compress.study.prepared import PreparedVariant, prepare_variant
 from me2e_compress.study.workspace import Workspace
 from me2e_compress.workflows.result import SILENT
 from tests.command import write_frames
-from tests.evaluators.highway.drivers import straight_on
+from tests.evaluators.highway.drivers import slow_here, straight_on
 from tests.stand_in import write_model
 from tests.study.conftest import Make
 
@@ -41,14 +41,6 @@ def write_images(folder: Path, seed: int) -> None:
 
 def made(study: Study, folder: Path) -> PreparedVariant:
     return prepare_variant(study, study.variants[0], Workspace(folder), SILENT)
-
-
-@pytest.fixture
-def no_passes(monkeypatch: pytest.MonkeyPatch) -> None:
-    def run(*_: object) -> None:
-        raise AssertionError("the passes ran again")
-
-    monkeypatch.setattr(PassManager, "run", run)
 
 
 def test_passes_are_run_on_a_model_that_ships(make: Make, tmp_path: Path) -> None:
@@ -88,25 +80,6 @@ def test_the_checkpoint_of_a_model_is_kept(study: Study, tmp_path: Path) -> None
     assert made(plain, tmp_path).weights == "weights: a.pth, sha256 ab"
 
 
-def test_the_same_is_made_once(
-    study: Study, tmp_path: Path, request: pytest.FixtureRequest
-) -> None:
-    first = made(study, tmp_path)
-    request.getfixturevalue("no_passes")
-
-    assert made(study, tmp_path) == first
-
-
-def test_a_model_without_its_report_is_made_again(study: Study, tmp_path: Path) -> None:
-    first = made(study, tmp_path)
-    assert first.model is not None
-    report = first.model.with_name(f"{first.model.stem}.report.json")
-    report.unlink()
-
-    assert made(study, tmp_path) == first
-    assert json.loads(report.read_text())["output"]["sha256"] == first.sha256
-
-
 @pytest.mark.parametrize("change", ["frames", "source", "passes", "seed"])
 def test_what_decides_the_model_decides_its_name(
     study: Study, tmp_path: Path, change: str
@@ -126,26 +99,36 @@ def test_what_decides_the_model_decides_its_name(
     assert made(study, tmp_path).model != first.model
 
 
-@pytest.mark.parametrize("damage", ["weights", "cut", "report"])
-def test_an_altered_model_is_made_again(
-    study: Study, tmp_path: Path, damage: str
+@pytest.mark.parametrize("damage", ["", "weights", "cut", "report", "no report"])
+def test_the_same_is_made_once_and_an_altered_model_again(
+    study: Study, tmp_path: Path, damage: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    def run(*_: object) -> None:
+        raise AssertionError("the passes ran again")
+
     warnings = list[str]()
     first = made(study, tmp_path)
     assert first.model is not None
-    if damage == "weights":
+    report = first.model.with_name(f"{first.model.stem}.report.json")
+    if not damage:
+        monkeypatch.setattr(PassManager, "run", run)
+    elif damage == "weights":
         write_model(first.model, seed=3)
     elif damage == "cut":
         first.model.write_bytes(first.model.read_bytes()[:-9])
+    elif damage == "report":
+        report.write_text("{}")
     else:
-        first.model.with_name(f"{first.model.stem}.report.json").write_text("{}")
+        report.unlink()
 
     listener = Listener(on_warning=warnings.append)
     again = prepare_variant(study, study.variants[0], Workspace(tmp_path), listener)
 
     assert again == first
     assert graph.sha256_of(first.model) == first.sha256
-    assert warnings == [f"{first.model}: not what its report is of: made again"]
+    assert json.loads(report.read_text())["output"]["sha256"] == first.sha256
+    told = [f"{first.model}: not what its report is of: made again"]
+    assert warnings == ([] if damage in ("", "no report") else told)
 
 
 def with_means(study: Study, file: Path) -> Study:
@@ -212,14 +195,8 @@ def test_what_made_a_file_is_read_from_the_report_beside_it(
     assert made(plain, tmp_path).pipeline == ""
 
 
-TURNED = """
-    q = QuantizeLinear(ahead, s, z) d = DequantizeLinear(q, s, z)
-    v = DequantizeLinear(w, s, z) m = MatMul(d, v) plan = Add(m, b)"""
-GRID = ", float s = {0.1}, int8 z = {0}, int8[2,2] w = {10,0,0,10}, float[2] b = {0,0}"
-
-
 def test_a_variant_in_tensorrts_form_is_warned_of(make: Make, tmp_path: Path) -> None:
-    straight_on(tmp_path / "slow.onnx", body=TURNED, initializers=GRID)
+    slow_here(tmp_path / "slow.onnx")
     straight_on(tmp_path / "float.onnx")
     variants = tuple(
         Variant(name, str(tmp_path / f"{name}.onnx")) for name in ("float", "slow")

@@ -64,7 +64,7 @@ def ours(make: Make) -> Study:
     )
 
 
-def test_one_scale_gives_the_baseline_the_median_asked_for(
+def test_one_scale_gives_the_baseline_its_median_and_each_pays_its_own_latency(
     ours: Study, paced: list[list[str]], tmp_path: Path
 ) -> None:
     clock = clock_of(ours, tmp_path)
@@ -73,17 +73,10 @@ def test_one_scale_gives_the_baseline_the_median_asked_for(
     assert clock.scale == pytest.approx(2000.0)
     assert clock.latency("fast", 50).value == pytest.approx(240.0)
     assert clock.latency("blind", 50).value is None
-
-
-@pytest.mark.usefixtures("paced")
-def test_each_variant_pays_its_own_latency(ours: Study, tmp_path: Path) -> None:
-    clock = clock_of(ours, tmp_path)
     blind, _, fast = ours.variants
-
+    pays = TraceLatency(SAMPLES, scale=clock.scale, seed=7)
     assert clock.source(fast, IDEAL, 7) == NoLatency()
-    assert clock.source(fast, DEVICE, 7) == TraceLatency(
-        SAMPLES, scale=clock.scale, seed=7
-    )
+    assert clock.source(fast, DEVICE, 7) == pays
     assert clock.source(blind, DEVICE, 7) is None
 
 

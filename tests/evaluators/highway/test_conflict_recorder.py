@@ -82,7 +82,8 @@ def test_how_near_others_are_and_when_they_are_met(
 ) -> None:
     found = recorded((ego, others))
 
-    assert found.nearest_m == (pytest.approx(nearest_m),)
+    (nearest,) = found.nearest_m
+    assert nearest == pytest.approx(nearest_m)
     assert found.ttc_s == (ttc_s,)
 
 

@@ -98,7 +98,9 @@ def test_what_a_kill_left_at_the_beginning_does_not_matter(
     assert folder.episodes() == {}
 
 
-def test_a_corrupt_file_is_named_and_driven_again(results: Path) -> None:
+def test_a_file_that_is_corrupt_or_of_another_evaluation_is_driven_again(
+    results: Path, driven_once: tuple[Path, Path]
+) -> None:
     warnings = list[str]()
     before = contents(results)
     spoiled = results / "routes" / "parked.json"
@@ -108,16 +110,8 @@ def test_a_corrupt_file_is_named_and_driven_again(results: Path) -> None:
 
     assert contents(results) == before
     assert [str(spoiled) in line for line in warnings] == [True]
-
-
-def test_a_file_of_another_evaluation_is_driven_again(
-    results: Path, driven_once: tuple[Path, Path]
-) -> None:
-    before = contents(results)
     shutil.copy(driven_once[1] / "routes" / "parked.json", results / "routes")
-
     driven(results, TWO)
-
     assert contents(results) == before
 
 

@@ -26,26 +26,6 @@ def read() -> ModuleMap:
     return ModuleMap.parse(TEXT, "mine")
 
 
-@pytest.mark.parametrize(
-    ("path", "module"),
-    [
-        ("head.cls.weight", "head"),
-        ("head.planner.mlp.0", "planner"),
-        ("head.x.ego.weight", "planner"),
-        ("ego.weight", "planner"),
-        ("trunk", "backbone"),
-        ("model.trunk.conv1", "backbone"),
-        ("model.model.trunk", "backbone"),
-        ("neck", None),
-        ("", None),
-    ],
-)
-def test_the_deepest_pattern_wins(
-    read: ModuleMap, path: str, module: str | None
-) -> None:
-    assert read.match(path) == module
-
-
 def test_on_a_tie_the_one_written_out_wins_then_the_earlier() -> None:
     both = ModuleMap.parse(
         '[modules.a]\nrole = "feature"\npatterns = ["*.x"]\n'

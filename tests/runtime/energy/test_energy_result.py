@@ -60,13 +60,9 @@ def test_what_is_saved_is_read_back(result: EnergyResult, tmp_path: Path) -> Non
     assert EnergyResult.load(tmp_path / "energy.json") == result
 
 
-def test_nothing_measured_is_null_and_says_why() -> None:
-    assert (NONE.joules, NONE.j_per_frame, NONE.low) == (None, None, None)
+def test_a_figure_stands_beside_its_interval_or_a_reason_in_its_place() -> None:
     assert NONE.headline == f"energy: not measured: {NONE.reason}"
     assert NONE.tables() == ()
-
-
-def test_a_figure_stands_beside_its_interval() -> None:
     assert FOUND.headline == "energy: 2.5 J a frame (2.4 to 2.6), nvml-total of a GPU"
     (shown,) = FOUND.tables()
     assert [cell.text for cell in shown.rows[0]] == ["gross", "2.5", "2.4", "2.6"]
@@ -75,15 +71,11 @@ def test_a_figure_stands_beside_its_interval() -> None:
 
 
 @pytest.mark.parametrize(("power", "alerts"), [(2.74, 0), (2.76, 1), (2.24, 1)])
-def test_power_that_is_far_from_the_counter_is_flagged(
+def test_power_far_from_the_counter_and_a_slow_device_are_flagged(
     power: float, alerts: int
 ) -> None:
     assert len(replace(FOUND, power_j_per_frame=power).alerts()) == alerts
-
-
-def test_a_device_that_slowed_down_is_flagged() -> None:
     (line,) = replace(FOUND, throttled=("power cap",)).alerts()
-
     assert "slowed itself down: power cap" in line
 
 
@@ -263,16 +255,13 @@ def test_a_board_counts_and_tells_its_power(monkeypatch: pytest.MonkeyPatch) -> 
     assert driver.shut == 1
 
 
-def test_a_card_without_a_counter_has_its_power_integrated(
+def test_a_counter_without_power_beside_it_and_power_without_a_counter(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     Driver(monkeypatch, energy=UNSUPPORTED)
     reader = answered(Nvml().open())
-
     assert (reader.counter, reader.counts) == ("nvml-power-integrated", False)
 
-
-def test_a_counter_without_power_beside_it(monkeypatch: pytest.MonkeyPatch) -> None:
     Driver(monkeypatch, power=UNSUPPORTED, clock=UNSUPPORTED, slow=UNSUPPORTED)
     reader = answered(Nvml().open())
 

@@ -5,8 +5,6 @@ from dataclasses import replace
 from itertools import groupby
 from pathlib import Path
 
-import numpy as np
-import onnx
 import pynvml
 import pytest
 from hypothesis import given
@@ -17,11 +15,13 @@ from me2e_compress.graph import sha256_of
 from me2e_compress.runtime.energy.energy_counter import EnergySchedule, Recorded
 from me2e_compress.runtime.energy.energy_result import EnergyResult
 from me2e_compress.runtime.energy.meter import EnergyMeter, measure_energy
-from me2e_compress.runtime.frames import Array, Frame
 from tests.installed import install
 from tests.runtime.energy.clockwork import Clock
 from tests.runtime.energy.opened import Driver
 from tests.runtime.energy.world import World
+from tests.runtime.test_profile import FRAMES, model
+
+__all__ = ["model"]
 
 SCHEDULE = EnergySchedule(
     warm_up_s=2, window_s=2, window_frames=10, windows=6, idle_s=2
@@ -168,20 +168,9 @@ def test_a_schedule_that_cannot_be(change: dict[str, float], fault: str) -> None
 # The energy of files is measured by what runs them, with any package's counter.
 
 
-MODEL = """<ir_version: 8, opset_import: ["" : 17]>
-counter (float[2] x, float[2] total) => (float[2] total_out)
-{ total_out = Add (x, total) }"""
-ONES: dict[str, Array] = {"x": np.ones(2, np.float32)}
-FRAMES = [Frame(0, True, ONES), Frame(1, False, ONES)]
 SHORT = EnergySchedule(
     *(0.02, 0.02, 5, 5), idle_s=0.02, lead_in_s=0.005
 )  # whatever the machine: a clock never fails
-
-
-@pytest.fixture
-def model(tmp_path: Path) -> Path:
-    onnx.save(onnx.parser.parse_model(MODEL), tmp_path / "m.onnx")
-    return tmp_path / "m.onnx"
 
 
 @pytest.fixture

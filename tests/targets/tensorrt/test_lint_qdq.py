@@ -242,7 +242,7 @@ def test_graphs_of_other_quantizers_are_judged_the_same() -> None:
 # FP8 pairs and int4 weights by block: TensorRT takes both.
 
 
-ONE = np.float32(0.01)
+ONE, FP8 = np.float32(0.01), ml_dtypes.float8_e4m3fn
 PAIRED = "q = QuantizeLinear(x, s, z) d = DequantizeLinear(q, s, z)"
 
 
@@ -257,7 +257,7 @@ def rules_of(body: str, **weights: npt.NDArray[Any] | np.generic) -> set[str]:
 def test_fp8_pairs_of_activation_and_weight_are_taken() -> None:
     numbers = np.arange(1024, dtype=np.uint8).reshape(32, 32) % 64
     body = f"{PAIRED} wd = DequantizeLinear(w, s, z) y = MatMul(d, wd)"
-    w, z = (each.view(ml_dtypes.float8_e4m3fn) for each in (numbers, np.uint8(0)))
+    w, z = numbers.view(FP8), np.zeros((), FP8)
 
     assert rules_of(body, w=w, s=ONE, z=z) == set()
 

@@ -55,6 +55,11 @@ def test_every_operator_of_onnx_is_in_one_list() -> None:
             "element-type",
             "MaxPool of int32; it accepts bfloat16, float, float16",
         ),
+        (
+            "(float[2] x, float16[2] h) => (float[2] y) { y = Add(x, h) }",
+            "mixed-types",
+            "Add of float and float16: cast one of them",
+        ),
     ],
 )
 def test_what_the_parser_does_not_take(call: str, rule: str, message: str) -> None:
@@ -109,17 +114,6 @@ def test_a_type_or_an_operator_that_came_later(
 def test_a_version_that_is_none(text: str) -> None:
     with pytest.raises(ValueError, match="is no version of TensorRT, such as"):
         TensorRT(version=text)
-
-
-def test_two_float_types_in_one_operator() -> None:
-    (each,) = (
-        each
-        for each in found(
-            "m (float[2] x, float16[2] h) => (float[2] y) { y = Add(x, h) }"
-        )
-        if each.rule == "mixed-types"
-    )
-    assert each.message == "Add of float and float16: cast one of them"
 
 
 @pytest.mark.parametrize(

@@ -105,18 +105,15 @@ def test_tensorrt_10_is_allowed_the_types_of_the_graph(
 
 
 @pytest.mark.parametrize("tensorrt", [11], indirect=True)
-def test_what_tensorrt_11_no_longer_has(tensorrt: int, tmp_path: Path) -> None:
+def test_tensorrt_11_takes_the_types_of_the_graph(
+    tensorrt: int, tmp_path: Path
+) -> None:
+    found = build_engine(written(tmp_path, INT8), EngineSettings())
+    assert found.content.decode() == "[]"  # int8 without a flag
     with pytest.raises(
         PreconditionError, match=r"11\.4\.0 takes the types of the graph"
     ):
         build_engine(written(tmp_path), EngineSettings("fp16"))
-
-
-@pytest.mark.parametrize("tensorrt", [11], indirect=True)
-def test_tensorrt_11_takes_int8_without_a_flag(tensorrt: int, tmp_path: Path) -> None:
-    found = build_engine(written(tmp_path, INT8), EngineSettings())
-
-    assert found.content.decode() == "[]"
 
 
 @pytest.mark.usefixtures("tensorrt")
