@@ -117,7 +117,11 @@ def test_a_tensor_whose_range_one_element_makes_is_named(tmp_path: Path) -> None
     assert found.outliers == pytest.approx({"image": 110, "y": 110}, rel=0.02)
 
 
-def test_an_unknown_tensor_or_method_is_an_error(frames: CalibrationSet) -> None:
+def test_an_unknown_tensor_or_method_and_no_frames_are_errors(
+    frames: CalibrationSet,
+) -> None:
+    with pytest.raises(FramesError, match="no frames to calibrate on"):
+        Calibrator(threads=1).run(conv_attention(), ["a"], FrameSubset(frames, ()))
     with pytest.raises(GraphError, match="no tensor nowhere"):
         Calibrator().run(conv_attention(), ["nowhere"], frames)
     with pytest.raises(RecipeError, match=r"no calibration method 'int4'; .*max-min"):
@@ -169,11 +173,6 @@ def test_a_file_that_holds_no_ranges_is_refused(tmp_path: Path, content: str) ->
         Ranges.load(path)
     with pytest.raises(FramesError, match="no such ranges"):
         Ranges.load(tmp_path / "none.json")
-
-
-def test_no_frames_are_an_error(frames: CalibrationSet) -> None:
-    with pytest.raises(FramesError, match="no frames to calibrate on"):
-        Calibrator(threads=1).run(conv_attention(), ["a"], frames.part(()))
 
 
 FOUR = ("image", "a", "seen", "mixed")

@@ -43,16 +43,6 @@ def test_the_checkpoint_is_named(cli: Cli, files: Path) -> None:
     assert json.loads((files / "out.report.json").read_text())["weights"] == line
 
 
-def test_int8_by_scheme(cli: Cli, dense: Path) -> None:
-    scheme = INT8.replace("full", "prediction")
-    record = cli.document(f"compress dense.onnx {scheme} -o out.onnx")
-    assert record["steps"][-1]["text"] == (
-        'quantize-int8{scheme="prediction", target="onnxruntime"}'
-    )
-    weights = graph.load(dense / "out.onnx").graph.initializers.values()
-    assert ir.DataType.INT8 in [value.dtype for value in weights]
-
-
 @pytest.mark.parametrize("target", ["tensorrt", "onnxruntime"])
 def test_a_graph_that_is_quantized_already_is_refused(
     cli: Cli, dense: Path, target: str

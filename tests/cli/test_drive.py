@@ -245,12 +245,6 @@ def test_a_set_goes_on_where_it_was_killed(
     assert cli.document(f"{asked} Accident,ParkedObstacle")["admitted"] == 2
     assert made == ["Accident", "ParkedObstacle", "ParkedObstacle"]
     assert [path.name for path in tmp_path.iterdir()] == ["set.json"]
-
-
-def test_what_lies_beside_a_set_and_is_no_draft_is_named(
-    cli: Cli, tmp_path: Path
-) -> None:
-    (tmp_path / "set.json.part").write_text("[]")
-    line = "routes -o set.json --scenarios Accident"
-
-    assert "set.json.part: not a set that was begun: the file: " in cli.refused(line)
+    (tmp_path / "other.json.part").write_text("[]")
+    said = cli.refused("routes -o other.json --scenarios Accident")
+    assert "other.json.part: not a set that was begun: the file: " in said

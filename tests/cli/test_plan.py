@@ -18,7 +18,7 @@ MAP = "--map map.toml"
 MADE = f"compress dense.onnx --scheme prediction --frames frames {MAP} -o out.onnx"
 
 
-def test_the_plan_that_is_shown_is_the_one_beside_the_file_and_inside(
+def test_the_plan_that_is_shown_is_the_one_beside_the_file_and_is_compared(
     cli: Cli, dense: Path
 ) -> None:
     cli.done(MADE)
@@ -30,12 +30,7 @@ def test_the_plan_that_is_shown_is_the_one_beside_the_file_and_inside(
 
     written = json.loads((dense / "out.plan.json").read_text())
     assert written == IN_JSON | {k: shown[k] for k in written if k in shown}
-
-
-def test_plans_are_compared(cli: Cli, dense: Path) -> None:
-    cli.done(MADE)
     line = f"plan dense.onnx --scheme feature-ext --rules paper {MAP} --against"
-
     said = cli.done(f"{line} out.onnx").out
     assert "/plan_head/MatMul: int8 (layer) -> float (module)" in said
     assert "1 differences" in said

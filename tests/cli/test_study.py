@@ -6,14 +6,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import me2e_compress.study.run
-from me2e_compress.cli.driving import study
-from me2e_compress.errors import StudyError
 from me2e_compress.evaluators.highway import engine
 from me2e_compress.registry.drafts import IN_JSON
-from me2e_compress.shipped.drivers import shipped
 from me2e_compress.simulator.routes import save_routes
-from me2e_compress.study import Study, load_study
+from me2e_compress.study import load_study
 from tests.command import Cli, write_frames
 from tests.evaluators.highway.drivers import CROSSING, straight_on
 from tests.study.conftest import Here
@@ -100,27 +96,6 @@ def test_what_is_wrong_is_one_line(
     toml.write_text(STUDY.replace(old, new))
 
     assert message in cli.refused("study study.toml -o out")
-
-
-def test_a_model_that_ships_is_not_one_where_you_are(
-    toml: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    elsewhere = tmp_path / "elsewhere"
-    elsewhere.mkdir()
-    straight_on(elsewhere / "highway")
-    monkeypatch.chdir(elsewhere)
-    toml.write_text(STUDY.replace('"m.onnx"', '"highway"'))
-    asked = list[Study]()
-
-    def noted(found: Study, *_: object, **__: object) -> None:
-        asked.append(found)
-        raise StudyError("seen")
-
-    monkeypatch.setattr(me2e_compress.study.run, "run_study", noted)
-    with pytest.raises(StudyError, match="seen"):
-        study(toml, output=tmp_path / "out")
-
-    assert asked[0].variants[0].policy == str(shipped("highway"))
 
 
 @pytest.mark.usefixtures("toml")

@@ -50,10 +50,16 @@ def charges(source: LatencySource, route: str, count: int = 60) -> list[int]:
     return [charge(DecisionFacts(123)) for _ in range(count)]
 
 
-def test_a_frame_rate_charges_its_period_and_none_nothing() -> None:
+def test_a_frame_rate_charges_its_period_a_measurement_itself_and_none_nothing() -> (
+    None
+):
     assert charges(parse_latency("fps:10"), "r", 2) == [100_000, 100_000]
     assert charges(parse_latency(f"fps:{1 / 0.15}"), "r", 1) == [150_000]
     assert parse_latency("none") == NoLatency()
+    source = parse_latency("measured{scale=3}")
+    assert source == MeasuredLatency(3.0)
+    assert source.measures
+    assert charges(source, "r", 1) == [369]
 
 
 def test_a_trace_in_order_starts_over_on_every_route(trace: Path) -> None:
@@ -92,14 +98,6 @@ def test_a_route_does_not_depend_on_what_drove_before() -> None:
     assert mixed == alone
 
 
-def test_a_measurement_is_scaled_and_says_so() -> None:
-    source = parse_latency("measured{scale=3}")
-
-    assert source == MeasuredLatency(3.0)
-    assert source.measures
-    assert charges(source, "r", 1) == [369]
-
-
 @pytest.mark.parametrize(
     ("text", "words"),
     [
@@ -135,6 +133,10 @@ def test_a_trace_comes_back_and_its_percentiles_are_samples(trace: Path) -> None
     assert LatencyTrace.load(trace) == LatencyTrace("abc", "a bench", SAMPLES)
     assert [record[f"p{p}_us"] for p in (50, 90, 99)] == [50, 90, 99]
     assert record["max_us"] == 100
+    # sources say how many samples they have
+    layered = parse_latency(f"limited{{source=trace:{trace}, fps=10}}")
+    assert parse_latency(f"trace:{trace}").measured == layered.measured == len(SAMPLES)
+    assert parse_latency("trace").measured is parse_latency("fps:10").measured is None
 
 
 @pytest.mark.parametrize(
@@ -153,13 +155,6 @@ def test_another_file_is_no_trace(tmp_path: Path, text: str) -> None:
 
     with pytest.raises(EvaluationError, match=r"trace.json: not a latency trace"):
         LatencyTrace.load(path)
-
-
-def test_a_trace_says_how_many_samples_it_has(trace: Path) -> None:
-    layered = parse_latency(f"limited{{source=trace:{trace}, fps=10}}")
-
-    assert parse_latency(f"trace:{trace}").measured == layered.measured == len(SAMPLES)
-    assert parse_latency("trace").measured is parse_latency("fps:10").measured is None
 
 
 def test_the_fingerprint_of_a_trace_is_its_samples() -> None:

@@ -34,15 +34,9 @@ def test_equal_names_are_joined_and_state_runs_by_its_names(tmp_path: Path) -> N
     assert list(stack.names.values()) == ["next_bev", "plan", "feats"]
     assert stack.recurrent == {"prev_bev": "next_bev"}
     assert bevs(path, True, False, False, True) == [2.0, 3.0, 3.5, 2.0]
-
-
-def test_what_a_frame_holds_is_the_first_value(tmp_path: Path) -> None:
-    session = joined(write_stack(tmp_path))
     (frame,) = ones(True)
-    frame.arrays["prev_bev"] = np.full((1, 4), 20, np.float32)
-
-    (answer,) = replay(session, [frame])
-
+    frame.arrays["prev_bev"] = np.full((1, 4), 20, np.float32)  # the first value
+    (answer,) = replay(joined(path), [frame])
     assert answer["next_bev"][0, 0] == 12.0
 
 
@@ -103,8 +97,17 @@ def images(count: int = 5) -> list[Frame]:
     ]
 
 
-def test_the_joined_graph_answers_as_its_parts(tmp_path: Path) -> None:
+def test_the_joined_graph_tells_names_apart_and_answers_as_its_parts(
+    tmp_path: Path,
+) -> None:
     path = write_dense(tmp_path)
+    stack = JoinedStack.load(path)
+    weights = stack.model.graph.initializers
+    file = stack.parts["backbone"].model.graph.initializers["w"]  # it is shared
+    assert weights["backbone.w"].const_value is file.const_value
+    assert list(weights) == ["backbone.w", "points", "head.w"]
+    named = [value.name for value in stack.model.graph.outputs]
+    assert named == ["next_bev", "plan", "feats"]
 
     whole = list(replay(joined(path), images()))
 
@@ -131,18 +134,6 @@ def test_what_passes_made_is_cut_and_joined_again(tmp_path: Path, text: str) -> 
     for one, other in zip(whole, by_files(path, images()), strict=True):
         for name, value in one.items():
             assert value == pytest.approx(other[name], rel=1e-5, abs=1e-6)
-
-
-def test_names_that_two_parts_have_are_told_apart(tmp_path: Path) -> None:
-    stack = JoinedStack.load(write_dense(tmp_path))
-    model = stack.model
-
-    file = stack.parts["backbone"].model.graph.initializers["w"]  # it is shared
-    assert model.graph.initializers["backbone.w"].const_value is file.const_value
-    assert list(model.graph.initializers) == ["backbone.w", "points", "head.w"]
-    assert [value.name for value in model.graph.outputs] == [
-        *("next_bev", "plan", "feats")
-    ]
 
 
 def test_an_older_part_is_written_in_the_opset_of_the_newest(tmp_path: Path) -> None:

@@ -134,19 +134,14 @@ TESTED = (
 )
 
 
-def test_traffic_signs_are_rated_where_no_junction_decides() -> None:
+def test_traffic_signs_are_rated_unless_a_junction_decides() -> None:
     rates = ability_rates(TESTED)
 
     assert rates["Traffic_Signs"].value == rates["Merging"].value == 50.0
     # the others were not driven, so there is no mean of five
     assert rates["mean"].measure.reason == "Overtaking: no such route was driven"
-
-
-def test_where_a_junction_decides_there_is_no_rate() -> None:
     rammed = drive(CRASH, route="rammed", abilities=SIGNS, completion=80.0)
-
     rates = ability_rates((*TESTED, rammed))
-
     signs = rates["Traffic_Signs"].measure
     assert signs.reason == "where the junction is on rammed is not known"
     assert rates["Merging"].value == pytest.approx(100 / 3)

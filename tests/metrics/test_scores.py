@@ -232,9 +232,12 @@ def test_percentiles_and_the_share_over_budget() -> None:
         "other_mean_ms": None,
     }
     assert deadlines([50_000, 50_001]).over_percent.value == 50.0  # in time
+    nothing = deadlines([])
+    assert (nothing.count, nothing.over_percent.value) == (0, None)
+    assert set(nothing.to_json().values()) == {50.0, 0, None}
 
 
-def test_a_percentile_of_too_few_is_not_measured() -> None:
+def test_a_percentile_of_too_few_or_of_a_trace_of_fewer_is_not_measured() -> None:
     found = deadlines([40_000] * 150)
 
     assert found.percentiles_ms[99.0].value == 40.0
@@ -242,15 +245,11 @@ def test_a_percentile_of_too_few_is_not_measured() -> None:
     shown = deadlines_table("trace", found)
     assert [cell.text for cell in shown.rows[2]][:2] == ["p99.9", "-"]
     assert "needs 1,000 samples, has 150" in shown.note
-
-
-def test_decisions_drawn_from_a_trace_tell_no_more_than_it() -> None:
-    found = deadlines([40_000] * 2478, measured=16)
-
-    assert found.count == 2478
-    assert found.percentiles_ms[50.0].value == 40.0
-    assert found.percentiles_ms[99.0].reason == "needs 100 samples, has 16"
-    assert found.percentiles_ms[99.9].reason == "needs 1,000 samples, has 16"
+    found = deadlines([40_000] * 2478, measured=16)  # drawn from a trace
+    assert (found.count, found.percentiles_ms[50.0].value) == (2478, 40.0)
+    for percent, needs in ((99.0, "100"), (99.9, "1,000")):
+        reason = found.percentiles_ms[percent].reason
+        assert reason == f"needs {needs} samples, has 16"
 
 
 @pytest.mark.parametrize(("percent", "least"), [(50, 2), (90, 10), (99, 100)])
@@ -258,14 +257,6 @@ def test_one_sample_lies_beyond_a_percentile(percent: int, least: int) -> None:
     assert too_few(percent, least - 1)
     assert not too_few(percent, least)
     assert percentile(range(least), percent) == least - 2
-
-
-def test_nothing_decided_is_not_zero() -> None:
-    found = deadlines([])
-
-    assert found.count == 0
-    assert found.over_percent.value is None
-    assert set(found.to_json().values()) == {50.0, 0, None}
 
 
 @pytest.mark.parametrize("budget_ms", [0.0, -1.0, float("nan"), float("inf")])

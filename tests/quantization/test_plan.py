@@ -372,17 +372,14 @@ def left(model: ir.Model, modules: tuple[str, ...]) -> tuple[FloatWeight, ...]:
     return float_weights(model, quantizer.plan(model, Context(MODULES)))
 
 
-def test_the_largest_weights_that_stay_float_come_first(model: ir.Model) -> None:
+def test_the_largest_weights_that_stay_float_come_first_each_with_its_rule(
+    model: ir.Model,
+) -> None:
     found = left(model, ("backbone", "head"))
 
     assert [each.name for each in found] == ["recurrent", "step", "table"]
     assert found[0].bytes == 4 * 256 * 64
     assert (found[0].op, found[0].module, found[0].rule) == ("LSTM", "head", "operator")
     assert found[0].reason == "LSTM is not a weighted layer"
-
-
-def test_a_layer_outside_the_scheme_is_named_with_its_rule(model: ir.Model) -> None:
     (layer,) = [each for each in left(model, ("head",)) if each.name == "layer"]
-
-    assert layer.rule == "module"
-    assert layer.node == "/backbone/MatMul"
+    assert (layer.rule, layer.node) == ("module", "/backbone/MatMul")

@@ -42,13 +42,20 @@ def image() -> dict[str, np.ndarray]:
     return {"x": random.normal(size=(1, 8, 9, 9)).astype(np.float32)}
 
 
-def test_lent_weights_give_what_the_file_gives(model: ir.Model, tmp_path: Path) -> None:
+def test_lent_and_mapped_weights_give_what_the_file_gives(
+    model: ir.Model, tmp_path: Path
+) -> None:
     graph.save(model, tmp_path / "m.onnx")
     from_file = Session(tmp_path / "m.onnx", threads=1)
 
     lent = Session(model, threads=1)
 
-    assert np.array_equal(lent.run(image())["y"], from_file.run(image())["y"])
+    want = from_file.run(image())["y"]
+    assert np.array_equal(lent.run(image())["y"], want)
+    graph.save(model, tmp_path / "apart.onnx", external=True)
+    mapped = graph.load(tmp_path / "apart.onnx")  # not copied
+    assert external_tensors(mapped)
+    assert np.array_equal(Session(mapped, threads=1).run(image())["y"], want)
 
 
 def test_onnxruntime_fuses_lent_weights_and_leaves_them_as_they_are(
@@ -69,18 +76,6 @@ def test_a_session_outlives_its_graph(model: ir.Model) -> None:
     del model
 
     assert np.array_equal(session.run(image())["y"], first)
-
-
-def test_weights_in_a_file_are_mapped_not_copied(
-    model: ir.Model, tmp_path: Path
-) -> None:
-    graph.save(model, tmp_path / "m.onnx", external=True)
-    mapped = graph.load(tmp_path / "m.onnx")
-    assert external_tensors(mapped)
-
-    found = Session(mapped, threads=1).run(image())["y"]
-
-    assert np.array_equal(found, Session(model, threads=1).run(image())["y"])
 
 
 def test_weights_of_a_body_that_lie_in_a_file_are_found(tmp_path: Path) -> None:

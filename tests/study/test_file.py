@@ -117,8 +117,12 @@ def test_files_lie_beside_the_study(models: Path, tmp_path: Path) -> None:
     assert [each.name for each in study.variants[1].passes] == ["fold-constants"]
 
 
-def test_a_name_that_is_no_file_is_one_that_ships(models: Path) -> None:
+def test_a_name_that_is_no_file_is_one_that_ships_whatever_is_where_you_are(
+    models: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     text = GOOD.replace('"slow.onnx"', '"highway"')
+    (tmp_path / "highway").write_bytes((models / "slow.onnx").read_bytes())
+    monkeypatch.chdir(tmp_path)
 
     study = load_study(write(models, text))
 
@@ -154,18 +158,14 @@ def test_libraries_of_the_study_and_of_its_provider(models: Path) -> None:
     assert set(libraries) <= set(study.inputs())
 
 
-def test_the_provider_of_the_command_line_wins(models: Path) -> None:
+def test_provider_and_routes_of_the_command_line_win(models: Path) -> None:
     path = write(models, 'provider = "npu"\n' + GOOD)
 
-    assert load_study(path, provider="cpu").provider == CPU
+    study = load_study(path, provider="cpu", routes="ParkedObstacle_R2_0")
+    assert study.provider == CPU
+    assert [route.id for route in study.routes] == ["ParkedObstacle_R2_0"]
     with pytest.raises(ProviderError, match="no provider 'npu'; there are cpu, cuda"):
         load_study(path)
-
-
-def test_routes_of_the_command_line_win(models: Path) -> None:
-    study = load_study(write(models, GOOD), routes="ParkedObstacle_R2_0")
-
-    assert [route.id for route in study.routes] == ["ParkedObstacle_R2_0"]
 
 
 @pytest.mark.parametrize(

@@ -122,7 +122,9 @@ def test_the_same_seed_gives_the_same_bytes(
     assert one == two
 
 
-def test_what_is_there_is_not_made_again(make: Make, tmp_path: Path) -> None:
+def test_what_is_there_is_not_made_again_and_shared_by_studies(
+    make: Make, tmp_path: Path
+) -> None:
     asked = make(**ONE, timing=Timing())
     engine, again = Here(), Here()
 
@@ -132,6 +134,12 @@ def test_what_is_there_is_not_made_again(make: Make, tmp_path: Path) -> None:
     assert [route for _, route in engine.driven] != []
     assert again.driven == []
     assert one == two
+    beside = replace(asked, variants=(Variant("faster", "blind:9"), BLIND))
+    run_study(beside, tmp_path, again, pictures=0)
+    assert {name for name, _ in again.driven} == {"blind:9"}
+    other = replace(asked, variants=(Variant("blind", "blind:9"),))
+    with pytest.raises(EvaluationError, match=r"blind\.ideal: .* of another evaluatio"):
+        run_study(other, tmp_path, Here(), pictures=0)
 
 
 def test_a_study_is_silent_and_its_file_is_taken_as_it_is(
@@ -144,27 +152,6 @@ def test_a_study_is_silent_and_its_file_is_taken_as_it_is(
 
     assert capfd.readouterr() == ("", "")
     assert found.study == load_study(toml)
-
-
-def test_studies_share_what_they_have_in_common(make: Make, tmp_path: Path) -> None:
-    engine = Here()
-    faster = Variant("faster", "blind:9")
-    first = make(**ONE, timing=Timing())
-    second = replace(first, variants=(faster, BLIND))
-
-    run_study(first, tmp_path, Here())
-    run_study(second, tmp_path, engine)
-
-    assert {name for name, _ in engine.driven} == {"blind:9"}
-
-
-def test_a_name_that_is_taken_by_another_driver(make: Make, tmp_path: Path) -> None:
-    asked = make(**ONE, timing=Timing())
-    run_study(asked, tmp_path, Here())
-    other = replace(asked, variants=(Variant("blind", "blind:9"),))
-
-    with pytest.raises(EvaluationError, match=r"blind\.ideal: .* of another evaluatio"):
-        run_study(other, tmp_path, Here())
 
 
 def test_a_missing_model_is_named_before_anything_drives(

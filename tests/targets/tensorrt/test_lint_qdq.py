@@ -257,9 +257,9 @@ def rules_of(body: str, **weights: npt.NDArray[Any] | np.generic) -> set[str]:
 def test_fp8_pairs_of_activation_and_weight_are_taken() -> None:
     numbers = np.arange(1024, dtype=np.uint8).reshape(32, 32) % 64
     body = f"{PAIRED} wd = DequantizeLinear(w, s, z) y = MatMul(d, wd)"
-    w, z = numbers.view(FP8), np.zeros((), FP8)
+    w: npt.NDArray[Any] = numbers.view(FP8)
 
-    assert rules_of(body, w=w, s=ONE, z=z) == set()
+    assert rules_of(body, w=w, s=ONE, z=np.zeros((), FP8)) == set()
 
 
 @pytest.mark.parametrize(
@@ -267,7 +267,7 @@ def test_fp8_pairs_of_activation_and_weight_are_taken() -> None:
     [(ml_dtypes.int4, set()), (np.int8, {"channel-scale", "half-quantized"})],
 )
 def test_int4_weights_alone_have_scales_by_block(kind: type, rules: set[str]) -> None:
-    w = (np.arange(1024) % 15 - 7).reshape(32, 32).astype(kind)
+    w: npt.NDArray[Any] = (np.arange(1024) % 15 - 7).reshape(32, 32).astype(kind)
     body = "wd = DequantizeLinear<axis=0, block_size=16>(w, s) y = MatMul(x, wd)"
 
     assert rules_of(body, w=w, s=np.full((2, 32), ONE)) == rules
