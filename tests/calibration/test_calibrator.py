@@ -121,7 +121,7 @@ def test_an_unknown_tensor_or_method_and_no_frames_are_errors(
     frames: CalibrationSet,
 ) -> None:
     with pytest.raises(FramesError, match="no frames to calibrate on"):
-        Calibrator(threads=1).run(conv_attention(), ["a"], FrameSubset(frames, ()))
+        Calibrator(threads=1).run(conv_attention(), ["a"], frames.part(()))
     with pytest.raises(GraphError, match="no tensor nowhere"):
         Calibrator().run(conv_attention(), ["nowhere"], frames)
     with pytest.raises(RecipeError, match=r"no calibration method 'int4'; .*max-min"):

@@ -4,7 +4,9 @@ import dataclasses
 import json
 import re
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
 import numpy.typing as npt
@@ -16,7 +18,9 @@ from me2e_compress.calibration.calibrator import Calibrator
 from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.calibration.observers import (
     OBSERVERS,
+    Bounds,
     MeanSquaredError,
+    Observer,
     Percentile,
     scale_of,
     within,
@@ -29,7 +33,6 @@ from tests.frames import record
 from tests.installed import install
 from tests.nets import conv_attention, image, parsed
 from tests.profiles import scaled
-from tests.testing.test_check_observer import RootMeanSquare
 
 GOOD = Ranges(
     {"a": (-1.0, 4.0), "b": (0.0, 2.0)},
@@ -370,6 +373,17 @@ def test_methods_are_read_from_text(text: str, canonical: str) -> None:
     assert OBSERVERS.parse(canonical) == method
 
 
+@dataclass(frozen=True)
+class RootMeanSquare(Observer):
+    """So many root mean squares to each side."""
+
+    name: ClassVar[str] = "rms"
+    times: float = 3.0
+
+    def ranges(self, seen: Statistics) -> tuple[Bounds, Bounds]:
+        return within(seen, self.times * np.sqrt(seen.mean_squares.mean(axis=0)))
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [
@@ -390,7 +404,7 @@ def test_what_is_no_method_is_refused(text: str, message: str) -> None:
 def test_a_number_goes_to_the_observer_that_it_is_written_behind(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    entry = {"rms": "tests.testing.test_check_observer:RootMeanSquare"}
+    entry = {"rms": "tests.calibration.test_review:RootMeanSquare"}
     install(monkeypatch, tmp_path, "an-rms", "me2e_compress.observers", entry)
 
     assert OBSERVERS.parse("rms:4") == RootMeanSquare(4.0)

@@ -18,6 +18,7 @@ from me2e_compress.evaluators.contract import Listener, evaluator_named
 from me2e_compress.evaluators.highway.evaluator import Highway
 from me2e_compress.metrics.episode import Episode
 from me2e_compress.registry import registry
+from me2e_compress.workflows.evaluate import drive_of
 from tests.evaluators.lanes import Lane
 
 

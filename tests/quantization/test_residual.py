@@ -8,14 +8,8 @@ import pytest
 
 from me2e_compress.calibration.ranges import Ranges
 from me2e_compress.graph.rewrite import add_constant
-from me2e_compress.quantization.plan import (
-    Decision,
-    Overrides,
-    QuantPlan,
-    make_plan,
-    share_scales,
-    sharing_costs,
-)
+from me2e_compress.quantization.decision import Decision, Overrides, QuantPlan
+from me2e_compress.quantization.plan import make_plan, share_scales, sharing_costs
 from me2e_compress.quantization.rules import RULE_SETS
 from tests.nets import FULL, PAPER, net
 

@@ -135,11 +135,11 @@ def test_what_is_there_is_not_made_again_and_shared_by_studies(
     assert again.driven == []
     assert one == two
     beside = replace(asked, variants=(Variant("faster", "blind:9"), BLIND))
-    run_study(beside, tmp_path, again, pictures=0)
+    run_study(beside, tmp_path, again)
     assert {name for name, _ in again.driven} == {"blind:9"}
     other = replace(asked, variants=(Variant("blind", "blind:9"),))
     with pytest.raises(EvaluationError, match=r"blind\.ideal: .* of another evaluatio"):
-        run_study(other, tmp_path, Here(), pictures=0)
+        run_study(other, tmp_path, Here())
 
 
 def test_a_study_is_silent_and_its_file_is_taken_as_it_is(

@@ -11,7 +11,8 @@ from me2e_compress.errors import MissingExtraError, PreconditionError, RecipeErr
 from me2e_compress.graph.modules import map_of
 from me2e_compress.manager import PassManager, recipe
 from me2e_compress.passes import Context
-from me2e_compress.quantization.plan import make_plan, stamp_plan
+from me2e_compress.quantization.decision import stamp_plan
+from me2e_compress.quantization.plan import make_plan
 from me2e_compress.quantization.rules import RULE_SETS
 from me2e_compress.quantization.scheme import QuantScheme
 from me2e_compress.shipped.drivers import shipped
