@@ -27,7 +27,7 @@ from benchmarks.subjects import write_source
 from me2e_compress import graph
 from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.errors import Me2eError
-from me2e_compress.graph.modules import ModuleMap
+from me2e_compress.graph.modules.module_map import ModuleMap
 from me2e_compress.manager import PassManager, recipe
 from me2e_compress.passes import Context, Pass
 from me2e_compress.shipped.drivers import sample_frames

@@ -25,7 +25,7 @@ import onnxruntime
 from benchmarks.processes import in_turn
 from me2e_compress import graph
 from me2e_compress.graph import provenance
-from me2e_compress.graph.modules import ModuleMap
+from me2e_compress.graph.modules.module_map import ModuleMap
 from me2e_compress.passes.base import Context
 from me2e_compress.passes.flatten_matmul import FlattenMatmul
 from me2e_compress.passes.fuse_basic import FuseBasic

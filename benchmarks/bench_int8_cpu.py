@@ -38,7 +38,7 @@ from me2e_compress import graph
 from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.errors import GraphError
 from me2e_compress.fidelity.compare import compare
-from me2e_compress.graph.modules import ModuleMap
+from me2e_compress.graph.modules.module_map import ModuleMap
 from me2e_compress.graph.nodes import constant_values
 from me2e_compress.passes import Context, Pass
 from me2e_compress.passes.convert_float32 import ConvertFloat32

@@ -16,7 +16,8 @@ import onnx_ir as ir
 
 from me2e_compress import graph
 from me2e_compress.graph import provenance
-from me2e_compress.graph.modules import ModuleMap, assign, detect, itemise
+from me2e_compress.graph.modules.assign import assign, detect, itemise
+from me2e_compress.graph.modules.module_map import ModuleMap
 from me2e_compress.graph.surgeon import restore
 from me2e_compress.passes import Context
 from me2e_compress.passes.import_normalize import ImportNormalize

@@ -28,7 +28,7 @@ from me2e_compress.calibration.ranges import Ranges
 from me2e_compress.calibration.statistics import Statistics
 from me2e_compress.fidelity.compare import OutputFidelity, Reference
 from me2e_compress.graph import rewrite
-from me2e_compress.graph.modules import ModuleMap
+from me2e_compress.graph.modules.module_map import ModuleMap
 from me2e_compress.graph.nodes import array_of, sole_reader
 from me2e_compress.passes.base import Context
 from me2e_compress.passes.quantize_int8 import QuantizeInt8

@@ -34,7 +34,7 @@ from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.calibration.ranges import Ranges
 from me2e_compress.fidelity.compare import compare
 from me2e_compress.graph import WEIGHTED
-from me2e_compress.graph.modules import ModuleMap
+from me2e_compress.graph.modules.module_map import ModuleMap
 from me2e_compress.graph.nodes import constant_values
 from me2e_compress.manager import PassManager, recipe
 from me2e_compress.passes import Context

@@ -161,7 +161,8 @@ def _noted(out: Path, spec: Stack, frames: int) -> list[dict[str, object]]:
 def _truth(given: argparse.Namespace) -> dict[str, object]:
     import onnx_ir as ir
 
-    from me2e_compress.graph.modules import ModuleMap, assign
+    from me2e_compress.graph.modules.assign import assign
+    from me2e_compress.graph.modules.module_map import ModuleMap
     from models.tests.truth import record
 
     known = record(given.stack, opset=given.opset)

@@ -19,7 +19,7 @@ if TYPE_CHECKING:  # what a type checker sees; at run time names load when asked
     from me2e_compress import graph as graph
     from me2e_compress.calibration.dataset import CalibrationSet as CalibrationSet
     from me2e_compress.errors import Me2eError as Me2eError
-    from me2e_compress.graph.modules import ModuleMap as ModuleMap
+    from me2e_compress.graph.modules.module_map import ModuleMap as ModuleMap
     from me2e_compress.manager import PassManager as PassManager
     from me2e_compress.manager import Report as Report
     from me2e_compress.manager import Step as Step
@@ -96,7 +96,7 @@ _MODULES = ("errors", "evaluators", "graph", "passes", "registry", "targets", "t
 _ROOMS = {
     "calibration.dataset": "CalibrationSet",
     "errors": "Me2eError",
-    "graph.modules": "ModuleMap",
+    "graph.modules.module_map": "ModuleMap",
     "manager": "PassManager Report Step Verification",
     "passes": "Context PASSES Pass PassResult",
     "study": "StudyResult load_study run_study",

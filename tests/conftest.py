@@ -5,7 +5,7 @@ from tempfile import TemporaryDirectory
 import onnx_ir as ir
 import pytest
 
-from me2e_compress.graph.modules import ModuleMap
+from me2e_compress.graph.modules.module_map import ModuleMap
 from me2e_compress.passes.base import Context
 from me2e_compress.workflows import checks
 from tests import profiles

@@ -11,7 +11,7 @@ import onnx_ir as ir
 from me2e_compress import graph
 from me2e_compress.calibration.ranges import Ranges
 from me2e_compress.graph import provenance
-from me2e_compress.graph.modules import ModuleMap
+from me2e_compress.graph.modules.module_map import ModuleMap
 from me2e_compress.graph.provenance import Provenance
 from me2e_compress.quantization.decision import Decision, QuantPlan
 from me2e_compress.quantization.plan import make_plan

@@ -7,7 +7,7 @@ import pytest
 
 from me2e_compress.calibration.ranges import Ranges
 from me2e_compress.errors import Me2eError
-from me2e_compress.graph.modules import ModuleMap
+from me2e_compress.graph.modules.module_map import ModuleMap
 from me2e_compress.manager import recipe
 from me2e_compress.quantization.decision import Overrides, load_plan
 from me2e_compress.registry import documents

@@ -16,7 +16,8 @@ from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.driving.onnx_policy import OnnxPolicy
 from me2e_compress.errors import FramesError, RecipeError
 from me2e_compress.graph import provenance
-from me2e_compress.graph.modules import ModuleMap, detect
+from me2e_compress.graph.modules.assign import detect
+from me2e_compress.graph.modules.module_map import ModuleMap
 from me2e_compress.manager import PassManager, recipe
 from me2e_compress.passes import Context, Pass, PassResult
 from me2e_compress.runtime.session import Session, replay, run_once

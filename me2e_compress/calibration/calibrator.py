@@ -13,6 +13,7 @@ import onnx_ir as ir
 from me2e_compress import graph
 from me2e_compress.calibration.dataset import CalibrationSet, archive_of, load_arrays
 from me2e_compress.calibration.observers import DEFAULT_METHOD, OBSERVERS
+from me2e_compress.calibration.probed_session import probed_session
 from me2e_compress.calibration.ranges import Ranges
 from me2e_compress.calibration.statistics import (
     BINS,
@@ -25,13 +26,7 @@ from me2e_compress.errors import FramesError, GraphError
 from me2e_compress.registry import documents
 from me2e_compress.runtime.atomic import write_bytes
 from me2e_compress.runtime.frames import Array
-from me2e_compress.runtime.probing import (
-    READINGS,
-    Probe,
-    Reading,
-    probed_session,
-    shared_constant,
-)
+from me2e_compress.runtime.probing import READINGS, Probe, Reading, shared_constant
 from me2e_compress.runtime.providers import CPU, Provider
 from me2e_compress.runtime.runnable import unsupported
 from me2e_compress.runtime.session import DTYPES, feed_forward

@@ -153,21 +153,14 @@ def study(
 
 def routes(
     *,
-    output: Output | None = None,
-    examine: Path | None = None,
+    output: Output,
     options: RoutesOptions | None = None,
 ) -> None:
-    """Make a fresh set of admitted routes, or examine an existing set again.
+    """Make a fresh set of admitted routes.
 
     Args:
         output: the manifest to write
-        examine: examine this manifest instead of making one
     """
-    from me2e_compress.workflows import routes as workflow
+    from me2e_compress.workflows.routes import make_routes
 
-    if examine is not None:
-        show_of(workflow.examine_routes, examine, "all")
-        return
-    if output is None:
-        raise OptionError("a new set needs -o ROUTES.json")
-    show_of(workflow.make_routes, output, options)
+    show_of(make_routes, output, options)

@@ -14,7 +14,7 @@ from me2e_compress.calibration.ranges import Ranges
 from me2e_compress.display import significant
 from me2e_compress.errors import EvaluationError
 from me2e_compress.fidelity.compare import Fidelity, Reference
-from me2e_compress.graph.modules import ModuleMap
+from me2e_compress.graph.modules.module_map import ModuleMap
 from me2e_compress.quantization.decision import (
     RESIDUAL,
     Overrides,

@@ -5,7 +5,7 @@ package says about it, besides walking nodes and values.
 """
 
 from me2e_compress.graph.digest import digest
-from me2e_compress.graph.files import data_names, file_bytes, load, save, sha256_of
+from me2e_compress.graph.files import file_bytes, load, save, sha256_of
 from me2e_compress.graph.nodes import (
     array_of,
     graphs_of,
@@ -16,38 +16,28 @@ from me2e_compress.graph.nodes import (
     opset_of,
     producer_of,
 )
-from me2e_compress.graph.provenance import Provenance
 from me2e_compress.graph.shapes import (
     CONVOLUTIONS,
     WEIGHTED,
     bias_of,
     channel_axis,
     infer_shapes,
-    open_shape,
     rank_of,
     static_shape,
 )
 from me2e_compress.graph.summary import (
-    Port,
-    Size,
     interface,
     macs,
-    macs_counter,
     node_count,
     size,
-    total_macs,
 )
 
 __all__ = [
     "CONVOLUTIONS",
     "WEIGHTED",
-    "Port",
-    "Provenance",
-    "Size",
     "array_of",
     "bias_of",
     "channel_axis",
-    "data_names",
     "digest",
     "file_bytes",
     "graphs_of",
@@ -58,10 +48,8 @@ __all__ = [
     "is_standard",
     "load",
     "macs",
-    "macs_counter",
     "node_count",
     "nodes_of",
-    "open_shape",
     "opset_of",
     "producer_of",
     "rank_of",
@@ -69,5 +57,4 @@ __all__ = [
     "sha256_of",
     "size",
     "static_shape",
-    "total_macs",
 ]

@@ -10,7 +10,7 @@ import onnx_ir as ir
 
 from me2e_compress import graph
 from me2e_compress.display import AT_LEAST, Table, counted, giga, megabytes, table
-from me2e_compress.graph import Size
+from me2e_compress.graph.summary import Size
 from me2e_compress.passes.base import Pass
 
 UNSTEADY = (

@@ -11,7 +11,7 @@ from me2e_compress import graph
 from me2e_compress.display import counted
 from me2e_compress.errors import PreconditionError, RecipeError
 from me2e_compress.graph import provenance, rewrite
-from me2e_compress.graph.modules import ModuleMap, Substitute
+from me2e_compress.graph.modules.module_map import ModuleMap, Substitute
 from me2e_compress.graph.nodes import LAYOUT_OPERATORS, makers_of, reads_of
 from me2e_compress.passes.base import Context, Pass, PassResult
 from me2e_compress.passes.edges import Edge, add_edge

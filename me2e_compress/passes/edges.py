@@ -12,7 +12,7 @@ import onnx_ir as ir
 from me2e_compress import graph
 from me2e_compress.errors import PreconditionError, RecipeError
 from me2e_compress.graph import rewrite
-from me2e_compress.graph.modules import ModuleMap
+from me2e_compress.graph.modules.module_map import ModuleMap
 from me2e_compress.graph.nodes import makers_of
 from me2e_compress.graph.shapes import REFUSALS, infer_node
 from me2e_compress.passes.parts import Part, Substitution, fit, listed, stretched

@@ -9,7 +9,7 @@ import onnx_ir as ir
 
 from me2e_compress.display import counted
 from me2e_compress.graph import graphs_of, provenance
-from me2e_compress.graph.modules import assign
+from me2e_compress.graph.modules.assign import assign
 from me2e_compress.graph.nodes import is_plugin, nodes_in, nodes_of, opset_of
 from me2e_compress.graph.rewrite import lift_constants
 from me2e_compress.graph.rewrite.raise_opset import raise_opset

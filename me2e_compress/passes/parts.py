@@ -14,8 +14,13 @@ from me2e_compress.calibration.means import load_means, token_means
 from me2e_compress.display import counted
 from me2e_compress.errors import FramesError, PreconditionError
 from me2e_compress.graph import provenance, rewrite
-from me2e_compress.graph.modules import ModuleMap, PathGlob, scope_of
-from me2e_compress.graph.modules.module_map import entering, leaving
+from me2e_compress.graph.modules.module_map import (
+    ModuleMap,
+    PathGlob,
+    entering,
+    leaving,
+    scope_of,
+)
 from me2e_compress.passes.base import Context
 from me2e_compress.runtime.frames import Array
 

@@ -11,10 +11,10 @@ from me2e_compress.graph import (
     WEIGHTED,
     input_at,
     is_standard,
-    open_shape,
     producer_of,
     static_shape,
 )
+from me2e_compress.graph.shapes import open_shape
 from me2e_compress.operators import op_types
 
 KEEP = 16

@@ -8,8 +8,8 @@ from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 
 import onnx_ir as ir
 
-from me2e_compress.graph import input_at, is_standard, open_shape
-from me2e_compress.graph.shapes import extent, is_one_matrix
+from me2e_compress.graph import input_at, is_standard
+from me2e_compress.graph.shapes import extent, is_one_matrix, open_shape
 from me2e_compress.operators import op_types, position_inputs, score_inputs
 from me2e_compress.quantization.find_attention import behind
 

@@ -4,7 +4,7 @@ import dataclasses
 from typing import Self
 
 from me2e_compress.errors import ModuleMapError, RecipeError
-from me2e_compress.graph.modules import ModuleMap, Role
+from me2e_compress.graph.modules.module_map import ModuleMap, Role
 
 SCHEMES: dict[str, tuple[Role, ...]] = {
     "feature-ext": ("feature",),

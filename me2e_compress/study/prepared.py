@@ -12,7 +12,7 @@ from me2e_compress.driving.host_stage import HOST_STAGES
 from me2e_compress.driving.policies import Driver, driver_named
 from me2e_compress.errors import GraphError, Me2eError, StudyError
 from me2e_compress.evaluators.highway.drivers import OnnxDriver
-from me2e_compress.graph.modules import ModuleMap
+from me2e_compress.graph.modules.module_map import ModuleMap
 from me2e_compress.manager.recipe import to_text
 from me2e_compress.registry import documents
 from me2e_compress.runtime.providers import CPU, PROVIDERS

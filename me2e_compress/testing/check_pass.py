@@ -7,7 +7,7 @@ import onnx_ir as ir
 from me2e_compress import graph
 from me2e_compress.errors import VerificationError
 from me2e_compress.graph import provenance
-from me2e_compress.graph.modules import map_of
+from me2e_compress.graph.modules.assign import map_of
 from me2e_compress.manager import equivalence
 from me2e_compress.manager.attempt import attempt
 from me2e_compress.manager.verification_inputs import VerificationInputs

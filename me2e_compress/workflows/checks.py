@@ -32,7 +32,8 @@ from me2e_compress import graph
 from me2e_compress.calibration.dataset import CalibrationSet, archive_of
 from me2e_compress.driving.adapter.outputs import adapted
 from me2e_compress.errors import FORMER, GraphError
-from me2e_compress.graph.modules import ModuleMap, map_of
+from me2e_compress.graph.modules.assign import map_of
+from me2e_compress.graph.modules.module_map import ModuleMap
 from me2e_compress.graph.opset import lowered
 from me2e_compress.graph.shapes import unshaped_plugins
 from me2e_compress.operators.kernels.trampoline import why_not

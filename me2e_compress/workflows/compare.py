@@ -25,7 +25,8 @@ from me2e_compress.fidelity.first_difference import (
 )
 from me2e_compress.fidelity.liveness import Liveness, LivenessTally
 from me2e_compress.graph import provenance
-from me2e_compress.graph.modules import ModuleMap, assign, map_of
+from me2e_compress.graph.modules.assign import assign, map_of
+from me2e_compress.graph.modules.module_map import ModuleMap
 from me2e_compress.runtime.frames import Frame
 from me2e_compress.runtime.session import Session
 from me2e_compress.targets.onnxruntime import slow_here

@@ -10,6 +10,7 @@ from me2e_compress import graph
 from me2e_compress.display import megabytes
 from me2e_compress.errors import PreconditionError, RecipeError
 from me2e_compress.fidelity.floor import Floor
+from me2e_compress.graph.files import data_names
 from me2e_compress.manager import PassManager, Report
 from me2e_compress.manager import recipe as recipes
 from me2e_compress.manager.pass_manager import collector_paused
@@ -252,7 +253,7 @@ def compress(
     # claim the outputs first; Python's cycle collector would walk every node
     inputs = (source, named, frames, options.module_map, options.adapter, *read)
     reported = beside(output, "plan"), beside(output, "report")
-    outputs = (output, *graph.data_names(output), *reported)
+    outputs = (output, *data_names(output), *reported)
     with writing(outputs, inputs, force=options.force), collector_paused():
         loaded = read_graph(source, listener, options.adapter, options.module_map)
         modules = load_map(options.module_map, loaded)

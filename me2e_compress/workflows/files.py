@@ -7,6 +7,7 @@ from me2e_compress import graph
 from me2e_compress.display import counted, megabytes, table
 from me2e_compress.errors import GraphError
 from me2e_compress.graph import file_bytes
+from me2e_compress.graph.files import data_names
 from me2e_compress.graph.stack.join import JoinedStack
 from me2e_compress.graph.stack.split import split_stack
 from me2e_compress.registry import drafts
@@ -109,7 +110,7 @@ def join(stack: str | Path, output: str | Path, *, force: bool = False) -> JoinR
     """
     source, output = Path(stack), Path(output)
     joined = JoinedStack.load(source)
-    outputs = (output, *graph.data_names(output))
+    outputs = (output, *data_names(output))
     with writing(outputs, (source, *joined.paths), force=force):
         graph.save(joined.model, output)
     fed = tuple(FedInput(*each) for each in joined.feeds())
@@ -159,9 +160,7 @@ def split(
     if not parts:
         raise GraphError(f"{source}: gives none of the outputs of {toml}")
     files = {part: output / joined.parts[part].file for part in parts}
-    named = [
-        each for path in files.values() for each in (path, *graph.data_names(path))
-    ]
+    named = [each for path in files.values() for each in (path, *data_names(path))]
     inputs = (source, toml, *joined.paths)
     check_folder(output, inputs)
     with drafts.written(output, GraphError):

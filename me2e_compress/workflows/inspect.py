@@ -13,11 +13,17 @@ from me2e_compress import graph
 from me2e_compress.display import AT_LEAST, giga, megabytes, number, table
 from me2e_compress.driving.adapter.outputs import adapted
 from me2e_compress.errors import EvaluationError, GraphError
-from me2e_compress.graph import Port, provenance
-from me2e_compress.graph.modules import Item, ModuleMap, assign, itemise
+from me2e_compress.graph import provenance
+from me2e_compress.graph.modules.assign import Item, assign, itemise
+from me2e_compress.graph.modules.module_map import ModuleMap
 from me2e_compress.graph.opset import lowered
 from me2e_compress.graph.recurrence import recurrent_inputs
-from me2e_compress.graph.summary import activation_bytes, why_uncounted
+from me2e_compress.graph.summary import (
+    Port,
+    activation_bytes,
+    macs_counter,
+    why_uncounted,
+)
 from me2e_compress.manager import PassManager, recipe
 from me2e_compress.passes import Context
 from me2e_compress.passes.fix_shapes import FixShapes, open_dimensions
@@ -255,7 +261,7 @@ def inspect(model: str | Path, options: InspectOptions | None = None) -> Inspect
     costs = {item.module: item for item in _costs(folded, modules)}
     items = _with_costs(items, costs, folded, taken)
     # say what is unknown, and why
-    count, fed_back, wrong = graph.macs_counter(folded), dict[str, str](), ""
+    count, fed_back, wrong = macs_counter(folded), dict[str, str](), ""
     uncounted = [node for node in folded.graph.all_nodes() if count(node) is None]
     try:
         fed_back = recurrent_inputs(loaded)
@@ -300,7 +306,7 @@ def _folded(model: ir.Model, modules: ModuleMap) -> ir.Model:
 
 
 def _costs(model: ir.Model, modules: ModuleMap) -> tuple[Item, ...]:
-    return itemise(model, modules, provenance.module_of, graph.macs_counter(model))
+    return itemise(model, modules, provenance.module_of, macs_counter(model))
 
 
 @dataclasses.dataclass(frozen=True, repr=False)

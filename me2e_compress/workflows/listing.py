@@ -28,7 +28,7 @@ from me2e_compress.driving.policies import POLICIES
 from me2e_compress.driving.shipped_adapters import adapter_file, shipped_adapters
 from me2e_compress.errors import RecipeError
 from me2e_compress.evaluators import EVALUATORS
-from me2e_compress.graph import modules
+from me2e_compress.graph.modules.module_map import ModuleMap, presets
 from me2e_compress.manager.report import versions
 from me2e_compress.operators import OPERATORS
 from me2e_compress.operators.kernels.kernel import KERNELS
@@ -135,7 +135,7 @@ KINDS: Mapping[str, Callable[[], tuple[Entry, ...]]] = {
     ),
     "module-maps": lambda: tuple(
         Entry(each.name, _OURS, ", ".join(each.names()))
-        for each in map(modules.ModuleMap.load, (*modules.presets(), "whole"))
+        for each in map(ModuleMap.load, (*presets(), "whole"))
     ),
     "stacks": lambda: tuple(
         Entry(name, _OURS, "trained; ships with the package") for name in SHIPPED

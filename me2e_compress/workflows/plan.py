@@ -12,7 +12,7 @@ from me2e_compress import graph
 from me2e_compress.calibration.observers import DEFAULT_METHOD
 from me2e_compress.display import table
 from me2e_compress.errors import PreconditionError, RecipeError
-from me2e_compress.graph.modules import ModuleMap
+from me2e_compress.graph.modules.module_map import ModuleMap
 from me2e_compress.manager import PassManager, recipe
 from me2e_compress.passes import Context, Pass
 from me2e_compress.passes.lower_int8 import LowerInt8

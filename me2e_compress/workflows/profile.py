@@ -8,7 +8,7 @@ from pathlib import Path
 from me2e_compress import graph
 from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.errors import EvaluationError, MissingExtraError
-from me2e_compress.graph.modules import assign
+from me2e_compress.graph.modules.assign import assign
 from me2e_compress.metrics import BUDGET_MS
 from me2e_compress.metrics.deadlines import Deadlines, deadlines, deadlines_table
 from me2e_compress.registry import drafts

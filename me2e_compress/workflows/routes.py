@@ -1,4 +1,4 @@
-"""Make a set of admitted routes, or examine one again."""
+"""Make a set of admitted routes."""
 
 from __future__ import annotations
 
@@ -17,8 +17,6 @@ from me2e_compress.runtime.atomic import write_document
 from me2e_compress.simulator.routes import (
     ROAD_VERSION,
     SCENARIO_ABILITIES,
-    load_routes,
-    pick_routes,
     save_routes,
 )
 from me2e_compress.version import __version__
@@ -27,7 +25,7 @@ from me2e_compress.workflows.options import RoutesOptions
 from me2e_compress.workflows.result import SILENT, Listener, Result, Shown
 
 if TYPE_CHECKING:  # they take highway-env, an extra and a second to import
-    from me2e_compress.evaluators.highway.generate import Admission, ScenarioRoutes
+    from me2e_compress.evaluators.highway.generate import ScenarioRoutes
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
@@ -139,50 +137,3 @@ def _scenario_types(words: str) -> tuple[str, ...]:
             there = ", ".join(sorted(SCENARIO_ABILITIES))
             raise EvaluationError(f"no scenario {name!r}; there are {there}")
     return names
-
-
-@dataclasses.dataclass(frozen=True, repr=False)
-class ExaminationResult(Result):
-    """Which routes of a set are admitted, one verdict per route."""
-
-    manifest: Path
-    verdicts: tuple[Admission, ...]
-
-    @property
-    def refused(self) -> tuple[Admission, ...]:
-        """The routes that are not admitted."""
-        return tuple(one for one in self.verdicts if not one.admitted)
-
-    def shown(self) -> Shown:
-        """Return the routes that are refused, and why; the error names the first."""
-        every, refused = len(self.verdicts), self.refused
-        headline = f"{every - len(refused)} of {counted(every, 'route')} admitted"
-        if not refused:
-            return Shown(headline)
-        rows = [(one.route.id, str(one.refusal)) for one in refused]
-        error = EvaluationError(
-            f"{self.manifest}: {len(refused)} of {every} routes are not admitted, the"
-            f" first is {refused[0].route.id}: {refused[0].refusal}"
-        )
-        columns = ("route", "refused because")
-        return Shown(headline, [table("Refused", columns, rows, words=2)], error=error)
-
-    def to_json(self) -> object:
-        """Return how many were examined, and why some are refused."""
-        why = {one.route.id: one.refusal for one in self.refused}
-        return {"examined": len(self.verdicts), "refused": why}
-
-
-def examine_routes(
-    manifest: str | Path, pick: str = "all", listener: Listener = SILENT
-) -> ExaminationResult:
-    """Examine a set of routes again; `pick` is ``all``, a number or ``ID,ID``."""
-    need_extra("highway", "examining routes")
-    from me2e_compress.evaluators.highway.generate import examine
-
-    manifest, verdicts = Path(manifest), []
-    picked = pick_routes(load_routes(manifest), pick)
-    for route in picked:
-        verdicts.append(examine(route))
-        listener.on_progress("examining", len(verdicts), len(picked), route.id)
-    return ExaminationResult(manifest, tuple(verdicts))

@@ -5,7 +5,7 @@ from collections import Counter
 import pytest
 import torch
 
-from me2e_compress.graph.modules import ModuleMap
+from me2e_compress.graph.modules.module_map import ModuleMap
 from models.construct import construct
 from models.stacks import STACKS
 

@@ -9,7 +9,7 @@ import pytest
 from me2e_compress import graph
 from me2e_compress.cli.app import COMMANDS
 from me2e_compress.cli.console import print_json
-from me2e_compress.graph import modules
+from me2e_compress.graph.modules.module_map import presets
 from me2e_compress.manager import recipe
 from me2e_compress.targets.tensorrt.tensorrt_engine import (
     EngineSettings,
@@ -56,7 +56,7 @@ def test_every_kind_is_listed_with_its_options(cli: Cli) -> None:
         assert [entry["name"] for entry in found[kind]] == list(registry.names())
     assert [entry["name"] for entry in found["recipes"]] == recipe.shipped()
     maps = [entry["name"] for entry in found["module-maps"]]
-    assert maps == [*modules.presets(), "whole"]
+    assert maps == [*presets(), "whole"]
     blind = next(each for each in found["policies"] if each["name"] == "blind")
     assert [option["name"] for option in blind["options"]] == ["speed_mps"]
 

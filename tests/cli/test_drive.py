@@ -171,20 +171,6 @@ def test_a_fresh_set_is_made_admitted_and_reported(cli: Cli, tmp_path: Path) -> 
     assert [route.id for route in made] == [f"{STOP}_R2_0", f"{STOP}_R2_1"]
 
 
-def test_a_set_is_put_through_the_gate_again(cli: Cli, tmp_path: Path) -> None:
-    save_routes([route_of(STOP, 1)], tmp_path / "good.json")
-    easy = route_of("VehicleOpensDoorTwoWays", 1, door_m=1000.0)
-    save_routes([easy], tmp_path / "easy.json")
-
-    assert "1 of 1 route admitted" in cli.done("routes --examine good.json").out
-    said = cli("routes --examine easy.json")
-    assert said.code == 1
-    assert "test: the scenario's event never happened" in said.err
-    found = cli.document("routes --examine easy.json", code=1)
-    assert found["status"] == "refused"
-    assert list(found["refused"]) == ["test"]
-
-
 def test_what_is_of_the_first_road_is_one_line(cli: Cli, tmp_path: Path) -> None:
     save_routes([route_of(STOP, 1)], tmp_path / "new.json")
     text = (tmp_path / "new.json").read_text()
@@ -192,7 +178,6 @@ def test_what_is_of_the_first_road_is_one_line(cli: Cli, tmp_path: Path) -> None
     (tmp_path / "old.json").write_text(text.replace(', "road": 2', ""))
 
     for line, words in (
-        ("routes --examine old.json", "route test is of the first road"),
         ("evaluate blind:8 -o out --routes old.json", "route test is of the first"),
         ("evaluate blind:8 -o out --routes edited.json", "edited.json: was changed"),
     ):

@@ -13,7 +13,7 @@ import pytest
 
 import me2e_compress
 from me2e_compress.cli.app import COMMANDS
-from me2e_compress.graph.modules import ModuleMap
+from me2e_compress.graph.modules.module_map import ModuleMap
 from me2e_compress.manager import recipe
 from me2e_compress.passes import PASSES
 from tests.docs.pages import PAGES, ROOT, blocks

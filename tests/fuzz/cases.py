@@ -94,7 +94,10 @@ JSON = {
         "trace.json",
         "evaluate blind --latency trace:bad.json --routes 0 -o out",
     ),
-    "routes": ("routes.json", "routes --examine bad.json --routes no-such-route"),
+    "routes": (
+        "routes.json",
+        "evaluate blind --routes bad.json --render no-such -o out",
+    ),
 }
 """A good document and a command that reads it, by the format's name."""
 

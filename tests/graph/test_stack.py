@@ -8,7 +8,7 @@ import pytest
 
 from me2e_compress import graph
 from me2e_compress.errors import GraphError
-from me2e_compress.graph.modules import ModuleMap
+from me2e_compress.graph.modules.module_map import ModuleMap
 from me2e_compress.graph.rewrite import add_constant
 from me2e_compress.graph.stack.join import End, JoinedStack
 from me2e_compress.graph.stack.split import split_stack

@@ -3,7 +3,7 @@
 import numpy as np
 import onnx_ir as ir
 
-from me2e_compress.graph.modules import ModuleMap
+from me2e_compress.graph.modules.module_map import ModuleMap
 from me2e_compress.passes.ablate_modules import AblateModules
 from me2e_compress.passes.base import Context
 from me2e_compress.runtime.session import run_once

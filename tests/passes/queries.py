@@ -5,7 +5,7 @@ import numpy.typing as npt
 import onnx_ir as ir
 
 from me2e_compress import graph
-from me2e_compress.graph.modules import ModuleMap
+from me2e_compress.graph.modules.module_map import ModuleMap
 from me2e_compress.passes.base import Context
 from me2e_compress.passes.edges import Edge
 from tests.nets import net

@@ -12,7 +12,7 @@ import onnxruntime
 
 from me2e_compress import graph
 from me2e_compress.graph import provenance, static_shape
-from me2e_compress.graph.modules import ModuleMap
+from me2e_compress.graph.modules.module_map import ModuleMap
 from me2e_compress.graph.summary import weight_bytes
 from me2e_compress.passes.base import Context, Pass, PassResult
 from me2e_compress.passes.fold_constants import ENTRY_BYTES

@@ -10,7 +10,7 @@ import pytest
 
 from me2e_compress.errors import Me2eError
 from me2e_compress.graph import provenance
-from me2e_compress.graph.modules import ModuleMap
+from me2e_compress.graph.modules.module_map import ModuleMap
 from me2e_compress.manager import PassManager, recipe
 from me2e_compress.passes.base import Context
 from me2e_compress.passes.fold_constants import FoldConstants

@@ -13,7 +13,7 @@ import pytest
 from me2e_compress import graph
 from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.errors import ModuleMapError, PreconditionError, ProviderError
-from me2e_compress.graph.modules import ModuleMap
+from me2e_compress.graph.modules.module_map import ModuleMap
 from me2e_compress.manager.verification_inputs import relative
 from me2e_compress.passes import Context
 from me2e_compress.passes.convert_float16 import ConvertFloat16

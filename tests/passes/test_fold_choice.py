@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from me2e_compress.graph import static_shape
-from me2e_compress.graph.modules import ModuleMap
+from me2e_compress.graph.modules.module_map import ModuleMap
 from me2e_compress.graph.nodes import Array
 from me2e_compress.passes import Context
 from me2e_compress.passes.fold_constants import FoldConstants, knowledge

@@ -8,7 +8,7 @@ import pytest
 from me2e_compress import graph
 from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.errors import FramesError, Me2eError, PreconditionError, RecipeError
-from me2e_compress.graph.modules import ModuleMap
+from me2e_compress.graph.modules.module_map import ModuleMap
 from me2e_compress.manager import PassManager
 from me2e_compress.manager.report import Report
 from me2e_compress.passes import Context

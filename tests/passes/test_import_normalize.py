@@ -8,7 +8,7 @@ import pytest
 from me2e_compress import graph
 from me2e_compress.errors import ModuleMapError
 from me2e_compress.graph import provenance
-from me2e_compress.graph.modules import ModuleMap
+from me2e_compress.graph.modules.module_map import ModuleMap
 from me2e_compress.passes import Context
 from me2e_compress.passes.import_normalize import (
     ORIGINAL_DOMAIN,

@@ -6,7 +6,7 @@ import pytest
 
 from me2e_compress import graph
 from me2e_compress.errors import ModuleMapError, RecipeError
-from me2e_compress.graph.modules import Module, ModuleMap
+from me2e_compress.graph.modules.module_map import Module, ModuleMap
 from me2e_compress.passes import Context
 from me2e_compress.passes.quantize_int8 import QuantizeInt8
 from me2e_compress.quantization.decision import (

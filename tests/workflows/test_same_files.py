@@ -10,13 +10,11 @@ import pytest
 import me2e_compress as me2e
 from me2e_compress.manager import recipe
 from me2e_compress.registry.drafts import IN_JSON
-from me2e_compress.simulator.routes import save_routes
 from me2e_compress.workflows.files import export_stack
 from me2e_compress.workflows.options import RoutesOptions
 from me2e_compress.workflows.result import Result
-from me2e_compress.workflows.routes import examine_routes, make_routes
+from me2e_compress.workflows.routes import make_routes
 from tests.command import Command
-from tests.simulator.world.driving import route_of
 
 Call = Callable[[], object]
 MAP = "map.toml"
@@ -177,17 +175,6 @@ def test_results_that_are_there_are_scored_silently(
 
     assert capfd.readouterr() == ("", "")
     assert found.scores == {str(tmp_path / "results"): driven.scores}
-
-
-def test_a_set_of_routes_is_examined_silently(
-    tmp_path: Path, capfd: pytest.CaptureFixture[str]
-) -> None:
-    save_routes([route_of(STOP, 1)], tmp_path / "routes.json")
-
-    found = examine_routes(tmp_path / "routes.json")
-
-    assert capfd.readouterr() == ("", "")
-    assert found.refused == ()
 
 
 def test_who_listens_hears_every_stage(dense: Path) -> None:

@@ -19,8 +19,7 @@ from me2e_compress.driving.contract import Answer, Observation, Shape, Trajector
 from me2e_compress.driving.input_sources import INPUT_SOURCES
 from me2e_compress.driving.shipped_adapters import adapter_file
 from me2e_compress.errors import EvaluationError, GraphError
-from me2e_compress.graph.modules import ModuleMap
-from me2e_compress.graph.modules.module_map import Ports
+from me2e_compress.graph.modules.module_map import ModuleMap, Ports
 from me2e_compress.graph.recurrence import declared_pairs, recurrence, sides
 from me2e_compress.runtime.frames import Array
 from me2e_compress.runtime.plan_adapter import CONTRACT_STEP_S, PLAN, PlanAdapter

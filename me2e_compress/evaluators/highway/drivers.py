@@ -13,7 +13,7 @@ from me2e_compress.driving.policies import POLICIES, Driver, SizedPolicy
 from me2e_compress.driving.shipped_adapters import adapter_file, shipped_adapters
 from me2e_compress.errors import EvaluationError
 from me2e_compress.graph import load, sha256_of
-from me2e_compress.graph.modules import ModuleMap
+from me2e_compress.graph.modules.module_map import ModuleMap
 from me2e_compress.runtime.providers import CPU, Provider
 
 

@@ -8,7 +8,8 @@ import onnx_ir as ir
 import pytest
 
 from me2e_compress import graph
-from me2e_compress.graph.modules import Assignment, ModuleMap, assign
+from me2e_compress.graph.modules.assign import Assignment, assign
+from me2e_compress.graph.modules.module_map import ModuleMap
 from models.tests import truth
 from models.vad.stack import VadTiny
 

@@ -10,7 +10,8 @@ import torch
 
 from me2e_compress import graph
 from me2e_compress.graph import provenance
-from me2e_compress.graph.modules import ModuleMap, assign, detect, itemise
+from me2e_compress.graph.modules.assign import assign, detect, itemise
+from me2e_compress.graph.modules.module_map import ModuleMap
 from me2e_compress.passes import Context
 from me2e_compress.passes.fold_constants import FoldConstants
 from me2e_compress.passes.import_normalize import ImportNormalize

@@ -10,7 +10,8 @@ import torch
 from numpy.typing import NDArray
 
 from me2e_compress.errors import GraphError
-from me2e_compress.graph.modules import ModuleMap, assign, detect
+from me2e_compress.graph.modules.assign import assign, detect
+from me2e_compress.graph.modules.module_map import ModuleMap
 from models.export import ExportOptions, export_stack, trace
 from models.stacks import Stack
 from models.tcp.config import ActionHeads

@@ -10,7 +10,8 @@ import onnxruntime
 import pytest
 import torch
 
-from me2e_compress.graph.modules import ModuleMap, assign
+from me2e_compress.graph.modules.assign import assign
+from me2e_compress.graph.modules.module_map import ModuleMap
 from me2e_compress.operators import expand, fused_nodes, import_domains
 from me2e_compress.targets import TARGETS
 from models.bev.sizes import Sampling

@@ -18,7 +18,7 @@ from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.fidelity.compare import Reference, compare
 from me2e_compress.fidelity.liveness import LivenessTally
 from me2e_compress.graph import provenance
-from me2e_compress.graph.modules import ModuleMap
+from me2e_compress.graph.modules.module_map import ModuleMap
 from me2e_compress.passes import Context
 from me2e_compress.passes.ablate_modules import AblateModules
 from me2e_compress.passes.fold_constants import FoldConstants

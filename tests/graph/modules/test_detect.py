@@ -2,7 +2,7 @@ import onnx_ir as ir
 import pytest
 
 from me2e_compress.errors import ModuleMapError
-from me2e_compress.graph.modules import detect
+from me2e_compress.graph.modules.assign import detect
 
 
 def chain(*scopes: str, **props: str) -> ir.Model:

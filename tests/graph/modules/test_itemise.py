@@ -3,7 +3,8 @@ from collections.abc import Callable
 import onnx_ir as ir
 import pytest
 
-from me2e_compress.graph.modules import Item, ModuleMap, assign, itemise
+from me2e_compress.graph.modules.assign import Item, assign, itemise
+from me2e_compress.graph.modules.module_map import ModuleMap
 
 MAP = ModuleMap.parse(
     '[modules.neck]\nrole = "feature"\noptional = ["neck"]\n'

@@ -3,7 +3,7 @@ from pathlib import Path
 import pytest
 
 from me2e_compress.errors import ModuleMapError
-from me2e_compress.graph.modules import ModuleMap, Substitute, presets
+from me2e_compress.graph.modules.module_map import ModuleMap, Substitute, presets
 
 TEXT = """
 strip = ["model"]

@@ -4,8 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from me2e_compress.graph.modules import PathGlob
-from me2e_compress.graph.modules.module_map import is_malformed
+from me2e_compress.graph.modules.module_map import PathGlob, is_malformed
 
 WORDS = st.text(string.ascii_lowercase + string.digits + "_", min_size=1, max_size=6)
 PATHS = st.lists(WORDS, min_size=1, max_size=6).map(tuple)

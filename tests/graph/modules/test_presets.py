@@ -1,6 +1,6 @@
 import pytest
 
-from me2e_compress.graph.modules import ModuleMap
+from me2e_compress.graph.modules.module_map import ModuleMap
 
 VAD = {
     "img_backbone.layer1.0.conv1.weight": "backbone",

@@ -1,7 +1,7 @@
 import onnx_ir as ir
 import pytest
 
-from me2e_compress.graph.modules import scope_of
+from me2e_compress.graph.modules.module_map import scope_of
 
 
 def node(name: str, output: str = "", **props: str) -> ir.Node:

@@ -7,7 +7,7 @@ import pytest
 
 from me2e_compress import graph
 from me2e_compress.graph import provenance
-from me2e_compress.graph.modules import detect
+from me2e_compress.graph.modules.assign import detect
 from me2e_compress.manager import PassManager
 from me2e_compress.passes import Context
 from me2e_compress.passes.ablate_modules import AblateModules

@@ -8,7 +8,7 @@ import pytest
 
 from me2e_compress import graph
 from me2e_compress.errors import MissingExtraError, PreconditionError, RecipeError
-from me2e_compress.graph.modules import map_of
+from me2e_compress.graph.modules.assign import map_of
 from me2e_compress.manager import PassManager, recipe
 from me2e_compress.passes import Context
 from me2e_compress.quantization.decision import stamp_plan
