@@ -16,6 +16,7 @@ from me2e_compress.fidelity.compare import (
     SetOutputs,
     SetTally,
     Tally,
+    channel_axis,
     compare,
 )
 from me2e_compress.fidelity.floor import Floor, Rounding, choice_between
@@ -175,6 +176,21 @@ def test_small_channels_beside_large_ones_are_judged_apart() -> None:
     (below,) = Floor().shortfalls(Fidelity((found,), (), None, "", 1))
     assert str(below) == f"y[:, :, 4:10] {found.small_db:.1f} dB"
     assert of_one_output(boxes, boxes + 0.5).small == ""
+
+
+@pytest.mark.parametrize(
+    ("axis", "shapes"),
+    [
+        (1, [(9, 2), (1, 8, 50)]),
+        (2, [(1, 50, 8), (1, 8, 8)]),
+        (3, [(6, 1, 50, 8), (6, 50, 1, 8)]),
+        (None, [(8,), (9, 1), (9, 129), (2, 3, 64, 64)]),
+    ],
+)
+def test_channels_are_the_last_axis_or_the_shorter_and_pictures_have_none(
+    axis: int | None, shapes: list[tuple[int, ...]]
+) -> None:
+    assert {channel_axis(shape) for shape in shapes} == {axis}
 
 
 def test_models_with_nothing_in_common_and_no_frames_are_not_compared() -> None:

@@ -99,6 +99,12 @@ def only_node(text: str) -> ir.Node:
             " { y = Attention<q_num_heads=8, kv_num_heads=4>(q, k, v) }",
             2 * 8 * 5 * 7 * (16 + 24),
         ),
+        (
+            "m (float[2,8,5,16] q, float[2,4,7,16] k, float[2,4,7,24] v,"
+            " float[2,4,3,16] a, float[2,4,3,24] b) => (float[2,8,5,24] y)"
+            ' { y, m, n = Attention(q, k, v, "", a, b) }',
+            2 * 8 * 5 * (7 + 3) * (16 + 24),
+        ),
         ("m (float[9] x) => (float[9] y) { y = Relu(x) }", 0),
     ],
 )

@@ -19,6 +19,7 @@ from me2e_compress.manager import (
 )
 from me2e_compress.manager.runtime_levels import LEVELS
 from me2e_compress.manager.verification_inputs import (
+    EQUAL,
     VerificationInputs,
     errors,
     relative,
@@ -96,6 +97,7 @@ def test_sizes_are_drawn_until_the_graph_runs(
     (check,) = checks(text, context, passes.IDLE)
     assert check.sizes == sizes
     assert check.unproven is None
+    assert all(size % 4 == 0 and lead in (1, 2) for lead, size in EQUAL[3:])
 
 
 @pytest.mark.parametrize(

@@ -189,6 +189,23 @@ def test_other_inputs_are_no_matrices(input_: str) -> None:
     assert found["y"].rule == "layer"
 
 
+@pytest.mark.parametrize(
+    "text",
+    [  # of a known size they are points, else matrices
+        "c (float[B,50,3] ref_pts, float[3,3] w, float[3,32] v) => (float y)"
+        " { a = MatMul(ref_pts, w) y = MatMul(a, v) }",
+        "c (float[6,4,C] lidar2img, float[4,200] w, float[4,32] v) => (float y)"
+        " { p = MatMul(lidar2img, w) a = Transpose<perm=[0,2,1]>(p) y = MatMul(a, v) }",
+    ],
+)
+def test_named_inputs_of_other_sizes_are_geometry_in_the_layer_behind(
+    text: str,
+) -> None:
+    sides = re.findall(r"float\[([\d,]+)\] ([wv])\b", text)
+    shapes = {name: tuple(map(int, side.split(","))) for side, name in sides}
+    assert by_output(planned(text, shapes, ALONE))["y"].rule == "geometry"
+
+
 def test_the_default_keeps_geometry_in_float() -> None:
     rules = RULE_SETS.parse("safe").rules()
 
