@@ -135,16 +135,17 @@ def test_custom_operators_of_their_own_domain_are_carried_through() -> None:
 def test_constants_become_initializers_in_branches_too() -> None:
     model = unstamped(
         "g (bool c, float[2] x) => (float[2] y) {"
-        " k = Constant <value_float = 2.0> ()"
-        " z = Mul (x, k)"
+        " k = Constant <value_float = 2.0> () e = Constant <value = float[0] {}> ()"
+        " w = Concat <axis = 0> (x, e) z = Mul (w, k)"
         " y = If (c) <"
         "then_branch = t () => (float[2] a) {"
         " one = Constant <value_floats = [1.0, 1.0]> () a = Add(z, one) },"
         " else_branch = e () => (float[2] b) { b = Neg(z) }> }"
     )
     normalise(model)
-    assert [n.op_type for n in model.graph.all_nodes()] == ["Mul", "If", "Add", "Neg"]
-    assert list(model.graph.initializers) == ["k"]
+    left = ["Concat", "Mul", "If", "Add", "Neg"]
+    assert [n.op_type for n in model.graph.all_nodes()] == left
+    assert list(model.graph.initializers) == ["k", "e"]
     onnx.checker.check_model(ir.to_proto(model))
     assert settled(model)
 
