@@ -32,7 +32,7 @@ def lower(model: ir.Model, path: Path) -> None:
     if model.ir_version > NEWEST_IR:
         changes.append(f"IR version {model.ir_version} became {NEWEST_IR}")
         model.ir_version = NEWEST_IR
-    newest = max(opset for _, opset in _bodies(model))
+    newest = max(opset for _, opset in bodies(model))
     if newest > NEWEST_OPSET:
         changes.append(f"opset {newest} became {NEWEST_OPSET}")
         _lower_opset(model, newest, path)
@@ -54,7 +54,7 @@ def _lower_opset(model: ir.Model, newest: int, path: Path) -> None:
         )
     changed = [
         (node, opset)
-        for body, opset in _bodies(model)
+        for body, opset in bodies(model)
         for node in body.all_nodes()
         if _since(node, opset) > NEWEST_OPSET
     ]
@@ -71,7 +71,7 @@ def _lower_opset(model: ir.Model, newest: int, path: Path) -> None:
                 imports[domain] = NEWEST_OPSET
 
 
-def _bodies(model: ir.Model) -> Iterator[tuple[ir.Graph | ir.Function, int]]:
+def bodies(model: ir.Model) -> Iterator[tuple[ir.Graph | ir.Function, int]]:
     """List the graph and the functions, each with its opset."""
     main = opset_of(model)
     yield model.graph, main

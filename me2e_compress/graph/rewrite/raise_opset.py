@@ -8,7 +8,7 @@ import onnx_ir as ir
 
 from me2e_compress.graph import provenance
 from me2e_compress.graph.nodes import STANDARD, array_of, has_subgraph, opset_of
-from me2e_compress.graph.opset import alone, changed_since, why_not
+from me2e_compress.graph.opset import alone, bodies, changed_since, why_not
 from me2e_compress.graph.rewrite.edits import (
     add_constant,
     fresh_name,
@@ -32,42 +32,60 @@ def raise_opset(model: ir.Model, opset: int, by: str) -> tuple[int, str]:
 
     Operators that did not change in between stay, others are converted by ONNX's
     version converter, one by one, so that names, metadata and plugins stay. Functions
-    keep the opset that they import. Nothing changes unless every node can be written.
+    are taken along, as they are. Nothing changes unless every node can be written, and
+    those of functions stay the same.
     """
     before, known = opset_of(model), onnx.defs.onnx_opset_version()
     if opset > known:
         return 0, f"onnx {onnx.__version__} converts to {known} at most"
     changed = [
-        node
-        for node in model.graph.all_nodes()
-        if changed_since(node, before, opset) and _converts(node, before)
+        (node, own, body is not model.graph)
+        for body, own in bodies(model)
+        for node in body.all_nodes()
+        if own < opset and changed_since(node, own, opset) and _converts(node, own)
     ]
     if changed:
         infer_shapes(model)
     # Convert all of them before the first is replaced
     written = dict[ir.Node, ir.Graph]()
-    for node in changed:
-        reason = _not_converted(node, before)
+    for node, own, in_function in changed:
+        reason = _not_converted(node, own)
         if reason:
             return 0, f"{node.op_type} {node.name!r} stays as it is: {reason}"
         try:
-            proto = onnx.version_converter.convert_version(alone(node, before), opset)
+            proto = onnx.version_converter.convert_version(alone(node, own), opset)
         except (onnx.version_converter.ConvertError, RuntimeError) as error:
             called = f"{node.op_type} {node.name!r}"
             return 0, f"{called} cannot be written in {opset}: {why_not(error)}"
-        written[node] = ir.serde.deserialize_model(proto).graph
+        if not in_function:
+            written[node] = ir.serde.deserialize_model(proto).graph
+        elif not _is_same(proto.graph, alone(node, own).graph):
+            return 0, f"{node.op_type} {node.name!r} of a function is another there"
     names = value_names(model.graph)
     for node, instead in written.items():
         _replace(node, instead, before, names, by)
-    for domain in STANDARD:
-        if domain in model.opset_imports:
-            model.opset_imports[domain] = opset
-    return len(changed) + 1, ""
+    for body, _ in bodies(model):
+        for domain in STANDARD:
+            if 0 < body.opset_imports.get(domain, 0) < opset:
+                body.opset_imports[domain] = opset
+    return len(written) + 1, ""
 
 
 def _converts(node: ir.Node, before: int) -> bool:
     """Return whether a node is another one in a newer opset: If and Loop take more."""
     return not has_subgraph(node) or (node.op_type == "Scan" and before < _SCAN_AS_IS)
+
+
+def _is_same(new: onnx.GraphProto, old: onnx.GraphProto) -> bool:
+    """Return whether a graph of one node was converted without a change."""
+    one, other = (
+        [
+            (node.op_type, [*node.input], sorted(map(str, node.attribute)))
+            for node in graph.node
+        ]
+        for graph in (new, old)
+    )
+    return one == other
 
 
 def _not_converted(node: ir.Node, before: int) -> str:

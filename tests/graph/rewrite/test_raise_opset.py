@@ -95,3 +95,31 @@ def test_what_the_converter_would_change_stays_in_its_opset(
 
     assert model.opset_imports[""] == row[0]
     assert f"opset {row[0]} stays: {op} 'old' stays as it is" in result.notes[0]
+
+
+@pytest.mark.parametrize(
+    ("body", "opset", "note"),
+    [
+        ("MatMul(i, i)", 13, "opset 12 became 13"),
+        (
+            "Softmax(i)",
+            12,
+            "opset 12 stays: Softmax 'Softmax_0' of a function is another there",
+        ),
+    ],
+)
+def test_a_function_is_taken_along_or_its_graph_stays(
+    body: str, opset: int, note: str
+) -> None:
+    model = ir.from_onnx_text(
+        '<ir_version: 9, opset_import: ["" : 12, "f" : 1]> g (float[2,2] x) =>'
+        " (float[2,2] y) { h = f.F(x) y = MatMul(h, x) }"
+        f' <domain: "f", opset_import: ["" : 12]> F (i) => (o) {{ o = {body} }}'
+    )
+
+    result = ImportNormalize().run(model, Context(EVERYTHING))
+
+    (function,) = model.functions.values()
+    assert model.opset_imports[""] == function.opset_imports[""] == opset
+    assert result.notes == (note,)
+    onnx.checker.check_model(ir.to_proto(model))
