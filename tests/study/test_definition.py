@@ -273,4 +273,4 @@ def test_the_mean_of_a_drive_is_that_of_its_record(tmp_path: Path) -> None:
 
     record = DriveRecord.load(tmp_path / "records" / "faster.even.jsonl")
     assert record.mean_latency_us == 500_000
-    assert held_frames(asked, even) == held_frames(asked, SLOW)
+    assert held_frames(asked, even) == held_frames(asked, SLOW) == 10  # 0.5 s by 0.05 s
