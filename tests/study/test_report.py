@@ -156,7 +156,7 @@ def test_a_curve_needs_three_conditions(found: StudyResult) -> None:
     assert drawn is not None
     assert all(drawn.count(f">{name}</text>") == 3 for name in ("middle", "fast"))
     fast = tuple(each for each in three.drives if each.variant == "fast")
-    assert ">again<" not in str(curves(dataclasses.replace(three, drives=fast)))
+    assert ">again<" not in str(curves(replace(three, drives=fast)))
 
 
 def test_findings_give_costs_and_what_is_sure(found: StudyResult) -> None:
