@@ -4,9 +4,13 @@ import numpy as np
 import pytest
 
 from me2e_compress import graph
-from me2e_compress.calibration.calibrator import Calibrator, Extremes
+from me2e_compress.calibration.calibrator import (
+    Calibrator,
+    Extremes,
+    probed_session,
+    schedule_probes,
+)
 from me2e_compress.calibration.dataset import CalibrationSet
-from me2e_compress.calibration.probed_session import probed_session, schedule_probes
 from me2e_compress.calibration.statistics import BINS
 from me2e_compress.runtime.probing import READINGS, insert_probes
 from me2e_compress.runtime.session import Session
