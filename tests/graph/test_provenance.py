@@ -9,6 +9,7 @@ from me2e_compress.errors import GraphError
 from me2e_compress.graph import provenance
 from me2e_compress.graph.provenance import ORIGINS, Provenance
 from me2e_compress.registry.documents import MalformedError
+from tests.nets import parsed
 
 
 @pytest.fixture
@@ -38,16 +39,14 @@ def test_a_past_of_another_kind_is_named(node: ir.Node, text: str) -> None:
 
 def test_a_file_holds_few_bytes_of_the_past_and_loses_none(tmp_path: Path) -> None:
     pasts = {"a": ("a",), "b": ("source/of/a", "source/of/b"), "c": ("a",)}
-    x = ir.val("x", ir.DataType.FLOAT, [2])
-    nodes, last = [], x
-    for name in (*pasts, "c"):  # the last two bear one name
-        nodes.append(ir.node("Relu", [last], name=name))
-        provenance.stamp(nodes[-1], Provenance("m", pasts[name], ("p",)))
-        last = nodes[-1].outputs[0]
-        last.name, last.type, last.shape = f"y{len(nodes)}", x.type, x.shape
-    model = ir.Model(
-        ir.Graph([x], [last], nodes=nodes, opset_imports={"": 17}), ir_version=8
+    model = parsed(
+        "m (float[2] x) => (float[2] w) {"
+        " t = Relu (x) u = Relu (t) v = Relu (u) w = Relu (v) }"
     )
+    nodes = list(model.graph)
+    for node, name in zip(nodes, (*pasts, "c"), strict=True):  # two bear one name
+        node.name = name
+        provenance.stamp(node, Provenance("m", pasts[name], ("p",)))
     before = [dict(node.metadata_props) for node in nodes]
 
     graph.save(model, tmp_path / "m.onnx")
@@ -65,10 +64,8 @@ def test_a_file_holds_few_bytes_of_the_past_and_loses_none(tmp_path: Path) -> No
 
 
 @pytest.mark.parametrize("text", ["eJyr", "!", "[1]", '{"a": ', "[" * 300])
-def test_a_past_that_is_no_table_is_named(node: ir.Node, text: str) -> None:
-    model = ir.Model(
-        ir.Graph([], [], nodes=[node], opset_imports={"": 17}), ir_version=8
-    )
+def test_a_past_that_is_no_table_is_named(text: str) -> None:
+    model = parsed("m (float[2] x) => (float[2] w) { w = Relu (x) }")
     model.metadata_props[ORIGINS] = text
     with pytest.raises(GraphError, match=r"^its metadata me2e.origins is not a table"):
         provenance.unpack(model)
