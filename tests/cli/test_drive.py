@@ -93,6 +93,7 @@ def test_what_fits_and_what_is_missing_is_said_before_a_drive(
 
     found = cli.document("evaluate m.onnx --check --adapter a.toml")
     assert found["status"] == "ok"
+    assert "input" in cli.done("evaluate m.onnx --check --adapter a.toml").out
     found = cli.document("evaluate m.onnx --check", code=1)
     assert found["status"] == "refused"
     assert "could not drive: " in cli.refused("evaluate m.onnx --check --json")
