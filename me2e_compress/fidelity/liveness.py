@@ -21,7 +21,10 @@ ROUNDING = 1e-4
 """A deviation, over the length of the output, that may be rounding alone: two runtimes
 are 3e-5 to 6e-5 apart in float32 on UniAD-tiny (models/README.md)."""
 
-Verdict: TypeAlias = Literal["alive", "constant", "frozen", "not judged"]
+Verdict: TypeAlias = Literal["alive", "weak", "constant", "frozen", "not judged"]
+
+WEAK = 0.5
+"""An output that moves less far than this share of before is alive, but weak."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -77,11 +80,12 @@ class Liveness:
         moving = [
             (each.moves, each.output)
             for each in self.outputs
-            if each.verdict == "alive" and each.moves is not None
+            if each.verdict in ("alive", "weak") and each.moves is not None
         ]
         if moving and not self.faults:
             share, output = min(moving)
-            yield f"every output is alive (least of all {output}: {share:.0%})"
+            words = "every output is alive" if share >= WEAK else "none dead, but weak"
+            yield f"{words} (least of all {output}: {share:.0%})"
         rests = [
             f"{each.output} ({each.reason})"
             for each in self.outputs
@@ -159,7 +163,8 @@ class OutputTally:
         if first.discrete:
             return OutputLiveness(self.name, "not judged", moves, "whole numbers")
         if moves >= alive:
-            return OutputLiveness(self.name, "alive", moves)
+            verdict: Verdict = "alive" if moves >= WEAK else "weak"
+            return OutputLiveness(self.name, verdict, moves)
         reason = f"it moves {moves:.2%} as far as before"
         return OutputLiveness(
             self.name, "frozen" if moves else "constant", moves, reason

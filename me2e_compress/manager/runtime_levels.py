@@ -65,8 +65,6 @@ def first_node(
     level: Level,
     allowed: float,
     inputs: VerificationInputs,
-    *,
-    int8_kernels: bool = False,
 ) -> ir.Node | None:
     """Find the first node behind which a level differs, in log2 trials.
 
@@ -79,12 +77,7 @@ def first_node(
     behind = [node for node in model.graph if node in makers]
 
     def differs(node: ir.Node) -> bool:
-        opened = partial(
-            Session,
-            _up_to(model, node),
-            provider=inputs.provider,
-            int8_kernels=int8_kernels,
-        )
+        opened = partial(Session, _up_to(model, node), provider=inputs.provider)
         try:
             plain = opened(optimize="none").run(feeds)
             optimized = opened(optimize=level).run(feeds)

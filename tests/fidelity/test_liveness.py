@@ -116,9 +116,11 @@ def test_movement_is_the_standard_deviation_over_frames() -> None:
     for each in draws:
         tally.add(each, 0.25 * each + 7.0)
 
-    assert tally.result(0.2).verdict == "alive"
+    assert tally.result(0.2).verdict == "weak"
     assert tally.result(0.2).moves == pytest.approx(0.25)
     assert tally.result(0.3).verdict == "frozen"
+    (line,) = Liveness((tally.result(0.2),), 0.01).lines()
+    assert line == "none dead, but weak (least of all y: 25%)"
 
 
 def test_rounding_is_no_movement() -> None:

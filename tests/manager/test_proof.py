@@ -268,7 +268,6 @@ def test_the_first_node_that_a_level_gets_wrong_is_named(
             *,
             optimize: Level = "all",
             provider: Provider = CPU,
-            int8_kernels: bool = False,
         ) -> None:
             model = model.clone()
             for node in model.graph:

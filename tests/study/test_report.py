@@ -98,6 +98,7 @@ def test_a_preview_is_named_so_in_every_title_and_the_headline(page: str) -> Non
     assert all("(preview: 2 of 220 routes)" in f"{a}{b}" for a, b in titles)
     (lede,) = re.findall(r'<p class="lede">(.*?)</p>', page)
     assert "2 routes cannot show a difference below " in lede
+    assert "Decisions cost no time under ideal: no latency shows there." in page
 
 
 def test_the_checkpoint_stands_where_a_variant_was_made(found: StudyResult) -> None:

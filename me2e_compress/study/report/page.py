@@ -108,6 +108,11 @@ def study_page(
         f"Against {outcome.study.baseline}, the same routes; in brackets the 95 %"
         " interval of the mean difference."
     )
+    free = [each.name for each in outcome.study.conditions if each.latency == "none"]
+    if free:
+        note += (
+            f" Decisions cost no time under {', '.join(free)}: no latency shows there."
+        )
     return Page(
         outcome.title,
         _lede(outcome),
