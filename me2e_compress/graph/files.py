@@ -4,15 +4,14 @@ import contextlib
 import hashlib
 import os
 import tempfile
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
 
-import numpy as np
 import onnx
 import onnx_ir as ir
 import onnx_ir.passes.common as common
-from google.protobuf.message import DecodeError, Message
+from google.protobuf.message import DecodeError
 
 from me2e_compress.display import reason
 from me2e_compress.errors import GraphError
@@ -136,10 +135,9 @@ def save(model: ir.Model, path: str | Path, *, external: bool | None = None) -> 
     ):
         draft = Path(folder) / path.name
         with _ours(model), provenance.packed(model):
-            if external:
-                ir.save(model, draft, format="protobuf", external_data=data.name)
-            else:
-                write_inline(inlined(model) if stored else model, draft)
+            whole = inlined(model) if stored and not external else model
+            where = data.name if external else None
+            ir.save(whole, draft, format="protobuf", external_data=where)
         # The earlier model keeps its weights until the new one stands in its place.
         draft_data = draft.with_name(data.name)
         if draft_data.exists():
@@ -343,116 +341,3 @@ def _anchored(tensor: ir.ExternalTensor, path: Path) -> ir.ExternalTensor:
         doc_string=tensor.doc_string,
         base_dir=data.parent,
     )
-
-
-LARGE_BYTES = 1 << 16
-"""Weights beyond this are written one by one, smaller ones with the graph."""
-
-_GRAPH, _INITIALIZER, _RAW_DATA = b"\x3a", b"\x2a", b"\x4a"
-"""ModelProto.graph is field 7, GraphProto.initializer 5, TensorProto.raw_data 9, each
-followed by its length (onnx.proto)."""
-
-_BEFORE_GRAPH = (
-    *("ir_version", "producer_name", "producer_version", "domain"),
-    *("model_version", "doc_string"),
-)
-_PLAIN = frozenset(
-    {
-        *(ir.DataType.FLOAT, ir.DataType.DOUBLE, ir.DataType.FLOAT16),
-        *(ir.DataType.INT64, ir.DataType.INT32, ir.DataType.INT8),
-        *(ir.DataType.UINT8, ir.DataType.BOOL),
-    }
-)
-"""Types whose raw bytes are those of the numbers."""
-
-
-def write_inline(model: ir.Model, path: Path) -> None:
-    """Write a model with all its weights in one file; none of them is external.
-
-    The model stays as it is.
-    """
-    large = {
-        value: value.const_value
-        for value in model.graph.initializers.values()
-        if value.const_value is not None and _is_large(value.const_value)
-    }
-    proto = _light(model, large)
-    # The message of each weight, that of a large one but for its numbers
-    large_of = {str(value.name): tensor for value, tensor in large.items()}
-    weights = list[tuple[bytes, ir.TensorProtocol | None, int]]()
-    for each in proto.graph.initializer:
-        tensor = large_of.get(each.name)
-        if tensor is None:
-            begin, more = bytes(each.SerializeToString()), 0
-        else:
-            begin, more = _begin(each.name, tensor), tensor.nbytes
-        weights.append((begin, tensor, len(begin) + more))
-    # Fields are written in the order of their numbers
-    proto.graph.ClearField("initializer")
-    before, behind = _around(proto.graph, ("node", "name"))
-    proto.ClearField("graph")
-    first, last = _around(proto, _BEFORE_GRAPH)
-    total = sum(1 + len(_varint(length)) + length for _, _, length in weights)
-    total += len(before) + len(behind)
-    with path.open("wb") as stream:
-        stream.write(first + _GRAPH + _varint(total) + before)
-        for begin, tensor, length in weights:
-            stream.write(_INITIALIZER + _varint(length) + begin)
-            if tensor is not None:
-                stream.write(tensor.tobytes())
-        stream.write(behind + last)
-
-
-def _is_large(tensor: ir.TensorProtocol) -> bool:
-    if isinstance(tensor, ir.serde.TensorProtoTensor):
-        held: onnx.TensorProto = tensor.raw
-        if not held.HasField("raw_data"):  # numbers as a list stay a list
-            return False
-    return (
-        tensor.nbytes > LARGE_BYTES
-        and tensor.dtype in _PLAIN
-        and not tensor.doc_string
-        and not tensor.metadata_props
-        and not isinstance(tensor, ir.ExternalTensor)
-    )
-
-
-def _light(
-    model: ir.Model, large: Mapping[ir.Value, ir.TensorProtocol]
-) -> onnx.ModelProto:
-    """Write the message of a model, its large weights empty."""
-    try:
-        for value in large:
-            value.const_value = ir.tensor(np.zeros(0, np.float32), name=value.name)
-        return ir.to_proto(model)
-    finally:
-        for value, tensor in large.items():
-            value.const_value = tensor
-
-
-def _begin(name: str, tensor: ir.TensorProtocol) -> bytes:
-    """Return all of a tensor's message but the numbers; its name is the value's."""
-    begin = onnx.TensorProto(
-        dims=[int(size) for size in tensor.shape.numpy()],
-        data_type=tensor.dtype.value,
-        name=name,
-    )
-    return bytes(begin.SerializeToString()) + _RAW_DATA + _varint(tensor.nbytes)
-
-
-def _around(message: Message, fields_before: Iterable[str]) -> tuple[bytes, bytes]:
-    """Return the fields of a message before one that it lacks, and those behind."""
-    whole = message.SerializeToString()
-    for name in fields_before:
-        message.ClearField(name)
-    behind = message.SerializeToString()
-    return whole[: len(whole) - len(behind)], behind
-
-
-def _varint(number: int) -> bytes:
-    """Write a number as protobuf does: seven bits a byte, the last without a mark."""
-    parts = list[int]()
-    while number > 0x7F:
-        parts.append(number & 0x7F | 0x80)
-        number >>= 7
-    return bytes([*parts, number])

@@ -49,7 +49,7 @@ def test_a_failed_save_keeps_the_old_file(
     def full(*args: object, **kwargs: object) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(files, "write_inline", full)
+    monkeypatch.setattr(ir, "save", full)
     with pytest.raises(OSError, match="No space"):
         graph.save(weighted(32), path)
     assert path.read_bytes() == before
