@@ -252,7 +252,8 @@ EVERY_S = 10.0
 class ProgressLines:
     """Writes the progress of a long run, seldom enough for a log.
 
-    A run of less than `EVERY_S` writes nothing, unless every new stage is written too.
+    A run of less than `EVERY_S` writes nothing, unless every new stage is written too;
+    a stage that was written of is written of as it ends.
     """
 
     def __init__(
@@ -263,20 +264,20 @@ class ProgressLines:
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self._write, self._stages, self._clock = write, stages, clock
-        self._stage = ""
+        self._stage, self._unfinished = "", False
         self._begun = self._said = clock()
 
     def on_progress(self, stage: str, done: int, total: int, what: str) -> None:
         """Write a line if it is time for one; to be called by a listener."""
         now = self._clock()
         if stage != self._stage:
-            self._stage, self._begun = stage, now
+            self._stage, self._begun, self._unfinished = stage, now, False
             if self._stages:
                 self._write(stage)
                 self._said = now
-        if now - self._said < EVERY_S:
+        if now - self._said < EVERY_S and not (self._unfinished and done == total):
             return
-        self._said = now
+        self._said, self._unfinished = now, done < total
         line = f"{stage}: {_done(done, total, what)}"
         # how long the rest takes at the pace so far
         if 0 < done < total:

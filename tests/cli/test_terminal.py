@@ -93,7 +93,8 @@ STEPS = [(done * 0.3, "calibrate", done, 100, "frames") for done in range(101)]
     ("told", "stages", "said"),
     [
         (STEPS, False, ["calibrate: 34/100 frames, 20 s left",
-                        "calibrate: 68/100 frames, 10 s left"]),
+                        "calibrate: 68/100 frames, 10 s left",
+                        "calibrate: 100/100 frames"]),
         ([(EVERY_S / 2, "calibrate", 1, 2, "frames")], False, []),
         ([(0.0, stage, 0, 1, "") for stage in ("collect", "learn", "learn")],
          True, ["collect", "learn"]),
