@@ -100,7 +100,7 @@ def _refuse_former(words: Sequence[str]) -> None:
     name, taken = next(iter(words), ""), set[str]()
     if name in COMMANDS:
         arguments = app[name].assemble_argument_collection()
-        taken = {flag for each in arguments for flag in each.names}
+        taken = {flag for each in arguments if each.parse for flag in each.names}
     for flag in (word.partition("=")[0] for word in words[1:]):
         gone = FORMER.get(f"{name} {flag}") or FORMER.get(flag)
         if gone and flag not in taken:

@@ -30,6 +30,9 @@ __all__ = ["cli", "command"]
         ("export vad-tiny --opset 13 -o m.onnx", "python -m models.export"),
         ("demo --stack vad-tiny", "python -m models.export"),
         ("plan a.onnx --set-dim batch=1", "compress --set-dim"),
+        ("compress a.onnx -o b.onnx --allow-empty", "-r exact"),
+        ("evaluate blind -o out --dt-ms 25", "a study's dt_ms"),
+        ("routes --examine set.json", ""),
         ("compare a.onnx b.onnx frames --plugins c.so", "--provider 'cpu{plugins=["),
     ],
 )
