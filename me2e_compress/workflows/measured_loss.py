@@ -1,7 +1,7 @@
 """What lossy passes, and onnxruntime's own int8, did to a model's outputs."""
 
 import dataclasses
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from functools import partial
 from pathlib import Path
 
@@ -12,7 +12,7 @@ from me2e_compress.calibration.sample import hold_out
 from me2e_compress.display import Table, counted, table
 from me2e_compress.errors import EvaluationError, FramesError, GraphError
 from me2e_compress.fidelity.compare import Fidelity
-from me2e_compress.fidelity.floor import Floor, Rounding, Shortfall, shown
+from me2e_compress.fidelity.floor import Floor, Shortfall, shown
 from me2e_compress.fidelity.liveness import Liveness
 from me2e_compress.manager import Report
 from me2e_compress.passes import Pass
@@ -47,10 +47,6 @@ class MeasuredLoss:
             measured.
         on: which frames were used, or why nothing was measured, in words.
         incomparable: whether an output is not finite, or of another shape than before.
-        unsteady: outputs that are not judged, with what they fall to in `rounding`:
-            they pick between near-equal candidates.
-        rounding: outputs below the floor that fall below it, uncompressed, when the
-            largest input alone is rounded; None if nothing is below.
         shortfalls: outputs below the floor, the worst first.
         guilty: the lossy passes, which cause the shortfalls between them.
         int8_nodes: the nodes that are int8, where they are three at most.
@@ -64,8 +60,6 @@ class MeasuredLoss:
     fidelity: Fidelity | None
     on: str
     floor: Floor
-    unsteady: Mapping[str, float] = dataclasses.field(default_factory=dict)
-    rounding: Rounding | None = None
     liveness: Liveness | None = None
     runtime: RuntimeLoss | None = None
     shortfalls: tuple[Shortfall, ...] = ()
@@ -88,8 +82,7 @@ class MeasuredLoss:
             judged = [
                 each
                 for each in found.outputs
-                if each.name != found.plan_output
-                and not (each.discrete or each.name in self.unsteady)
+                if each.name != found.plan_output and not each.discrete
             ]
             if judged:
                 worst = min(judged, key=lambda each: each.sqnr_db)
@@ -100,8 +93,6 @@ class MeasuredLoss:
             yield f"{'; '.join(parts) or 'no output could be judged'} ({where})"
         elif self.on != NOT_ASKED:
             yield f"fidelity: not measured ({self.on})"
-        if found is not None and self.rounding is not None:
-            yield from self._rounded(found, self.rounding)
         if self.liveness is not None:
             yield from self.liveness.lines()
         if self.runtime is not None:
@@ -138,7 +129,6 @@ class MeasuredLoss:
             for each in found.outputs
             if each.discrete
         }
-        said |= dict.fromkeys(self.unsteady, "not judged: it picks")
         said |= dict.fromkeys(below, "below")
         rows = [
             (
@@ -159,27 +149,6 @@ class MeasuredLoss:
         """Return what the report says of it: all but the time."""
         names = (each.name for each in dataclasses.fields(self))
         return {name: getattr(self, name) for name in names if name != "seconds"}
-
-    def _rounded(self, found: Fidelity, rounding: Rounding) -> Iterator[str]:
-        """Say what rounding one input does to the graph before; nothing in silence."""
-        plan = "" if found.plan is None else found.plan_output
-        for choice in dict.fromkeys(map(rounding.choices.get, rounding.values)):
-            low = ", ".join(
-                f"{name} ({shown(value, 'm' if name == plan else 'dB')})"
-                for name, value in rounding.values.items()
-                if rounding.choices.get(name) == choice
-            )
-            alone = (
-                f"{low}: so low falls the graph itself, uncompressed, when only"
-                f" {rounding.input} is rounded to int8"
-            )
-            yield (
-                f"not judged: {alone}; it picks between near-equal candidates at"
-                f" {choice}, and the road tells what that means"
-                if choice
-                else f"judged, though int8 may be too coarse for it: {alone}, and"
-                " nothing picks on the way"
-            )
 
 
 KEPT_OUT = "kept out of calibration"
@@ -241,11 +210,7 @@ def measure_loss(
     floor: Floor,
     listener: Listener,
 ) -> MeasuredLoss | None:
-    """Compare the graph with that before the first lossy pass; None if all are exact.
-
-    Of what is below the floor, the outputs that choose between near-equal candidates
-    are set aside.
-    """
+    """Compare with the graph before the first lossy pass; None if all are exact."""
     if not report.lossy:
         return None
     loss = MeasuredLoss(None, frames.kind, floor)
@@ -266,7 +231,7 @@ def measure_loss(
 def _compared(
     loss: MeasuredLoss, report: Report, provider: Provider, frames: Frames
 ) -> MeasuredLoss:
-    """Measure; of what is below the floor, tell which outputs are judged."""
+    """Measure, and name what is below the floor."""
     passes = [each.applied for each in report.lossy]
     before, after = report.lossy[0].before, report.model
     open_session = partial(Session, release=True, provider=provider)
@@ -282,22 +247,16 @@ def _compared(
         kernels = open_session(after, stock=True)
     found = compared(reference, session, frames, after, kernels)
     loss = dataclasses.replace(loss, **vars(found))
-    low = [each.output for each in loss.floor.shortfalls(found.fidelity)]
-    if not low:
+    below = loss.floor.shortfalls(found.fidelity)
+    if not below:
         return loss
-    # outputs that choose between near-equal candidates are not judged
-    rounding = Rounding.of(reference, frames, before, loss.floor, low)
-    unsteady = {name: rounding.values[name] for name in rounding.choices}
-    below = loss.floor.shortfalls(found.fidelity, unsteady)
     int8 = any(isinstance(each, QuantizeInt8) for each in passes)
-    plan = plan_of(after) if below and int8 else None
+    plan = plan_of(after) if int8 else None
     placed = () if plan is None else plan.placed
     return dataclasses.replace(
         loss,
-        unsteady=unsteady,
-        rounding=rounding,
         shortfalls=below,
-        guilty=tuple(each.name for each in passes) if below else (),
+        guilty=tuple(each.name for each in passes),
         int8_nodes=tuple(e.node for e in placed) if len(placed) <= FEW_NODES else (),
-        advice=ADVICE if below and int8 else "",
+        advice=ADVICE if int8 else "",
     )
