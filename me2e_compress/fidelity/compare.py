@@ -113,19 +113,9 @@ class Reference:
         answers = tuple(detached(each) for each in replay(session, frames))
         return cls(session, frames, answers)
 
-    def compare(
-        self,
-        other: Session,
-        frames: Iterable[Frame] | None = None,
-        watching: Sequence[Watch] = (),
-    ) -> Fidelity:
-        """Compare another model with it, as :func:`compare` does.
-
-        ``frames`` replaces the recording for the other model; to see what other frames
-        change, pass the reference model itself.
-        """
-        shown = self.frames if frames is None else frames
-        return compare(self.session, other, shown, watching, iter(self.answers))
+    def compare(self, other: Session, watching: Sequence[Watch] = ()) -> Fidelity:
+        """Compare another model with it, as :func:`compare` does."""
+        return compare(self.session, other, self.frames, watching, iter(self.answers))
 
 
 def compare(
