@@ -12,6 +12,7 @@ import numpy.typing as npt
 import pydantic
 
 from me2e_compress.errors import EvaluationError, GraphError
+from me2e_compress.graph.recurrence import SETS
 from me2e_compress.registry import documents
 from me2e_compress.runtime.frames import Array, Frame, Frames
 from me2e_compress.runtime.plan_adapter import PLAN, PlanAdapter
@@ -335,9 +336,6 @@ def decibels(signal: float, noise: float) -> float:
 # after rounding, so a comparison slot by slot compares different cars.
 
 
-SETS = "me2e.sets"
-"""Metadata key: JSON of :class:`SetOutputs`."""
-
 SURE = 0.5
 """Score from which an agent counts: more likely there than not."""
 
@@ -415,9 +413,9 @@ class SetTally:
 
     @classmethod
     def of(cls, a: Session, b: Session) -> Self | None:
-        """Return the tally of the first's sets; None unless the second has them too."""
+        """Return the tally of the sets that either names and both have, or None."""
         shapes = {name: port.shape for name, port in a.outputs.items()}
-        named = SetOutputs.of(a.metadata, shapes)
+        named = SetOutputs.of({**b.metadata, **a.metadata}, shapes)
         both = named is not None and set(named.names) <= set(b.outputs)
         return cls(named) if named is not None and both else None
 

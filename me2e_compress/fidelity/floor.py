@@ -3,7 +3,7 @@
 import dataclasses
 
 from me2e_compress.fidelity import SQNR_FLOOR_DB
-from me2e_compress.fidelity.compare import Fidelity
+from me2e_compress.fidelity.compare import Fidelity, SetFidelity
 
 PLAN_FLOOR_M = 0.5
 """A car 1.9 m wide in the middle of a lane of 3.5 m still keeps 0.3 m to its lines."""
@@ -45,9 +45,12 @@ class Floor:
     sqnr_db: float = SQNR_FLOOR_DB
     plan_m: float = PLAN_FLOOR_M
 
-    def shortfalls(self, found: Fidelity) -> tuple[Shortfall, ...]:
-        """List what is below the floor, the worst first."""
+    def shortfalls(
+        self, found: Fidelity, agents: SetFidelity | None = None
+    ) -> tuple[Shortfall, ...]:
+        """List what is below the floor, the worst first; sets by matched agents."""
         below = []
+        matched = {} if agents is None else agents.sqnr_db
         for each in found.outputs:
             # The noise over what is allowed: above 1 is too much.
             part = ""
@@ -55,8 +58,10 @@ class Floor:
                 value, unit = found.plan.mean_m, "m"
                 excess = value / self.plan_m
             else:
-                value, unit = each.sqnr_db, "dB"
-                if each.small_db is not None and each.small_db < value:
+                value, unit = matched.get(each.name, each.sqnr_db), "dB"
+                if each.name in matched:
+                    part = " of matched agents"
+                elif each.small_db is not None and each.small_db < value:
                     value, part = each.small_db, each.small
                 excess = min(float(10 ** ((self.sqnr_db - value) / 20)), MOST_EXCESS)
             if excess > 1 and not each.discrete:

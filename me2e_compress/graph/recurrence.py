@@ -8,6 +8,8 @@ import onnx_ir as ir
 from me2e_compress.errors import GraphError
 from me2e_compress.registry import documents
 
+SETS = "me2e.sets"
+"""Metadata key of the outputs whose rows are agents, in no order."""
 RECURRENT = "me2e.recurrent"
 """Metadata key: JSON ``{input: output}``, null for an input that is not fed back;
 ``{}`` where none is."""

@@ -30,7 +30,12 @@ WEIGHTS = Path(__file__).with_name("weights")
 """One ``NAME.onnx``, ``NAME.json`` and ``NAME-frames`` per model."""
 
 SHIPPED = ("highway",)
-"""Names of the models."""
+"""Names of the models, and of their module maps."""
+
+
+def own_map(path: Path) -> str | None:
+    """Return the module map of a model that ships; None of any other file."""
+    return path.stem if path.parent == WEIGHTS and path.stem in SHIPPED else None
 
 
 class TrainingData(pydantic.BaseModel):

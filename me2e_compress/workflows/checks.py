@@ -43,7 +43,7 @@ from me2e_compress.runtime.children import run_script
 from me2e_compress.runtime.frames import Frames
 from me2e_compress.runtime.providers import CPU, Provider
 from me2e_compress.runtime.runnable import compiled_or_expanded, unsupported
-from me2e_compress.shipped.drivers import SHIPPED, is_copy, shipped
+from me2e_compress.shipped.drivers import SHIPPED, is_copy, own_map, shipped
 from me2e_compress.workflows import opening_main
 from me2e_compress.workflows.options import GraphOptions
 from me2e_compress.workflows.result import Listener
@@ -72,7 +72,7 @@ def read_graph(
     What an adapter and a map state becomes metadata of the graph; see :func:`adapted`.
     """
     model = graph.load(path)
-    adapted(model, adapter, module_map)
+    adapted(model, adapter, module_map or own_map(path))
     if said := lowered(model):
         listener.on_warning(f"{path}: {said}: onnxruntime reads no newer")
     if lack := lacking_shapes(model):
@@ -339,7 +339,8 @@ def opened(
     for sessions of the file, which lacks it.
     """
     model = graph.load(path)
-    said = adapted(model, options.adapter, options.module_map)
+    module_map = options.module_map or own_map(path)
+    said = adapted(model, options.adapter, module_map)
     recording.check(model)
     provider = options.runs_on
     try_first(

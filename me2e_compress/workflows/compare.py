@@ -183,9 +183,8 @@ def compare(
         kernels = session(paths[1], stock=True)
     shown = map(reported, recording)
     found = compared(left, right, shown, judged, kernels, sets, alive=options.alive)
-    agents = None if sets is None else sets.result()
     return CompareResult(
-        *paths, found.fidelity, found.liveness, agents, found.runtime, slow
+        *paths, found.fidelity, found.liveness, found.agents, found.runtime, slow
     )
 
 
@@ -196,6 +195,7 @@ class Comparison:
     fidelity: Fidelity
     liveness: Liveness | None
     runtime: RuntimeLoss | None
+    agents: SetFidelity | None
 
 
 def compared(
@@ -223,6 +223,7 @@ def compared(
         fidelity,
         None if lively is None else lively.result(alive),
         None if runtime is None else runtime.result(model, fidelity),
+        None if sets is None else sets.result(),
     )
 
 

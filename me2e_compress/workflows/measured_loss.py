@@ -1,7 +1,7 @@
 """What lossy passes, and onnxruntime's own int8, did to a model's outputs."""
 
 import dataclasses
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 
@@ -11,7 +11,7 @@ from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.calibration.sample import hold_out
 from me2e_compress.display import Table, counted, table
 from me2e_compress.errors import EvaluationError, FramesError, GraphError
-from me2e_compress.fidelity.compare import Fidelity
+from me2e_compress.fidelity.compare import Fidelity, SetFidelity, SetTally
 from me2e_compress.fidelity.floor import Floor, Shortfall, shown
 from me2e_compress.fidelity.liveness import Liveness
 from me2e_compress.manager import Report
@@ -53,6 +53,7 @@ class MeasuredLoss:
         advice: the command that measures int8 module by module; empty where nothing is
             below the floor, or nothing is int8.
         liveness: which outputs still move; None if not asked.
+        agents: outputs that are sets, by their matched agents; None without any.
         runtime: what onnxruntime's int8 answers otherwise; None if it is not for it.
         seconds: CPU time of measuring.
     """
@@ -62,12 +63,17 @@ class MeasuredLoss:
     floor: Floor
     liveness: Liveness | None = None
     runtime: RuntimeLoss | None = None
+    agents: SetFidelity | None = None
     shortfalls: tuple[Shortfall, ...] = ()
     guilty: tuple[str, ...] = ()
     int8_nodes: tuple[str, ...] = ()
     advice: str = ""
     seconds: float = 0.0
     incomparable: bool = False
+
+    @property
+    def _matched(self) -> Mapping[str, float]:
+        return {} if self.agents is None else self.agents.sqnr_db
 
     def lines(self) -> Iterator[str]:
         """Yield how far the outputs moved, and which are alive or not judged."""
@@ -82,7 +88,8 @@ class MeasuredLoss:
             judged = [
                 each
                 for each in found.outputs
-                if each.name != found.plan_output and not each.discrete
+                if each.name not in (found.plan_output, *self._matched)
+                and not each.discrete
             ]
             if judged:
                 worst = min(judged, key=lambda each: each.sqnr_db)
@@ -129,6 +136,7 @@ class MeasuredLoss:
             for each in found.outputs
             if each.discrete
         }
+        said |= {name: f"agents {db:.1f} dB" for name, db in self._matched.items()}
         said |= dict.fromkeys(below, "below")
         rows = [
             (
@@ -245,9 +253,10 @@ def _compared(
     )
     if written and has_int8_kernels(after, provider):
         kernels = open_session(after, stock=True)
-    found = compared(reference, session, frames, after, kernels)
+    sets = SetTally.of(reference, session)
+    found = compared(reference, session, frames, after, kernels, sets)
     loss = dataclasses.replace(loss, **vars(found))
-    below = loss.floor.shortfalls(found.fidelity)
+    below = loss.floor.shortfalls(found.fidelity, found.agents)
     if not below:
         return loss
     int8 = any(isinstance(each, QuantizeInt8) for each in passes)

@@ -238,6 +238,16 @@ def test_what_is_below_the_floor_is_listed_the_worst_first() -> None:
     assert below[0].excess == pytest.approx(10.0)
 
 
+def test_sets_are_judged_by_their_matched_agents() -> None:
+    agents = SetFidelity(9, 9, {"boxes": 30.0, "scores": 11.0})
+    below = Floor().shortfalls(found(boxes=0.1, scores=0.2, bev=1.0), agents)
+
+    assert [str(each) for each in below] == [
+        "bev 1.0 dB",
+        "scores of matched agents 11.0 dB",
+    ]
+
+
 def test_the_plan_is_judged_in_metres_where_they_are_known() -> None:
     assert not Floor().shortfalls(found(plan_m=0.4, plan=3.0))
     assert str(Floor().shortfalls(found(plan_m=0.6, plan=3.0))[0]) == "plan 0.60 m"

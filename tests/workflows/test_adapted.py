@@ -11,8 +11,10 @@ from me2e_compress import graph
 from me2e_compress.driving.adapter import Adapter
 from me2e_compress.driving.adapter.outputs import adapted
 from me2e_compress.errors import EvaluationError, FramesError
+from me2e_compress.fidelity.compare import SetOutputs
 from me2e_compress.graph.recurrence import recurrent_inputs
 from me2e_compress.runtime.plan_adapter import PlanAdapter
+from me2e_compress.shipped.drivers import own_map, shipped
 from me2e_compress.workflows.calibrate import calibrate
 from me2e_compress.workflows.compare import compare
 from me2e_compress.workflows.compress import compress
@@ -103,6 +105,24 @@ def test_compare_knows_the_plan_and_the_state(
     assert found.plan_output == "waypoints"
     shown = inspect(mine, InspectOptions(adapter=adapter))
     assert shown.recurrent == {"memory": "remembered"}
+
+
+def test_a_map_says_which_outputs_are_sets(mine: Path, tmp_path: Path) -> None:
+    sets, model = tmp_path / "sets.toml", graph.load(mine)
+    named = '[sets]\nboxes = "remembered"\nscores = "remembered"\nothers = {}\n'
+    sets.write_text(PARTS + named.format('["waypoints"]'))
+    adapted(model, None, sets)
+    own = SetOutputs.of(
+        model.metadata_props, {"remembered": (1, 8), "waypoints": (1, 8)}
+    )
+    assert own == SetOutputs(
+        boxes="remembered", scores="remembered", others=("waypoints",)
+    )
+    sets.write_text(PARTS + named.format('["nowhere"]'))
+    with pytest.raises(EvaluationError, match="map sets: sets: no output nowhere"):
+        adapted(graph.load(mine), None, sets)
+    assert own_map(shipped("highway")) == "highway"
+    assert own_map(mine) is None
 
 
 def test_all_that_run_a_graph_feed_the_state_back(

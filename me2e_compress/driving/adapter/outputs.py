@@ -1,5 +1,6 @@
 """Convert a graph's outputs to a policy's answer."""
 
+import json
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,7 +21,7 @@ from me2e_compress.driving.input_sources import INPUT_SOURCES
 from me2e_compress.driving.shipped_adapters import adapter_file
 from me2e_compress.errors import EvaluationError, GraphError
 from me2e_compress.graph.modules.module_map import ModuleMap, Ports
-from me2e_compress.graph.recurrence import declared_pairs, recurrence, sides
+from me2e_compress.graph.recurrence import SETS, declared_pairs, recurrence, sides
 from me2e_compress.runtime.frames import Array
 from me2e_compress.runtime.plan_adapter import CONTRACT_STEP_S, PLAN, PlanAdapter
 from me2e_compress.runtime.session import DTYPES, Session
@@ -158,13 +159,18 @@ def _stated(
             name: out for name, out in pairs.items() if name not in (declared or {})
         }
         pairs = {} if declared == {} else free
-    if plan is None and not pairs:
+    sets = {} if SETS in own or not ports.sets else {SETS: json.dumps(ports.sets)}
+    if plan is None and not pairs and not sets:
         return {}
     origin = f"map {modules.name}"
     found = Adapter.parse({"plan": plan, "recurrent": pairs}, origin)
-    said = found.metadata(own)
+    said = found.metadata(own) | sets
     try:
         _check_stated(model, origin, found.plan, said)
+        outputs = [str(each.name) for each in model.graph.outputs]
+        for name in np.hstack([np.array([], str), *ports.sets.values()]):
+            if name not in outputs:
+                raise EvaluationError(f"{origin}: sets: no output {name}")
         if found.plan is not None:
             check_command(found.plan, [str(each.name) for each in model.graph.inputs])
     except EvaluationError as error:

@@ -203,11 +203,13 @@ class Ports(_Strict):
     """Which output is the plan, and which inputs are fed back.
 
     ``plan`` has the keys of an adapter's ``[plan]``, None to leave it open;
-    ``recurrent`` maps an input to the output that answers it.
+    ``recurrent`` maps an input to the output that answers it; ``sets`` names outputs
+    whose rows are agents, in no order, as the metadata ``me2e.sets`` do.
     """
 
     plan: dict[str, pydantic.JsonValue] | None = None
     recurrent: dict[str, str] = {}
+    sets: dict[str, str | tuple[str, ...]] = {}
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
@@ -254,6 +256,9 @@ class ModuleMap:
         reader = "planner"                    # left out: whoever read it
         [plan]                                # or [recurrent]: as in an adapter
         output = "ego_fut_preds"
+        [sets]                                # agents, matched by compare
+        boxes = "boxes"
+        scores = "scores"
         [[optional]]                          # where all names are there
         recurrent = { prev_bev = "bev_embed" }
         ```
@@ -296,7 +301,7 @@ class ModuleMap:
             name,
             tuple(table.module(key) for key, table in draft.modules.items()),
             draft.strip,
-            Ports(plan=draft.plan, recurrent=draft.recurrent),
+            Ports(plan=draft.plan, recurrent=draft.recurrent, sets=draft.sets),
             draft.optional,
         )
 
