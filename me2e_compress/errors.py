@@ -64,6 +64,7 @@ FORMER = {
     "--threads": "--threads is of calibrate and profile since 0.3.0",
     "--energy-out": f"--energy-out {_NOW} TRACE.energy.json beside the trace",
     "inspect --frames": f"inspect --frames {_NOW} --trace, of profile --by-module",
+    "--figure": f"--figure {_NOW} --by-module, which prints each module's share",
     "--nodes": f"--nodes {_NOW} plan -v",
     "study paper": f"the study paper {_NOW} benchmarks/paper/paper.toml",
     "study shifts": f"the study shifts {_NOW} benchmarks/shifts.toml",

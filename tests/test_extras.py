@@ -32,7 +32,7 @@ TOOLS = ("bench", "docs", "test")
 ALL, EVERY_TOOL = "all at once", "+".join(TOOLS)
 
 ROOMS: Mapping[str, tuple[str, ...]] = {
-    "highway": ("evaluators.highway", "simulator", "study", "workflows.latency_figure"),
+    "highway": ("evaluators.highway", "simulator", "study"),
     "fast": ("operators.kernels",),
     "trt-check": ("targets.tensorrt.rtx_main",),
 }
@@ -152,14 +152,9 @@ def test_modules_of_extras_are_what_the_project_says() -> None:
 
 def commands() -> Mapping[str, tuple[str, ...]]:
     """Return words that need an extra, by the module of it that is broken."""
-    frames = str(ROOT / "me2e_compress/shipped/weights/highway-frames")
     return {
         "highway_env": ("evaluate", "blind", "--routes", "1", "-o", "out"),
         "cv2": ("evaluate", "highway", "--routes", "1", "-o", "out"),
-        "matplotlib": (
-            *("profile", "highway", frames, "-o", "t.json"),
-            *("--samples", "1", "--figure", "f.png"),
-        ),
         "jinja2": ("study", "smoke", "-o", "out", "--dry-run"),
         "ray": (*("evaluate", "blind", "--routes", "1", "--engine", "ray"), "-o", "o"),
         "tensorrt_rtx": ("lint", "highway", "--target", "tensorrt", "--trt-check"),

@@ -17,10 +17,8 @@ from me2e_compress.registry.drafts import BYTES, MARK, is_marked
 from me2e_compress.runtime.atomic import write_document
 from me2e_compress.runtime.frames import Frame
 from me2e_compress.simulator.routes import load_routes, save_routes
-from me2e_compress.workflows.latency_figure import draw_modules
 from models.export import save as save_export
 from tests.graph.test_files import weighted
-from tests.workflows.test_latency_figure import trace_of
 
 
 def export(path: Path) -> None:
@@ -52,9 +50,6 @@ WRITERS: dict[str, Callable[[Path], object]] = {
     "c.npz": lambda path: CalibrationCheckpoint(path, {}).write(CalibrationState()),
     "frames": record,
     "routes.json": lambda path: save_routes(load_routes(), path),
-    **dict.fromkeys(
-        ("f.png", "f.svg", "f.pdf"), lambda path: draw_modules(trace_of(9), "m", path)
-    ),
 }
 
 

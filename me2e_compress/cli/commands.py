@@ -403,6 +403,6 @@ def profile(
         else:
             result = workflow.profile(model, frames, output, options, listener)
     show(result)
-    # files besides the trace are named on stderr
-    for file in filter(None, (result.figure, result.energy_output)):
-        tell(f"wrote {file}")
+    # the file besides the trace is named on stderr
+    if result.energy_output is not None:
+        tell(f"wrote {result.energy_output}")

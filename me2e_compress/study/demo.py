@@ -24,7 +24,7 @@ from me2e_compress.workflows.compare import CompareResult, compare
 from me2e_compress.workflows.compress import CompressResult, beside, compress
 from me2e_compress.workflows.files import export_stack
 from me2e_compress.workflows.frames import record_frames
-from me2e_compress.workflows.inspect import ModuleChanges, compare_modules
+from me2e_compress.workflows.inspect import InspectResult, inspect
 from me2e_compress.workflows.options import CompressOptions, FramesOptions
 from me2e_compress.workflows.result import Listener, Result, Shown
 
@@ -203,9 +203,9 @@ class DriverDemo:
             self._sections.append(Section("What became int8", plan.tables()))
         return result
 
-    def weigh(self, listener: Listener) -> ModuleChanges:
-        """Compare the modules before and after."""
-        result = compare_modules(self._source, self._small)
+    def weigh(self, listener: Listener) -> InspectResult:
+        """Weigh the modules of what was compressed."""
+        result = inspect(self._small)
         self._sections.append(Section("The modules", result.tables()))
         return result
 

@@ -10,7 +10,7 @@ import onnx_ir as ir
 import pydantic
 
 from me2e_compress import graph
-from me2e_compress.display import AT_LEAST, giga, megabytes, number, table
+from me2e_compress.display import giga, megabytes, number, table
 from me2e_compress.driving.adapter.outputs import adapted
 from me2e_compress.errors import EvaluationError, GraphError
 from me2e_compress.graph import provenance
@@ -307,51 +307,3 @@ def _folded(model: ir.Model, modules: ModuleMap) -> ir.Model:
 
 def _costs(model: ir.Model, modules: ModuleMap) -> tuple[Item, ...]:
     return itemise(model, modules, provenance.module_of, macs_counter(model))
-
-
-@dataclasses.dataclass(frozen=True, repr=False)
-class ModuleChanges(Result):
-    """The modules before and after; a module that is gone is missing in the latter."""
-
-    before: tuple[Item, ...]
-    after: tuple[Item, ...]
-
-    def shown(self) -> Shown:
-        """Return each module before and after, and the size of all weights."""
-        before, after = (
-            megabytes(sum(item.weight_bytes for item in side))
-            for side in (self.before, self.after)
-        )
-        left = f"{len(self.after)} of {len(self.before)} modules"
-        rows, kept = [], {item.module: item for item in self.after}
-        for item in self.before:
-            now = kept.get(item.module)
-            nodes, size = (now.nodes, now.weight_bytes) if now else (0, 0)
-            rows.append(
-                (
-                    item.module,
-                    f"{item.nodes} → {nodes}",
-                    number(item.parameters),
-                    f"{megabytes(item.weight_bytes)} → {megabytes(size)}",
-                    f"{_gmacs(item)} → {_gmacs(now)}",
-                )
-            )
-        columns = ("module", "nodes", "parameters", "weights MB", "GMACs")
-        note = "before: once imported, its shape arithmetic done"
-        if any(item.unknown_macs_nodes for item in (*self.before, *self.after)):
-            note += f"\n{AT_LEAST}"
-        return Shown(
-            f"{before} MB of weights, now {after} in {left}",
-            [table("Module by module", columns, rows, note)],
-            (),
-        )
-
-
-def _gmacs(item: Item | None) -> str:
-    return giga(0) if item is None else giga(item.macs, item.unknown_macs_nodes)
-
-
-def compare_modules(before: Path, after: Path) -> ModuleChanges:
-    """Weigh the modules of two files, each by the preset that fits it."""
-    loaded = [graph.load(path) for path in (before, after)]
-    return ModuleChanges(*(weigh(each, load_map(None, each)) for each in loaded))

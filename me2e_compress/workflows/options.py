@@ -384,8 +384,6 @@ class ProfileOptions(WriteOptions, GraphOptions):
     """of onnxruntime; 0 takes all"""
     by_module: bool = False
     """modules and operators too, in inferences of their own"""
-    figure: File | None = None
-    """draw modules over inferences: PNG, SVG, PDF"""
     energy: str | None = None
     """joules too: auto, nvml, recorded:FILE"""
     budget_ms: float = BUDGET_MS

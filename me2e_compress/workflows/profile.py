@@ -2,12 +2,11 @@
 
 import dataclasses
 from collections.abc import Sequence
-from importlib import util
 from pathlib import Path
 
 from me2e_compress import graph
 from me2e_compress.calibration.dataset import CalibrationSet
-from me2e_compress.errors import EvaluationError, MissingExtraError
+from me2e_compress.errors import EvaluationError
 from me2e_compress.graph.modules.assign import assign
 from me2e_compress.metrics import BUDGET_MS
 from me2e_compress.metrics.deadlines import Deadlines, deadlines, deadlines_table
@@ -54,7 +53,6 @@ class ProfileResult(Result):
     trace: LatencyTrace
     output: Path | None
     operators_us: Microseconds = dataclasses.field(default_factory=dict)
-    figure: Path | None = None
     energy: EnergyResult | None = None
     energy_output: Path | None = None
     budget_ms: float = BUDGET_MS
@@ -122,10 +120,6 @@ class ProfileResult(Result):
         }
 
 
-KINDS = (".png", ".svg", ".pdf")
-"""File name endings of a figure."""
-
-
 def profile(
     model: str | Path,
     frames: str | Path,
@@ -140,7 +134,7 @@ def profile(
 
     Raises:
         GraphError: The model does not exist or run, or the output would harm an input.
-        EvaluationError: There is nothing to measure, or a figure of another kind.
+        EvaluationError: There is nothing to measure.
         EnergyError: The named counter does not exist or work; if there is none at all,
             that is a result.
         FramesError: A frame does not fit.
@@ -149,18 +143,12 @@ def profile(
     """
     options = options or ProfileOptions()
     source, written = model_path(model), None if output is None else Path(output)
-    figure = None if options.figure is None else Path(options.figure)
     joules = None
-    # refuse what cannot be measured or drawn before anything is
-    if figure is not None and figure.suffix not in KINDS:
-        raise EvaluationError(f"{figure}: a figure ends in {', '.join(KINDS)}")
-    if figure is not None and util.find_spec("matplotlib") is None:
-        raise MissingExtraError("matplotlib", "highway")
     if options.energy is not None:
         check_counter(options.energy)
         joules = None if written is None else written.with_suffix(".energy.json")
     inputs = (source, frames, options.module_map, options.adapter)
-    with writing([written, figure, joules], inputs, force=options.force):
+    with writing([written, joules], inputs, force=options.force):
         # each measurement has inferences of its own: the profiler takes time itself
         recording, threads = CalibrationSet(Path(frames)), options.threads
         loaded, said = opened(source, recording, options, listener)
@@ -173,7 +161,7 @@ def profile(
             )  # fmt: skip
         trace = dataclasses.replace(trace, others=others.load)
         operators: Microseconds = {}
-        if options.by_module or figure is not None:
+        if options.by_module:
             placed = assign(loaded, load_map(options.module_map, loaded))
             parts = break_down(
                 loaded, placed.module_of, recording, warm_up=WARM_UP,
@@ -191,18 +179,12 @@ def profile(
             )[source.name]  # fmt: skip
         # files are written all or none
         with drafts.all_or_none():
-            if figure is not None:
-                from me2e_compress.workflows.latency_figure import (  # matplotlib
-                    draw_modules,
-                )
-
-                draw_modules(trace, source.stem, figure)
             if written is not None:
                 trace.save(written)
             if energy is not None and joules is not None:
                 energy.save(joules)
     return ProfileResult(
-        *(source, trace, written, operators, figure),
+        *(source, trace, written, operators),
         energy=energy,
         energy_output=joules,
         budget_ms=options.budget_ms,
@@ -263,7 +245,6 @@ def refuse_both(frames: Path | None, options: ProfileOptions) -> None:
         "FRAMES": frames,
         "--samples": options.samples,
         "--by-module": options.by_module,
-        "--figure": options.figure,
         "--energy": options.energy,
         "--adapter": options.adapter,
     }

@@ -8,7 +8,8 @@ import pytest
 from me2e_compress import graph
 from me2e_compress.shipped import drivers as shipped
 from me2e_compress.study import demo
-from me2e_compress.workflows.inspect import ModuleChanges
+from me2e_compress.workflows.frames import FramesResult
+from me2e_compress.workflows.options import FramesOptions
 from tests.command import Cli
 from tests.stand_in import write_shipped
 from tests.study.conftest import Here
@@ -63,7 +64,7 @@ def test_the_demo_compresses_drives_and_reports(cli: Cli, tmp_path: Path) -> Non
 def test_all_tables_are_shown_to_who_asks(cli: Cli) -> None:
     shown = cli.done(f"-v {DEMO}").out
 
-    for title in ("Pass by pass", "Module by module", "Fidelity over 2 frames"):
+    for title in ("Pass by pass", "Modules", "Fidelity over 2 frames"):
         assert shown.count(title) == 1
 
 
@@ -82,14 +83,14 @@ def test_what_is_there_is_refused_before_any_work(
 def test_all_its_steps_are_one_document(
     cli: Cli, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    found = ModuleChanges((), ())
+    found = FramesResult("m", Path("f"), FramesOptions())
     names = ("compress", "weigh", "compare", "drive")
     steps = {name: lambda listener: found for name in names}
     monkeypatch.setattr(demo.DriverDemo, "steps", property(lambda self: steps))
 
     document = cli.document("demo --out out")
 
-    assert document["drive"] == {"before": [], "after": []}
+    assert document["drive"]["frames"] == 0
 
 
 @pytest.mark.parametrize("line", ["demo --out out", "frames highway -o made"])

@@ -103,10 +103,9 @@ def test_a_profile_is_a_latency_trace(cli: Cli, manifest: Path) -> None:
     save_text(manifest / "m.onnx", "d (float[3] x) => (float[3] y) { y = Add (x, x) }")
     record(manifest / "frames", [{"x": np.zeros(3, np.float32)}] * 4)
 
-    line = "profile m.onnx frames -o trace.json --figure tail.png"
+    line = "profile m.onnx frames -o trace.json --by-module"
     shown = cli.document(line)
 
-    assert (manifest / "tail.png").read_bytes().startswith(b"\x89PNG")
     assert [each["name"] for each in shown["modules"]] == ["model", "(between nodes)"]
     saved = json.loads((manifest / "trace.json").read_text())
     assert saved == IN_JSON | {key: shown[key] for key in saved if key in shown}

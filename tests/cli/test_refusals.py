@@ -123,7 +123,6 @@ OTHERS = {
     "ranges good.json other-graph.json": r"other-graph\.json: of graph another, the f",
     "ranges map.toml": r"map\.toml: line 1 is not a name and a number",
     "list wheels": "no kind 'wheels'; there are passes, rules",
-    f"{TIMED} --figure tail.gif": r"tail\.gif: a figure ends in \.png",
     f"{TIMED} --energy sun": "no energy counter 'sun'; there are nvml, recorded",
     f"{TIMED} --energy recorded:no.csv": r"no\.csv: No such file",
 }
