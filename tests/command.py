@@ -9,15 +9,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import onnx_ir as ir
 import pytest
 
 from me2e_compress import graph
 from me2e_compress.cli import main
-from me2e_compress.graph import rewrite
 from tests.conftest import DRIVER, DRIVER_MAP
 from tests.docs.documents import faults
 from tests.frames import record
+from tests.nets import parsed, stored
 
 Command = Callable[..., int]
 
@@ -106,7 +105,7 @@ def cli(
 @pytest.fixture
 def files(tmp_path: Path) -> Path:
     """A folder with a model, its map and its frames."""
-    graph.save(ir.from_onnx_text(DRIVER), tmp_path / "in.onnx")
+    graph.save(parsed(DRIVER), tmp_path / "in.onnx")
     (tmp_path / "map.toml").write_text(DRIVER_MAP)
     write_frames(tmp_path / "frames", camera=np.zeros((1, 4), np.float32))
     return tmp_path
@@ -115,16 +114,13 @@ def files(tmp_path: Path) -> Path:
 @pytest.fixture
 def dense(files: Path) -> Path:
     """The folder with a model that has a layer to quantize."""
-    model = ir.from_onnx_text(
-        '<ir_version: 9, opset_import: ["" : 17]>\n'
-        "dense (float[4,16] camera) => (float[4,32] plan) {"
+    model = parsed(
+        "dense (float[4,16] camera, float[16,32] w) => (float[4,32] plan) {"
         ' ["/backbone/Relu"] a = Relu(camera)\n'
         ' ["/plan_head/MatMul"] plan = MatMul(a, w) }'
     )
     draws = np.random.default_rng(0).normal(size=(16, 32)).astype(np.float32)
-    weight = rewrite.add_constant(model.graph, draws, "w")
-    model.graph[1].replace_input_with(1, weight)
-    graph.save(model, files / "dense.onnx")
+    graph.save(stored(model, {"w": draws}), files / "dense.onnx")
     camera = np.random.default_rng(1).normal(size=(4, 16)).astype(np.float32)
     shutil.rmtree(files / "frames")
     write_frames(files / "frames", camera=camera)

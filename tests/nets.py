@@ -42,18 +42,17 @@ net (float[1,3,8,8] image, float[1,8,64] memory,
 }
 """
 
-MODULES = ModuleMap.parse(
-    """
-    [modules.backbone]
-    role = "feature"
-    patterns = ["backbone"]
-    [modules.head]
-    role = "prediction"
-    patterns = ["head"]
-    """,
-    "net",
-)
 
+def map_text(**roles: str) -> str:
+    """Write a map of modules, each of the nodes below its own name."""
+    return "".join(
+        f'[modules.{name}]\nrole = "{role}"\npatterns = ["{name}"]\n'
+        for name, role in roles.items()
+    )
+
+
+MAP_TEXT = map_text(backbone="feature", head="prediction")
+MODULES = ModuleMap.parse(MAP_TEXT, "net")
 
 FULL = QuantScheme.named("full", MODULES)
 
@@ -130,8 +129,8 @@ def by_output(plan: QuantPlan) -> dict[str, Decision]:
 
 
 def save_text(path: Path, text: str, **metadata: str) -> Path:
-    """Write a graph of opset 17 that is given as ONNX text, without its head."""
-    model = ir.from_onnx_text(f'<ir_version: 9, opset_import: ["" : 17]>\n{text}')
+    """Write a graph, of opset 17 where its text names none."""
+    model = parsed(text)
     model.metadata_props.update(metadata)
     graph.save(model, path)
     return path

@@ -4,7 +4,6 @@ from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
-import onnx_ir as ir
 
 from me2e_compress import graph
 from me2e_compress.graph import rewrite
@@ -12,15 +11,14 @@ from me2e_compress.graph.stack.join import JoinedStack
 from me2e_compress.runtime.frames import Frame
 from me2e_compress.runtime.session import Session
 from tests.frames import record
+from tests.nets import parsed
 
 BACKBONE = """
-<ir_version: 9, opset_import: ["" : 17]>
 backbone (float[1,4] img) => (float[1,4] feats) <float[1] two = {2}>
 { ["/backbone/Mul"] feats = Mul(img, two) }
 """
 
 HEAD = """
-<ir_version: 9, opset_import: ["" : 17]>
 head (float[1,4] feats, float[1,4] prev_bev)
     => (float[1,4] next_bev, float[1,2,2] plan)
 <float[1] half = {0.5}, int64[3] points = {1,2,2}, float[1,4] learned = {1,2,3,4}> {
@@ -45,7 +43,7 @@ def write_stack(folder: Path, toml: str = TWO_PARTS, **texts: str) -> Path:
     """Write the two graphs, or others of these names, and a TOML; return that."""
     known = {"backbone": BACKBONE, "head": HEAD}
     for name, text in (known | texts).items():
-        graph.save(ir.from_onnx_text(text), folder / f"{name}.onnx")
+        graph.save(parsed(text), folder / f"{name}.onnx")
     path = folder / "stack.toml"
     path.write_text(toml)
     return path
@@ -58,12 +56,10 @@ def joined(path: Path) -> Session:
 
 DENSE = {
     "backbone": """
-<ir_version: 9, opset_import: ["" : 17]>
 backbone (float[4,16] img) => (float[4,32] feats)
 { ["/backbone/MatMul"] a = MatMul(img, w) ["/backbone/Relu"] feats = Relu(a) }
 """,
     "head": """
-<ir_version: 9, opset_import: ["" : 17]>
 head (float[4,32] feats, float[4,32] prev_bev)
     => (float[4,32] next_bev, float[1,64,2] plan) <int64[3] points = {1, 64, 2}> {
     ["/head/Add"] next_bev = Add(feats, prev_bev)
@@ -79,7 +75,7 @@ def write_dense(folder: Path) -> Path:
     """Write parts that have a layer to quantize; return the TOML."""
     random = np.random.default_rng(0)
     for name, text in DENSE.items():
-        model = ir.from_onnx_text(text)
+        model = parsed(text)
         draws = random.normal(size=(16 if name == "backbone" else 32, 32))
         weight = rewrite.add_constant(model.graph, draws.astype(np.float32), "w")
         (layer,) = (node for node in model.graph if node.op_type == "MatMul")

@@ -6,8 +6,10 @@ from pathlib import Path
 
 import numpy as np
 import onnx
+import pytest
 from onnx import numpy_helper
 
+from me2e_compress.shipped import drivers
 from me2e_compress.shipped.drivers import SHIPPED
 from tests.frames import record
 
@@ -132,3 +134,11 @@ def _weights(seed: int) -> dict[str, np.ndarray]:
         "planner.shape": np.array([1, 6, 2]),
         "planner.ahead": ahead[None],
     }
+
+
+@pytest.fixture
+def weights(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder with a small driver, in the place of the package's."""
+    write_shipped(tmp_path / "weights")
+    monkeypatch.setattr(drivers, "WEIGHTS", tmp_path / "weights")
+    return tmp_path / "weights"

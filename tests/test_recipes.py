@@ -211,7 +211,6 @@ def test_without_frames_there_is_no_mean(model: Path) -> None:
 Numbers = npt.NDArray[np.float32]
 
 UNIAD = """
-<ir_version: 9, opset_import: ["" : 17]>
 uniad (float[1,5,8] img, float[1,4,5] four, float[1,3,5] three, float[6,8] anchors,
        float[8,8] mix) =>
     (float[1,1,8] sdc_traj, float[1,3,8] lane_query, float[1,4,6,8] trajectories,

@@ -7,17 +7,10 @@ import pytest
 from me2e_compress import graph
 from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.errors import GraphError
-from me2e_compress.shipped import drivers as room
 from me2e_compress.shipped.drivers import SHIPPED, card, copy, sample_frames, shipped
-from tests.stand_in import write_shipped
+from tests.stand_in import weights
 
-
-@pytest.fixture
-def weights(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A folder in place of the package's."""
-    write_shipped(tmp_path / "weights")
-    monkeypatch.setattr(room, "WEIGHTS", tmp_path / "weights")
-    return tmp_path / "weights"
+__all__ = ["weights"]
 
 
 def test_an_altered_file_names_both_digests(weights: Path) -> None:

@@ -109,10 +109,7 @@ def test_what_is_not_finite_has_no_mean(bad: float, kind: str) -> None:
 
 
 def test_one_value_one_shape() -> None:
-    model = parsed(
-        '<ir_version: 9, opset_import: ["" : 17]>'
-        " m (float[1,4] x) => (int64[2,n] where) { where = NonZero(x) }"
-    )
+    model = parsed(" m (float[1,4] x) => (int64[2,n] where) { where = NonZero(x) }")
 
     with pytest.raises(FramesError, match=r"frame 1 makes where \[2, 1\], it was"):
         token_means(model, rows([1, 2, 3, 4], [0, 0, 0, 4]), ["where"])

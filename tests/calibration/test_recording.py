@@ -35,8 +35,9 @@ def files(folder: Path) -> dict[str, bytes]:
     return {path.name: path.read_bytes() for path in sorted(folder.iterdir())}
 
 
-def test_what_is_written_is_read(tmp_path: Path) -> None:
-    folder = write_recording(tmp_path / "new" / "frames", source(3), {"seed": 0})
+def test_what_is_written_is_read_and_says_where_it_is_from(tmp_path: Path) -> None:
+    origin: dict[str, str | int] = {"stack": "s", "seed": 4}
+    folder = write_recording(tmp_path / "new" / "frames", source(3), origin)
 
     read = list(CalibrationSet(folder))
     for frame, expected in zip(read, drawn(3), strict=True):
@@ -47,18 +48,8 @@ def test_what_is_written_is_read(tmp_path: Path) -> None:
         assert list(frame.arrays) == list(expected.arrays)
         for name, array in expected.arrays.items():
             np.testing.assert_array_equal(frame.arrays[name], array)
-
-
-def test_the_index_says_where_the_frames_are_from(tmp_path: Path) -> None:
-    folder = write_recording(tmp_path / "frames", source(3), {"stack": "s", "seed": 4})
-
-    assert json.loads((folder / "scenes.json").read_text()) == {
-        **IN_JSON,
-        "scenes": [0, 2],
-        "stack": "s",
-        "seed": 4,
-        "count": 3,
-    }
+    index = json.loads((folder / "scenes.json").read_text())
+    assert index == {**IN_JSON, "scenes": [0, 2], **origin, "count": 3}
 
 
 def test_an_earlier_recording_is_replaced(tmp_path: Path) -> None:
@@ -79,12 +70,13 @@ def test_a_foreign_folder_is_refused(tmp_path: Path, also: tuple[str, ...]) -> N
     assert (tmp_path / "thesis.tex").read_text() == "mine"
 
 
-def test_a_file_is_not_a_folder(tmp_path: Path) -> None:
-    path = tmp_path / "frames"
-    path.write_text("mine")
-
+def test_a_file_is_not_a_folder_and_no_frames_write_nothing(tmp_path: Path) -> None:
+    with pytest.raises(FramesError, match="there are no frames to write"):
+        write_recording(tmp_path / "frames", source(0), {})
+    assert list(tmp_path.iterdir()) == []
+    (tmp_path / "frames").write_text("mine")
     with pytest.raises(FramesError, match="is a file"):
-        write_recording(path, source(1), {})
+        write_recording(tmp_path / "frames", source(1), {})
 
 
 def test_a_failure_leaves_what_was_there(tmp_path: Path) -> None:
@@ -99,12 +91,6 @@ def test_a_failure_leaves_what_was_there(tmp_path: Path) -> None:
         write_recording(target, lambda _: broken(), {})
     assert files(target) == before
     assert [path.name for path in tmp_path.iterdir()] == ["frames"]
-
-
-def test_no_frames(tmp_path: Path) -> None:
-    with pytest.raises(FramesError, match="there are no frames to write"):
-        write_recording(tmp_path / "frames", source(0), {})
-    assert list(tmp_path.iterdir()) == []
 
 
 def killed_after(count: int, begun: list[Begin]) -> Source:

@@ -3,7 +3,6 @@
 import re
 from pathlib import Path
 
-import onnx_ir as ir
 import pytest
 
 from me2e_compress import graph
@@ -97,7 +96,7 @@ def test_a_clean_graph_passes_the_lint(cli: Cli, dense: Path, target: str) -> No
 
 
 def test_what_would_be_refused_is_listed_and_fails(cli: Cli, tmp_path: Path) -> None:
-    graph.save(ir.from_onnx_text(TWIST), tmp_path / "twist.onnx")
+    graph.save(parsed(TWIST), tmp_path / "twist.onnx")
 
     said = cli("lint twist.onnx")
     assert said.code == 1

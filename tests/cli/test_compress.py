@@ -5,7 +5,6 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-import onnx_ir as ir
 import pytest
 
 from me2e_compress import graph
@@ -95,7 +94,7 @@ OPEN = """m (float[n,4] camera, float[1,4] other) => (float[n,4] plan) {
 def test_what_cannot_be_run_is_written_on_demand_alone(
     cli: Cli, tmp_path: Path
 ) -> None:
-    graph.save(ir.from_onnx_text(HEAD + PLUGIN), tmp_path / "in.onnx")
+    graph.save(parsed(HEAD + PLUGIN), tmp_path / "in.onnx")
     line = "compress in.onnx -r exact -o out.onnx"
 
     said = cli.refused(line)
@@ -111,7 +110,7 @@ def test_what_cannot_be_run_is_written_on_demand_alone(
 def test_an_open_dimension_is_proven_at_drawn_sizes_unless_nobody_asks(
     cli: Cli, tmp_path: Path
 ) -> None:
-    graph.save(ir.from_onnx_text(HEAD + OPEN), tmp_path / "in.onnx")
+    graph.save(parsed(HEAD + OPEN), tmp_path / "in.onnx")
 
     shown = cli.done("compress in.onnx -r exact -o a.onnx").words
     assert "every output is the same (synthetic, n=2" in shown
@@ -173,7 +172,6 @@ def test_a_graph_that_kills_onnxruntime_is_one_line(cli: Cli, tmp_path: Path) ->
 
 
 POOLED = """
-    <ir_version: 9, opset_import: ["" : 17]>
     m (float[1,16,8,8] x) => (float[%s] y)
     <int64[8] p = {0,0,1,1,0,0,1,1}, float[16,16,1,1] w = {%s}> {
         a = Tanh(x) b = Pad(a, p)
@@ -188,7 +186,7 @@ PLANNED = "--scheme full --rules paper --target"
 
 def pooled(folder: Path, end: str = "Relu", shape: str = "1,16,8,8") -> None:
     weight = ",".join(str(number) for number in range(256))
-    model = ir.from_onnx_text(POOLED % (shape, weight, end))
+    model = parsed(POOLED % (shape, weight, end))
     graph.save(model, folder / "pooled.onnx")
     draws = np.random.default_rng(0).normal(size=(1, 16, 8, 8))
     write_frames(folder / "pictures", x=draws.astype(np.float32))

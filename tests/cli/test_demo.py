@@ -6,22 +6,21 @@ from pathlib import Path
 import pytest
 
 from me2e_compress import graph
-from me2e_compress.shipped import drivers as shipped
 from me2e_compress.study import demo
 from me2e_compress.workflows.frames import FramesResult
 from me2e_compress.workflows.options import FramesOptions
 from tests.command import Cli
-from tests.stand_in import write_shipped
+from tests.stand_in import weights
 from tests.study.conftest import Here
+
+__all__ = ["weights"]
 
 DEMO = "demo --out out"
 
 
 @pytest.fixture(autouse=True)
-def small(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def small(weights: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A small driver in the place of the one that ships, few frames, no processes."""
-    write_shipped(tmp_path / "weights")
-    monkeypatch.setattr(shipped, "WEIGHTS", tmp_path / "weights")
     monkeypatch.setattr(demo, "CALIBRATION_FRAMES", 3)
     monkeypatch.setattr(demo, "HELD_OUT_FRAMES", 2)
     monkeypatch.setattr(demo, "LATENCY_SAMPLES", 5)

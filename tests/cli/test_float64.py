@@ -3,11 +3,10 @@
 from pathlib import Path
 
 import numpy as np
-import onnx_ir as ir
 import pytest
 
-from me2e_compress import graph
 from tests.command import Cli, write_frames
+from tests.nets import save_text
 
 SAMPLED = """
     <ir_version: 9, opset_import: ["" : 16]>
@@ -26,13 +25,9 @@ NO_KERNEL = (
 )
 
 
-def write(folder: Path, text: str) -> None:
-    graph.save(ir.from_onnx_text(text), folder / "double.onnx")
-
-
 @pytest.fixture(autouse=True)
 def double(tmp_path: Path) -> None:
-    write(tmp_path, SAMPLED)
+    save_text(tmp_path / "double.onnx", SAMPLED)
     draws = np.random.default_rng(0)
     x = draws.normal(size=(1, 2, 3, 3)).astype(np.float32)
     g = draws.uniform(-1, 0, size=(1, 3, 3, 2)).astype(np.float32)
@@ -50,14 +45,12 @@ def test_what_runs_it_says_why_it_cannot(cli: Cli, line: str) -> None:
     assert cli.refused(line).endswith(NO_KERNEL)
 
 
-def test_ranges_are_measured_on_its_float32_form(cli: Cli, tmp_path: Path) -> None:
+def test_its_float32_form_is_what_is_measured_and_compared_and_the_verdict_says_so(
+    cli: Cli, tmp_path: Path
+) -> None:
     paper = '[[pass]]\nname = "quantize-int8"\nrules = "paper"\n'
     (tmp_path / "paper.toml").write_text(paper)
-
     cli.done("calibrate double.onnx frames -o ranges.json -r paper.toml")
-
-
-def test_the_verdict_says_that_float64_is_not_what_was_compared(cli: Cli) -> None:
     found = cli.document("compress double.onnx -r exact -o out.onnx --frames frames")
 
     same, told = found["verdict"][:2]
@@ -71,7 +64,7 @@ def test_the_verdict_says_that_float64_is_not_what_was_compared(cli: Cli) -> Non
 
 def test_float64_that_runs_is_proven_against_itself(cli: Cli, tmp_path: Path) -> None:
     text = SAMPLED.replace("GridSample(a, b)", "Mul(a, h)")
-    write(tmp_path, text)
+    save_text(tmp_path / "double.onnx", text)
 
     found = cli.document("compress double.onnx -r exact -o out.onnx --frames frames")
 
@@ -86,7 +79,7 @@ def test_the_lint_names_it_although_a_pool_is_wrong_too(
     text = SAMPLED.replace(
         "y = MatMul(o, w)", "p = Pad(o, pads) y = MaxPool<kernel_shape=[3,3]>(p)"
     ).replace("<double h", "<int64[8] pads = {0,0,1,1,0,0,1,1}, double h")
-    write(tmp_path, text)
+    save_text(tmp_path / "double.onnx", text)
 
     found = cli.document("lint double.onnx --target onnxruntime", code=1)
 

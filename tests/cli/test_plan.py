@@ -83,7 +83,6 @@ def test_options_are_not_for_a_plan_that_is_made(
 
 def test_what_is_decided_together_is_listed(cli: Cli, tmp_path: Path) -> None:
     model = net(
-        '<ir_version: 9, opset_import: ["" : 17]>'
         "two (float[4,32] x, float[32,32] v, float[32,32] w)"
         " => (float[4,32] k, float[4,32] q) { k = MatMul(x, v) q = MatMul(x, w) }",
         {"v": np.eye(32), "w": np.ones((32, 32))},

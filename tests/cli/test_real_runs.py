@@ -55,6 +55,7 @@ def test_a_real_run_is_scored(cli: Cli) -> None:
     shown = cli.done("score run")
     assert "real runs, Bench2Drive's routes 0.0.3" in shown.out
     assert "driven │ 74.0000 │ 74.0000 │ 2 │ %" in shown.words
+    assert "nowhere: no such folder" in cli.refused("score run --metrics nowhere")
 
 
 def test_what_is_wrong_with_a_real_run_is_said(cli: Cli, run: Path) -> None:
@@ -87,13 +88,6 @@ def test_a_stated_mean_is_of_the_set_or_of_what_was_driven(
     shown = cli.done("score run").out
 
     assert ("its records say 0.672727 or 74" in shown) is not believed
-
-
-@pytest.mark.usefixtures("run")
-def test_a_folder_of_recordings_that_is_none_is_one_line(cli: Cli) -> None:
-    said = cli.refused("score run --metrics nowhere")
-
-    assert "nowhere: no such folder" in said
 
 
 @pytest.mark.parametrize("flag", ["--abilities", "--penalties", "--junctions"])

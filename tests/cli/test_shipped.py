@@ -13,15 +13,11 @@ from me2e_compress.simulator.routes import save_routes
 from me2e_compress.workflows.checks import model_path
 from tests.command import Cli
 from tests.evaluators.highway.drivers import EXIT, straight_on
-from tests.stand_in import record_driver, write_model, write_shipped
+from tests.stand_in import record_driver, weights, write_model
 
+__all__ = ["weights"]
 
-@pytest.fixture(autouse=True)
-def weights(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A folder with a small driver, in the place of the package's."""
-    write_shipped(tmp_path / "weights")
-    monkeypatch.setattr(shipped, "WEIGHTS", tmp_path / "weights")
-    return tmp_path / "weights"
+pytestmark = pytest.mark.usefixtures("weights")
 
 
 @pytest.fixture
@@ -35,6 +31,9 @@ def test_a_name_is_the_shipped_file_unless_there_is_a_file_of_that_name(
     cli: Cli, weights: Path, name: str
 ) -> None:
     assert model_path(name) == weights / f"{name}.onnx"
+    assert cli.document(f"export {name} -o mine.onnx")["output"] == "mine.onnx"
+    mine = (cli.folder / "mine.onnx").read_bytes()
+    assert mine == (weights / f"{name}.onnx").read_bytes()
     write_model(cli.folder / name, seed=1)
     assert model_path(name) == Path(name)
     with pytest.raises(GraphError, match=r"^uniad: no such file; .*ship: highway$"):
@@ -88,14 +87,6 @@ def test_evaluate_drives_it_and_names_everything_that_could_drive(
     said = cli.refused("evaluate nobody -o others")
     could = "models that ship: highway; policies: expert, blind"
     assert f"nobody: no such file; {could}" in said
-
-
-@pytest.mark.parametrize("name", shipped.SHIPPED)
-def test_export_copies_it(cli: Cli, weights: Path, name: str) -> None:
-    assert cli.document(f"export {name} -o mine.onnx")["output"] == "mine.onnx"
-
-    mine = (cli.folder / "mine.onnx").read_bytes()
-    assert mine == (weights / f"{name}.onnx").read_bytes()
 
 
 @pytest.mark.parametrize("line", ["inspect highway", "evaluate highway -o results"])

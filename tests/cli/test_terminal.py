@@ -152,21 +152,13 @@ def test_words_that_fit_stand_in_columns(
     assert NODE in lines[3]
 
 
-@pytest.mark.usefixtures("width")
-def test_words_that_do_not_fit_stand_below_each_other(
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    lines = printed(capsys, NODE, "planner", "MatMul", f"as_{NODE}", "")
-
-    below = ["    node: planner", "    op: MatMul", f"    rule: as_{NODE}"]
-    assert lines == ["Nodes", NODE, *below]
-
-
-def test_sentences_wrap_between_words(
+def test_words_that_do_not_fit_stand_below_each_other_and_sentences_wrap(
     capsys: pytest.CaptureFixture[str], width: int
 ) -> None:
+    below = ["    node: planner", "    op: MatMul", f"    rule: as_{NODE}"]
+    lines = printed(capsys, NODE, "planner", "MatMul", f"as_{NODE}", "")
+    assert lines == ["Nodes", NODE, *below]
     lines = printed(capsys, "planner", NODE, "MatMul", "layer", "int8 " * 20)
-
     assert all(len(line) <= width for line in lines)
     assert sum(line.count("int8") for line in lines) == 20
     assert any(NODE in line for line in lines)

@@ -8,17 +8,19 @@ import onnx_ir as ir
 
 from me2e_compress.runtime.frames import Frame
 from me2e_compress.runtime.session import Session
-from tests.nets import parsed
+from tests.nets import parsed, stored
 
 Arrays: TypeAlias = dict[str, Any]
 SCENES = (0, 4)
 COUNT = 8
 
 _TEXT = """
-stack (float[1,3,3,8,8] img, float[1,3,4,4] lidar2img, float[4] ego, float[1,16] prev)
+stack (float[1,3,3,8,8] img, float[1,3,4,4] lidar2img, float[4] ego, float[1,16] prev,
+       float[192,8] w_seen, float[3,8] w_camera, float[92,16] w_all, float[16,8] w_plan,
+       float[16,30] w_boxes)
  => (float[1,4,2] plan, float[1,5,6] boxes, float[1,16] prev_out)
-<int64[2] by_camera = {{3, 192}}, int64[2] row = {{1, -1}},
- int64[3] points = {{1, 4, 2}}, int64[3] agents = {{1, 5, 6}}, {weights}> {{
+<int64[2] by_camera = {3, 192}, int64[2] row = {1, -1},
+ int64[3] points = {1, 4, 2}, int64[3] agents = {1, 5, 6}> {
     flat = Reshape(img, by_camera)
     seen = MatMul(flat, w_seen)
     own = Mul(seen, w_camera)
@@ -32,7 +34,7 @@ stack (float[1,3,3,8,8] img, float[1,3,4,4] lidar2img, float[4] ego, float[1,16]
     plan = Reshape(planned, points)
     found = MatMul(prev_out, w_boxes)
     boxes = Reshape(found, agents)
-}}
+}
 """
 _SHAPES = {
     "w_seen": (192, 8), "w_camera": (3, 8), "w_all": (92, 16), "w_plan": (16, 8),
@@ -43,13 +45,11 @@ _SHAPES = {
 def stack() -> ir.Model:
     """Return the stack, with random weights."""
     drawn = np.random.default_rng(1)
-    weights = []
-    for name, shape in _SHAPES.items():
-        values = drawn.normal(0, 1 / np.sqrt(shape[0]), shape).reshape(-1)
-        sides = ",".join(map(str, shape))
-        listed = ", ".join(f"{value:.6f}" for value in values)
-        weights.append(f"float[{sides}] {name} = {{{listed}}}")
-    return parsed(_TEXT.format(weights=", ".join(weights)))
+    weights = {
+        name: drawn.normal(0, 1 / np.sqrt(shape[0]), shape).astype(np.float32)
+        for name, shape in _SHAPES.items()
+    }
+    return stored(parsed(_TEXT), weights)
 
 
 def frames() -> list[Frame]:

@@ -42,16 +42,11 @@ def absolute(model: ir.Model) -> None:
     model.graph.node("/backbone/Relu").op_type = "Abs"
 
 
-def test_a_graph_does_not_differ_from_itself() -> None:
+def test_a_graph_does_not_differ_from_itself_and_rounding_is_no_difference() -> None:
     found = difference(conv_attention())
-
     assert (found.first, found.unknown) == (None, 0)
     assert {each.sqnr_db for each in found.values} == {np.inf}
-
-
-def test_rounding_is_no_difference() -> None:
     found = difference(changed(lambda model: scale(model, "l", 1 + 1e-6)))
-
     assert found.first is None
     assert min(each.sqnr_db for each in found.values) < np.inf
 
@@ -137,9 +132,6 @@ def test_graphs_that_cannot_be_compared_are_refused(
 ) -> None:
     with pytest.raises(error, match=words):
         difference(parsed(text))
-
-
-def test_no_frame_is_refused() -> None:
     with pytest.raises(EvaluationError, match="no frames to compare on"):
         find_first_difference(conv_attention(), conv_attention(), [])
 

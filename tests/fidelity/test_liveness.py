@@ -11,7 +11,7 @@ import pytest
 from me2e_compress import graph
 from me2e_compress.fidelity.compare import compare
 from me2e_compress.fidelity.liveness import Liveness, LivenessTally, OutputTally
-from me2e_compress.runtime.frames import Frame
+from me2e_compress.runtime.frames import Array, Frame
 from me2e_compress.runtime.session import Session
 from tests.command import Command, command
 from tests.frames import record
@@ -110,33 +110,27 @@ def test_what_is_dead_is_named(changed: dict[str, str], said: str) -> None:
     assert found.faults[0].startswith(f"plan is {said}")
 
 
+def tally(*pairs: tuple[Array, Array]) -> OutputTally:
+    made = OutputTally("y")
+    for pair in pairs:
+        made.add(*pair)
+    return made
+
+
 def test_movement_is_the_standard_deviation_over_frames() -> None:
     draws = np.random.default_rng(0).normal(3.0, 1.0, (5, 2, 4))
-    tally = OutputTally("y")
-    for each in draws:
-        tally.add(each, 0.25 * each + 7.0)
+    moving = tally(*((each, 0.25 * each + 7.0) for each in draws))
+    # rounding is no movement
+    resting = tally(*((np.full(4, 1.0 + at * 1e-5), np.ones(4)) for at in range(3)))
+    growing = tally(*((each, each) for each in (np.ones(2), np.ones(3))))
 
-    assert tally.result(0.2).verdict == "weak"
-    assert tally.result(0.2).moves == pytest.approx(0.25)
-    assert tally.result(0.3).verdict == "frozen"
-    (line,) = Liveness((tally.result(0.2),), 0.01).lines()
+    assert moving.result(0.2).verdict == "weak"
+    assert moving.result(0.2).moves == pytest.approx(0.25)
+    assert moving.result(0.3).verdict == "frozen"
+    (line,) = Liveness((moving.result(0.2),), 0.01).lines()
     assert line == "none dead, but weak (least of all y: 25%)"
-
-
-def test_rounding_is_no_movement() -> None:
-    tally = OutputTally("y")
-    for at in range(3):
-        tally.add(np.full(4, 1.0 + at * 1e-5), np.ones(4))
-
-    assert tally.result(0.01).reason == "it rests in the first graph too"
-
-
-def test_an_output_that_changes_its_shape_is_not_judged() -> None:
-    tally = OutputTally("y")
-    for size in (2, 3):
-        tally.add(np.arange(size) / 2, np.arange(size) / 2)
-
-    assert str(tally.result(0.01)) == "y is not judged: its shape changes"
+    assert resting.result(0.01).reason == "it rests in the first graph too"
+    assert str(growing.result(0.01)) == "y is not judged: its shape changes"
 
 
 def test_a_state_that_is_not_fed_is_named() -> None:

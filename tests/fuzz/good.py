@@ -10,18 +10,13 @@ from me2e_compress.simulator.routes import load_routes, save_routes
 from tests.frames import record
 from tests.fuzz import frames, graphs
 from tests.metrics.drives import cruise, drive
+from tests.nets import MAP_TEXT
 
 Command = Callable[..., int]
 
-MAP = """
+MAP = f"""
 strip = ["model"]
-[modules.backbone]
-role = "feature"
-patterns = ["backbone"]
-[modules.head]
-role = "prediction"
-patterns = ["head"]
-optional = ["head.*"]
+{MAP_TEXT}optional = ["head.*"]
 """
 OVERRIDES = """
 [[override]]

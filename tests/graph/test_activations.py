@@ -1,12 +1,10 @@
 """Bytes that nodes write in a frame."""
 
-import onnx_ir as ir
-
 from me2e_compress import graph
 from me2e_compress.graph.summary import activation_bytes
+from tests.nets import parsed
 
 NET = """
-<ir_version: 9, opset_import: ["" : 17]>
 net (float[1,4] x, float[n,4] open) => (float[4,1] y, float[n,4] z)
 <float scale = {0.1}, int8 zero = {0}, int64[2] tall = {4, 1}> {
     a = Relu(x)
@@ -22,7 +20,7 @@ net (float[1,4] x, float[n,4] open) => (float[4,1] y, float[n,4] z)
 
 
 def test_int8_is_written_where_nothing_else_is_read() -> None:
-    model = ir.from_onnx_text(NET)
+    model = parsed(NET)
     graph.infer_shapes(model)
 
     found = {node.outputs[0].name: activation_bytes(node) for node in model.graph}

@@ -16,6 +16,7 @@ from me2e_compress.manager import PassManager, recipe
 from me2e_compress.passes import Context
 from me2e_compress.runtime.frames import Array, Frame
 from me2e_compress.runtime.session import Session, replay
+from tests.nets import parsed
 from tests.stacks import DENSE, HEAD, TWO_PARTS, joined, ones, write_dense, write_stack
 
 
@@ -140,7 +141,7 @@ def test_an_older_part_is_written_in_the_opset_of_the_newest(tmp_path: Path) -> 
     back = "Unsqueeze<axes = [0]>(t) kept = Sub(u, learned)"  # an attribute till 13
     there = f"t = Squeeze<axes = [0]>(next_bev) u = {back}"
     head = HEAD.replace("kept = Sub(next_bev, learned)", there)
-    head = head.replace('"" : 17', '"" : 11')
+    head = f'<ir_version: 9, opset_import: ["" : 11]>{head}'
     path = write_stack(tmp_path, head=head)
 
     assert graph.opset_of(JoinedStack.load(path).model) == 17
@@ -196,12 +197,12 @@ def test_dense_parts_share_no_name_with_their_inner_values(tmp_path: Path) -> No
     body = DENSE["backbone"].replace("a = MatMul(img, w) ", "plan = MatMul(img, w) ")
     body = body.replace("Relu(a)", "Relu(plan)").replace("w)", "img)")
     body = body.replace("float[4,16] img", "float[4,4] img").replace("32", "4")
-    model = ir.from_onnx_text(body)
+    model = parsed(body)
     path = write_stack(tmp_path)
     graph.save(model, tmp_path / "backbone.onnx")
     head = HEAD.replace("float[1,4]", "float[4,4]").replace("1,2,2", "4,2,2")
     head = head.replace("learned = {1,2,3,4}", f"learned = {{{','.join('1' * 16)}}}")
-    graph.save(ir.from_onnx_text(head), tmp_path / "head.onnx")
+    graph.save(parsed(head), tmp_path / "head.onnx")
 
     made = JoinedStack.load(path).model.graph
 

@@ -17,9 +17,9 @@ from me2e_compress.passes.eliminate_redundant import EliminateRedundant
 from me2e_compress.passes.fold_constants import FoldConstants
 from me2e_compress.passes.import_normalize import ImportNormalize
 from tests.manager import passes
+from tests.nets import parsed
 
 CHAIN = """
-<ir_version: 9, opset_import: ["" : 17]>
 chain (float[1,8] x) => (float[1,8] y)
 <float[8] w = {1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0}> {
     ["/backbone/Mul"] a = Mul(x, w)
@@ -36,7 +36,7 @@ chain (float[1,8] x) => (float[1,8] y)
 
 @pytest.fixture
 def chain() -> ir.Model:
-    return ir.from_onnx_text(CHAIN)
+    return parsed(CHAIN)
 
 
 def run(
@@ -149,7 +149,7 @@ def test_a_breach_of_contract_is_named(
 
 
 def test_an_operator_nobody_knows_is_carried_through(context: Context) -> None:
-    model = ir.from_onnx_text(
+    model = parsed(
         '<ir_version: 9, opset_import: ["" : 17, "trt.plugins" : 1]>\n'
         "m (float[1,8] x) => (float[1,8] y) {"
         ' ["/backbone/Relu"] a = Relu(x)\n'
@@ -196,8 +196,7 @@ def test_progress_counts_the_passes(chain: ir.Model, context: Context) -> None:
 @pytest.mark.parametrize("value", [np.nan, np.inf])
 def test_equal_non_numbers_are_equal(value: float, context: Context) -> None:
     literal = "nan" if np.isnan(value) else "inf"
-    model = ir.from_onnx_text(
-        '<ir_version: 9, opset_import: ["" : 17]>\n'
+    model = parsed(
         "m (float[2] x) => (float[2] y)\n<float[1] w = {0.0}> {"
         ' ["/backbone/Add"] y = Add(x, w) }'
     )
@@ -221,7 +220,7 @@ def test_a_pass_s_graph_is_written_once_for_checker_and_inference(
         monkeypatch.setattr(home, "without_weights", noted)
     monkeypatch.setattr("me2e_compress.graph.validity.without_weights", noted)
     chosen = (passes.DROPS_RELU,)
-    PassManager(chosen, verify_frames=0).run(ir.from_onnx_text(CHAIN), context)
+    PassManager(chosen, verify_frames=0).run(parsed(CHAIN), context)
 
     assert len(written) == 3  # as given, imported, rewritten
 
@@ -238,7 +237,7 @@ def test_a_graph_that_kills_its_process_is_refused_before_it_is_run(
     monkeypatch.setattr("me2e_compress.manager.verification_inputs.Session", opens)
     manager = PassManager((passes.DROPS_RELU,), try_first=refuses)
     with pytest.raises(GraphError, match="the graph after drops-relu-of-sigmoid kills"):
-        manager.run(ir.from_onnx_text(CHAIN), context)
+        manager.run(parsed(CHAIN), context)
 
 
 @pytest.mark.parametrize("known", [False, True], ids=["fresh", "with a past"])
@@ -255,8 +254,7 @@ def test_a_graph_that_kills_its_process_is_refused_before_it_is_run(
 def test_a_graph_is_imported_as_exporters_leave_it(
     body: str, known: bool, context: Context
 ) -> None:
-    model = ir.from_onnx_text(
-        '<ir_version: 9, opset_import: ["" : 17]>\n'
+    model = parsed(
         f'm (float[1,8] x) => (float[1,8] y) {{ ["/backbone/b"] b = Abs(x) {body} }}'
     )
     for node in model.graph if known else ():
@@ -266,7 +264,7 @@ def test_a_graph_is_imported_as_exporters_leave_it(
 
 
 def test_a_graph_may_hold_text(context: Context) -> None:
-    model = ir.from_onnx_text(
+    model = parsed(
         '<ir_version: 9, opset_import: ["" : 20]>\n'
         "m (string[2] x) => (string[2] y) {"
         ' unit = Constant<value_strings = ["m", "s"]>()'
@@ -279,8 +277,7 @@ def test_a_graph_may_hold_text(context: Context) -> None:
 
 
 def test_an_output_that_is_a_sequence_is_not_compared(context: Context) -> None:
-    model = ir.from_onnx_text(
-        '<ir_version: 9, opset_import: ["" : 17]>\n'
+    model = parsed(
         "m (float[1,8] x) => (seq(float[1,4]) y) <int64[2] parts = {4, 4}> {"
         ' ["/backbone/a"] y = SplitToSequence<axis = 1>(x, parts) }'
     )

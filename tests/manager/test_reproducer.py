@@ -8,6 +8,7 @@ import pytest
 from me2e_compress.manager import reproducer
 from me2e_compress.manager.reproducer import shrink
 from tests.conftest import DRIVER
+from tests.nets import parsed
 from tests.passes.small import ops, read
 
 OPERATORS = ("Abs", "Neg", "Exp", "Tanh", "Cos", "Sin", "Erf")
@@ -20,10 +21,7 @@ def chain(count: int) -> ir.Model:
         for index, each in enumerate(OPERATORS[:count])
     )
     inner = ", ".join(f"float[2] v{index}" for index in range(1, count))
-    return read(
-        '<ir_version: 9, opset_import: ["" : 17]>\n'
-        f"g (float[2] v0) => (float[2] v{count}) <{inner}> {{ {calls} }}"
-    )
+    return read(f"g (float[2] v0) => (float[2] v{count}) <{inner}> {{ {calls} }}")
 
 
 @pytest.mark.parametrize("count", [2, 4, 7])
@@ -54,7 +52,7 @@ def test_a_folder_of_the_user_is_left_alone(tmp_path: Path) -> None:
     theirs = tmp_path / "reproducer-fold-constants"
     theirs.mkdir()
     (theirs / "model.onnx").write_text("theirs")
-    model = ir.from_onnx_text(DRIVER)
+    model = parsed(DRIVER)
 
     made = [
         reproducer.write(tmp_path, model, "fold-constants", 0, "broke").name

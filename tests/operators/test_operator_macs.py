@@ -2,12 +2,12 @@
 
 from typing import Any
 
-import onnx_ir as ir
 import pytest
 
 from me2e_compress.graph import infer_shapes, macs, static_shape
 from me2e_compress.graph.shapes import Dims
 from me2e_compress.operators import OPERATORS
+from tests.nets import parsed
 
 Shapes = list[Dims | None]
 
@@ -74,7 +74,6 @@ def test_open_shapes_have_none(name: str, shapes: Shapes) -> None:
 
 
 ROTATED = """
-<ir_version: 9, opset_import: ["" : 17]>
 g (float[3,8,9] x, float[1] a, float[2] c) => (float[L,M,N] y)
     { z = RotateTRT<ATTRIBUTES>(x, a, c) y = Relu(z) }
 """
@@ -92,7 +91,7 @@ g (float[3,8,9] x, float[1] a, float[2] c) => (float[L,M,N] y)
 def test_what_its_dialect_refuses_nobody_knows(
     attributes: str, count: int | None, shape: tuple[int, ...] | None
 ) -> None:
-    model = ir.from_onnx_text(ROTATED.replace("ATTRIBUTES", attributes))
+    model = parsed(ROTATED.replace("ATTRIBUTES", attributes))
     infer_shapes(model)
     node = model.graph[0]
 

@@ -7,9 +7,9 @@ from me2e_compress.graph.modules.module_map import ModuleMap
 from me2e_compress.passes.ablate_modules import AblateModules
 from me2e_compress.passes.base import Context
 from me2e_compress.runtime.session import run_once
+from tests.nets import map_text
 
 STACK = """
-<ir_version: 9, opset_import: ["" : 17]>
 stack (float[1,4] camera) => (float[1,4] plan, float[1,2,2] lanes)
 <int64[3] square = {1, 2, 2}, int64[2] flat = {1, 4}> {
     ["/backbone/Relu"] f = Relu(camera)
@@ -23,21 +23,11 @@ stack (float[1,4] camera) => (float[1,4] plan, float[1,2,2] lanes)
 }
 """
 
-MAP = """
-[modules.backbone]
-role = "feature"
-patterns = ["backbone"]
-[modules.agents]
-role = "prediction"
-patterns = ["agents"]
-[modules.map]
-role = "prediction"
-patterns = ["map"]
-%s
-[modules.planner]
-role = "prediction"
-patterns = ["planner"]
-"""
+MAP = (
+    map_text(backbone="feature", agents="prediction", map="prediction")
+    + "%s\n"
+    + map_text(planner="prediction")
+)
 
 CAMERA = np.array([[-1, 0, 4, 9]], np.float32)
 

@@ -8,12 +8,11 @@ from me2e_compress import graph
 from me2e_compress.graph.modules.module_map import ModuleMap
 from me2e_compress.passes.base import Context
 from me2e_compress.passes.edges import Edge
-from tests.nets import net
+from tests.nets import map_text, net
 
 Numbers = npt.NDArray[np.float32]
 
 STACK = """
-<ir_version: 9, opset_import: ["" : 17]>
 stack (float[1,5,8] camera, float[1,3,5] pick, float[1,6,8] embedding,
        float[1,2,5] pair) => (float[1,1,8] plan, float[1,3,8] lanes, float[1,2,5] taken)
 <int64[1] one = {1}, int64[2] whole = {1, 8}, int64[4] cut = {1, 5, 2, 4},
@@ -42,27 +41,12 @@ stack (float[1,5,8] camera, float[1,3,5] pick, float[1,6,8] embedding,
 }
 """
 
-MAP = """
-[modules.backbone]
-role = "feature"
-patterns = ["backbone"]
-[modules.track]
-role = "prediction"
-patterns = ["track"]
-[modules.map]
-role = "prediction"
-patterns = ["map"]
-[modules.motion]
-role = "prediction"
-patterns = ["motion"]
-%s
-[modules.occ]
-role = "prediction"
-patterns = ["occ"]
-[modules.planner]
-role = "prediction"
-patterns = ["planner"]
-"""
+PREDICTIONS = dict.fromkeys(("track", "map", "motion"), "prediction")
+MAP = (
+    map_text(backbone="feature", **PREDICTIONS)
+    + "%s\n"
+    + map_text(occ="prediction", planner="prediction")
+)
 
 KEYS = Edge("map", "*.attn")
 """The planner's attention reads lanes behind the cells."""

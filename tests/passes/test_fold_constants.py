@@ -211,10 +211,7 @@ def programs(draw: st.DrawFn) -> tuple[str, dict[str, Any]]:
         names.append(f"v{index}")
     lines.append(f"z = Add({names[-1]}, x)")
     body = "\n".join(lines)
-    text = (
-        '<ir_version: 9, opset_import: ["" : 17]>\n'
-        f"g (float[2,3] x) => (float[A,B] z) {{ {body} }}"
-    )
+    text = f"g (float[2,3] x) => (float[A,B] z) {{ {body} }}"
     return text, weights
 
 

@@ -115,7 +115,6 @@ def test_a_view_of_rows_is_rotated_without_a_transposition() -> None:
 def test_another_reader_gets_the_map_as_it_was() -> None:
     body = sample() + " t = Transpose<perm = [0, 2, 3, 1]>(s) u = Neg(t)"
     model = read(
-        '<ir_version: 9, opset_import: ["" : 17]>\n'
         "g (float[1,16,4,4] m, float[1,2,3,2] at)"
         f" => (float[1,16,2,3] s, float[1,2,3,16] u) {{ {body} }}"
     )

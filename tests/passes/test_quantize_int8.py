@@ -30,7 +30,7 @@ from me2e_compress.targets.onnxruntime import int8_layers, unranged
 from me2e_compress.targets.tensorrt import TensorRT
 from me2e_compress.testing import check_pass
 from tests.frames import record
-from tests.nets import MODULES, conv_attention, image, net
+from tests.nets import MODULES, conv_attention, image, net, parsed
 
 PAPER = QuantizeInt8(rules="paper", target="tensorrt")
 TENSORS = ("image", "q", "seen", "p", "mixed")
@@ -138,8 +138,8 @@ def test_frames_and_graphs_that_do_not_fit_are_refused(
 
 
 def test_what_is_quantized_while_it_runs_is_not_lowered(context: Context) -> None:
-    model = ir.from_onnx_text(
-        """<ir_version: 9, opset_import: ["" : 17]>
+    model = parsed(
+        """
         g (float[2,4] x) => (int32[2,3] y) <int8[4,3] w = {1,2,3,4,5,6,7,8,9,1,2,3}> {
             q, s, z = DynamicQuantizeLinear(x)
             y = MatMulInteger(q, w, z)
@@ -259,7 +259,6 @@ def test_what_the_target_keeps_in_float_is_not_counted_as_int8(
 
 def test_where_the_target_takes_nothing_nothing_is_int8(context: Context) -> None:
     text = """
-    <ir_version: 9, opset_import: ["" : 17]>
     up (float[1,3,8,8] image, float[3,8,2,2] w) => (float[1,8,16,16] y) {
         ["/backbone/Up"] y = ConvTranspose<strides=[2,2]>(image, w)
     }
@@ -356,7 +355,6 @@ def test_saved_ranges_lower_to_the_same_graph_without_frames(
 
 
 BATCHED = """
-<ir_version: 9, opset_import: ["" : 17]>
 batched (float[1,3,8,8] image, float[1,3,8,4] w) => (float[1,3,8,4] y) {
     y = MatMul(image, w)
 }

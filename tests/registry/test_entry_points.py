@@ -38,7 +38,8 @@ def __getattr__(name: str) -> object:
 def others(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Three packages: one works, one is broken, two want the same name."""
     here, there = __name__, Shape.__module__
-    good = {"thawed": f"{here}:Thawed", "misnamed": f"{here}:Misnamed"}
+    classes = (Thawed, Misnamed, Undecorated)
+    good = {each.__name__.lower(): f"{here}:{each.__name__}" for each in classes}
     install(monkeypatch, tmp_path, "good-shapes", GROUP, good)
     bad = {"broken": f"{here}:Broken", "circle": f"{there}:Circle"}
     bad |= {"gone": "no_such_module:Shape", "lacking": f"{here}:Lacking"}
@@ -65,6 +66,7 @@ def test_a_class_of_another_package_is_found(
         ("gone", r"'gone' of bad-shapes 1.0 \(no_such_module:Shape\) cannot be impor"),
         ("thawed", "'thawed' of good-shapes 1.0 .* is not a frozen dataclass"),
         ("misnamed", "'misnamed' of good-shapes 1.0 .* calls itself 'other'"),
+        ("undecorated", "'undecorated' of good-shapes 1.0 .* is not a frozen datacl"),
         ("circle", "'circle' is claimed by me2e-compress and bad-shapes 1.0: uninst"),
         ("twice", "'twice' is claimed by shapes-(one|two) 1.0 and shapes-"),
     ],
@@ -89,16 +91,10 @@ def test_every_entry_is_listed_with_its_trouble() -> None:
     assert list(entries) == [
         *("square", "circle", "point"),
         *("broken", "gone", "lacking", "misnamed", "thawed", "twice"),
+        "undecorated",
     ]
     assert SHAPES.parse_all("square,point") == (Square(), Point())
     assert SHAPES.usable() == ("square", "point")
     assert entries["square"].error == ""
     assert "RuntimeError" in entries["broken"].error
     assert entries["circle"].source == "me2e-compress and bad-shapes 1.0"
-
-
-def test_an_undecorated_class_has_no_options_of_its_own() -> None:
-    ours = Registry[Shape]("s", "", StudyError, {"u": f"{__name__}:Undecorated"})
-
-    with pytest.raises(StudyError, match="is not a frozen dataclass"):
-        ours.get("u")

@@ -17,7 +17,7 @@ from me2e_compress.runtime.breakdown import (
 from me2e_compress.runtime.frames import Frame
 from me2e_compress.runtime.latency_trace import LatencyTrace, shares
 from me2e_compress.runtime.optimized import optimized, origins, with_unique_names
-from me2e_compress.runtime.providers import CudaProvider
+from me2e_compress.runtime.providers import CPU, CudaProvider, Provider
 from tests.nets import net
 
 TEXT = """
@@ -47,8 +47,10 @@ def module_of(node: ir.Node) -> str:
     )
 
 
-def measured(model: ir.Model) -> Breakdown:
-    return break_down(model, module_of, FRAMES, runs=5, warm_up=2, threads=1)
+def measured(model: ir.Model, provider: Provider = CPU) -> Breakdown:
+    return break_down(
+        model, module_of, FRAMES, runs=5, warm_up=2, threads=1, provider=provider
+    )
 
 
 def test_every_node_that_runs_is_of_a_module_and_both_ways_add_up(
@@ -123,15 +125,7 @@ def test_what_runs_inside_a_body_is_counted_once() -> None:
 
 def test_nodes_elsewhere_than_on_the_cpu_are_not_timed(model: ir.Model) -> None:
     with pytest.raises(ProviderError, match="cuda: times of nodes are measured on"):
-        break_down(
-            model,
-            module_of,
-            FRAMES,
-            runs=1,
-            warm_up=0,
-            threads=1,
-            provider=CudaProvider(),
-        )
+        measured(model, CudaProvider())
 
 
 def test_a_trace_keeps_its_modules_and_older_ones_are_read(tmp_path: Path) -> None:

@@ -110,18 +110,11 @@ def family(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Family]:
         each.kill()
 
 
-def test_children_run_no_module_of_the_current_folder(family: Family) -> None:
+def test_children_are_apart_from_folder_home_and_ctrl_c_and_end_with_their_parent(
+    family: Family,
+) -> None:
     assert list(family.folder.glob("*.sprung")) == []
     assert family.said["said"] == "word True\n"
-
-
-def test_children_leave_ctrl_c_to_their_parent(family: Family) -> None:
-    assert family.said["deaf"]
-
-
-def test_children_end_with_a_parent_that_is_killed(family: Family) -> None:
-    assert family.alive == []
-
-
-def test_nothing_is_written_into_the_home(family: Family) -> None:
     assert list(family.home.rglob("*")) == []
+    assert family.said["deaf"]
+    assert family.alive == []

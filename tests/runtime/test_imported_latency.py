@@ -101,9 +101,11 @@ def test_a_broken_file_is_one_line(tmp_path: Path, content: Any, words: str) -> 
     assert "\n" not in str(caught.value)
 
 
-def test_a_folder_of_files(tmp_path: Path, files: dict[str, Path]) -> None:
+def test_a_folder_of_files_or_of_none(tmp_path: Path, files: dict[str, Path]) -> None:
     model, folder = straight_on(tmp_path / "m.onnx"), tmp_path / "run"
     folder.mkdir()
+    with pytest.raises(EvaluationError, match="run: there is no file in it"):
+        import_profile(model, [folder])
     for name in ("times", "log"):
         files[name].rename(folder / name)
 
@@ -111,12 +113,6 @@ def test_a_folder_of_files(tmp_path: Path, files: dict[str, Path]) -> None:
 
     assert len(found.trace.samples_us) == 2
     assert "VDD_GPU_SOC: 7.00 W on average" in found.lines()[0]
-
-
-def test_an_empty_folder_is_refused(tmp_path: Path) -> None:
-    (tmp_path / "run").mkdir()
-    with pytest.raises(EvaluationError, match="run: there is no file in it"):
-        import_profile(straight_on(tmp_path / "m.onnx"), [tmp_path / "run"])
 
 
 def test_two_files_of_one_kind_are_refused(files: dict[str, Path]) -> None:

@@ -1,7 +1,6 @@
 from pathlib import Path
 
 import numpy as np
-import onnx
 import pytest
 
 from me2e_compress import graph
@@ -20,9 +19,9 @@ from me2e_compress.runtime.profile import (
 )
 from me2e_compress.runtime.session import replay
 from tests.command import write_frames
+from tests.nets import save_text
 
-MODEL = """<ir_version: 8, opset_import: ["" : 17]>
-counter (float[2] x, float[2] total) => (float[2] total_out)
+MODEL = """counter (float[2] x, float[2] total) => (float[2] total_out)
 { total_out = Add (x, total) }"""
 ONES: dict[str, Array] = {"x": np.ones(2, np.float32)}
 FRAMES = [Frame(0, True, ONES), Frame(1, False, ONES), Frame(2, False, ONES)]
@@ -30,8 +29,7 @@ FRAMES = [Frame(0, True, ONES), Frame(1, False, ONES), Frame(2, False, ONES)]
 
 @pytest.fixture
 def model(tmp_path: Path) -> Path:
-    onnx.save(onnx.parser.parse_model(MODEL), tmp_path / "m.onnx")
-    return tmp_path / "m.onnx"
+    return save_text(tmp_path / "m.onnx", MODEL)
 
 
 def test_every_sample_is_one_warm_inference(model: Path) -> None:
@@ -73,21 +71,12 @@ def test_one_thread_is_singular() -> None:
     assert machine_words(0).endswith("on all threads")
 
 
-TEXT = """<ir_version: 8, opset_import: ["" : 17]>
-model (float[3] x, float[3] s) => (float[3] y, float[3] s_out) {
-    s_out = Add (s, x)
-    y = Mul (s_out, x)
-}"""
-
-
 @pytest.fixture
 def models(tmp_path: Path) -> dict[str, Path]:
     found = {name: tmp_path / f"{name}.onnx" for name in ("one", "two")}
     for name, path in found.items():
-        model = onnx.parser.parse_model(TEXT)
-        model.doc_string = name
-        onnx.save(model, path)
-    write_frames(tmp_path / "frames", x=np.ones(3, np.float32))
+        save_text(path, MODEL, name=name)
+    write_frames(tmp_path / "frames", x=np.ones(2, np.float32))
     return found
 
 

@@ -27,8 +27,9 @@ from me2e_compress.runtime.providers import (
     provider_named,
 )
 from me2e_compress.runtime.session import Session
+from tests.nets import parsed, save_text
 
-NEGATE = '<ir_version: 9, opset_import: ["" : 17]> m (float[2] x) => (float[2] y) {'
+NEGATE = "m (float[2] x) => (float[2] y) { y = Neg(x) }"
 RTX = TensorRtRtxProvider.package
 
 
@@ -76,18 +77,13 @@ def test_providers_that_are_none(text: str, reason: str) -> None:
         provider_named(text)
 
 
-def test_a_library_that_is_missing(tmp_path: Path) -> None:
-    with pytest.raises(ProviderError, match=r"no-such\.so: no such file"):
-        provider_named("cpu", [tmp_path / "no-such.so"])
-
-
-def test_a_file_that_is_no_library(tmp_path: Path) -> None:
+def test_a_file_that_is_not_there_or_no_library(tmp_path: Path) -> None:
     library = tmp_path / "text.so"
+    with pytest.raises(ProviderError, match=r"text\.so: no such file"):
+        provider_named("cpu", [library])
     library.write_text("not a library")
-    model = ir.from_onnx_text(NEGATE + "y = Neg(x) }")
-
     with pytest.raises(ProviderError) as refusal:
-        Session(model, provider=provider_named("cpu", [library]))
+        Session(parsed(NEGATE), provider=provider_named("cpu", [library]))
 
     assert str(refusal.value).startswith(f"plugins library {library}: ")
     assert "\n" not in str(refusal.value)
@@ -104,9 +100,8 @@ def test_a_users_library_is_registered(tmp_path: Path) -> None:
     )
     words = ["cc", "-shared", "-fPIC", "-x", "c", "-", "-o", str(library)]
     subprocess.run(words, input=source, text=True, check=True)
-    model = ir.from_onnx_text(NEGATE + "y = Neg(x) }")
 
-    session = Session(model, provider=provider_named("cpu", [library]))
+    session = Session(parsed(NEGATE), provider=provider_named("cpu", [library]))
 
     assert called.exists()
     assert session.run({"x": np.ones(2, np.float32)})["y"].tolist() == [-1.0, -1.0]
@@ -165,8 +160,7 @@ def test_tensorrt_rtx_is_registered_from_its_package(
 
 @pytest.mark.usefixtures("bare")
 def test_a_driver_opens_its_model_on_its_provider(tmp_path: Path) -> None:
-    path = tmp_path / "m.onnx"
-    ir.save(ir.from_onnx_text(NEGATE + "y = Neg(x) }"), path)
+    path = save_text(tmp_path / "m.onnx", NEGATE)
 
     with pytest.raises(ProviderError, match="provider cuda: "):
         OnnxDriver(path, provider=CudaProvider(device=1)).open()
@@ -186,9 +180,8 @@ class _Watched(CpuProvider):
 def test_the_cpu_leaves_out_the_fusion_that_is_slow_there(
     provider: CpuProvider, kernel: str, tmp_path: Path
 ) -> None:
-    model = ir.from_onnx_text(
-        '<ir_version: 9, opset_import: ["" : 17]>'
-        " m (float[1,2,4] x) => (float[1,2,4] y)"
+    model = parsed(
+        "m (float[1,2,4] x) => (float[1,2,4] y)"
         " <float[4] s = {1.0, 1.0, 1.0, 1.0}>"
         " { a = Add(x, x) y = LayerNormalization(a, s, s) }"
     )

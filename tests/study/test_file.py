@@ -129,11 +129,6 @@ def test_a_name_that_is_no_file_is_one_that_ships_whatever_is_where_you_are(
     assert study.variants[0].policy == str(shipped("highway"))
 
 
-def test_variants_are_no_longer_called_schemes(models: Path) -> None:
-    with pytest.raises(StudyError, match=r"\[\[scheme\]\] is gone .* use \[\[variant"):
-        load_study(write(models, GOOD.replace("[[variant]]", "[[scheme]]")))
-
-
 def test_a_file_where_you_are_is_not_beside_the_study(
     models: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -191,6 +186,12 @@ def test_provider_and_routes_of_the_command_line_win(models: Path) -> None:
         ('"slow.onnx"\nrecipe', '"quick"\nrecipe', GraphError, "quick: no such file"),
         ('latency = "none"', 'latency = "quick"', EvaluationError, "source 'quick'"),
         ("[latency]", "[latency", StudyError, "not TOML"),
+        (
+            "[latency]",
+            "[record]\nframes = 4\nheld_out = 4\n[latency]",
+            StudyError,
+            "folders of frames, or what to record, not both",
+        ),
     ],
 )
 def test_what_is_wrong_is_one_line(
@@ -222,14 +223,17 @@ def test_a_key_that_is_gone_says_what_is_used_instead(models: Path, key: str) ->
         load_study(write(models, f'{key} = "paper"\n{GOOD}'))
 
 
-def test_variants_that_name_no_policy_take_the_study_s(models: Path) -> None:
-    text = GOOD.replace('policy = "slow.onnx"\n', "", 2)
+def test_variants_that_name_no_policy_take_the_study_s_and_drive_every_route(
+    models: Path,
+) -> None:
+    text = GOOD.replace('policy = "slow.onnx"\n', "", 2).replace("routes = 3", "")
 
     study = load_study(write(models, 'policy = "highway"\n' + text))
 
     ours = str(shipped("highway"))
     named = str(models / "slow.onnx")
     assert [each.policy for each in study.variants] == [ours, ours, named]
+    assert study.routes == load_routes()
 
 
 def test_the_study_of_the_documents_is_one(tmp_path: Path) -> None:
@@ -251,16 +255,3 @@ def test_the_study_of_the_documents_is_one(tmp_path: Path) -> None:
 
     assert [each.name for each in of_parts.blocks] == ["table-3"]
     assert of_parts.to_record == FramesToRecord(256, 64)
-
-
-def test_frames_are_given_or_recorded(models: Path) -> None:
-    both = f"{GOOD}\n[record]\nframes = 4\nheld_out = 4\n"
-
-    with pytest.raises(StudyError, match="folders of frames, or what to record, not b"):
-        load_study(write(models, both))
-
-
-def test_all_routes_is_what_a_study_drives_if_it_says_nothing(models: Path) -> None:
-    study = load_study(write(models, GOOD.replace("routes = 3", "")))
-
-    assert study.routes == load_routes()

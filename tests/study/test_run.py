@@ -87,7 +87,9 @@ def test_the_same_model_does_not_differ_and_the_baseline_is_not_compared(
     assert fast.better + fast.worse > 0
 
 
-def test_a_model_has_size_and_latency_and_a_driver_has_none(found: StudyResult) -> None:
+def test_a_model_has_size_latency_and_fidelity_and_a_driver_has_none(
+    found: StudyResult,
+) -> None:
     blind, slow, again, fast = found.variants
 
     assert blind.size_mb.value is None
@@ -97,18 +99,15 @@ def test_a_model_has_size_and_latency_and_a_driver_has_none(found: StudyResult) 
     assert slow.latency_ms[50].value == pytest.approx(200.0)
     assert again.latency_ms[50].value is not None
     assert fast.latency_ms[99].reason == "needs 100 samples, has 20"
-
-
-def test_fidelity_is_measured_against_the_baseline(found: StudyResult) -> None:
-    blind, slow, again, fast = (each.fidelity for each in found.variants)
-
-    assert blind.mean_m.reason == "blind is not a model"
-    assert slow.mean_m.reason == "the baseline itself"
-    assert again.mean_m.value == 0.0
-    assert again.plan_sqnr_db.reason == "no noise: equal to the bit"
-    assert fast.mean_m.value == pytest.approx(sum(range(2, 14, 2)) / 6)
-    assert fast.max_m.value == pytest.approx(12.0)
-    assert fast.frames == 2
+    # fidelity is measured against the baseline
+    plans = [each.fidelity for each in found.variants]
+    reasons = [each.mean_m.reason for each in plans[:2]]
+    assert reasons == ["blind is not a model", "the baseline itself"]
+    assert plans[2].mean_m.value == 0.0
+    assert plans[2].plan_sqnr_db.reason == "no noise: equal to the bit"
+    assert plans[3].mean_m.value == pytest.approx(sum(range(2, 14, 2)) / 6)
+    assert plans[3].max_m.value == pytest.approx(12.0)
+    assert plans[3].frames == 2
 
 
 def test_the_same_seed_gives_the_same_bytes(
@@ -154,24 +153,22 @@ def test_a_study_is_silent_and_its_file_is_taken_as_it_is(
     assert found.study == load_study(toml)
 
 
-def test_a_missing_model_is_named_before_anything_drives(
-    make: Make, tmp_path: Path
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        (
+            {"variants": (BLIND, Variant("slow", "gone.onnx"))},
+            r"variant slow: gone\.onnx: no such model",
+        ),
+        ({"frames": Path("no/gone")}, "^frames: no/gone: no such folder"),
+        ({"held_out": Path("no/gone")}, "^held_out: no/gone: no such folder"),
+    ],
+)
+def test_a_missing_model_or_frames_are_named_before_anything_runs(
+    make: Make, tmp_path: Path, changes: dict[str, object], message: str
 ) -> None:
-    asked = make(variants=(BLIND, Variant("slow", "gone.onnx")))
-
-    with pytest.raises(StudyError, match=r"variant slow: gone\.onnx: no such model"):
-        run_study(asked, tmp_path)
-    assert not (tmp_path / "results").exists()
-
-
-@pytest.mark.parametrize("which", ["frames", "held_out"])
-def test_frames_that_are_none_are_named_before_anything_runs(
-    make: Make, tmp_path: Path, which: str
-) -> None:
-    asked = make(**{which: tmp_path / "gone"})
-
-    with pytest.raises(StudyError, match=rf"^{which}: \S+/gone: no such folder"):
-        run_study(asked, tmp_path / "out")
+    with pytest.raises(StudyError, match=message):
+        run_study(make(**changes), tmp_path / "out")
     assert not (tmp_path / "out").exists()
 
 
@@ -336,18 +333,14 @@ def test_a_change_is_held_against_the_same_routes_without_it() -> None:
     assert int8.beyond["room_kept"].value == pytest.approx(-10.0)
 
 
-def test_what_was_not_driven_is_left_out() -> None:
-    missing = DriveRecord("int8", "fog", reason="it failed")
-
-    assert len(changes(CONDITIONS, (*DRIVES[:3], missing), "float", 0)) == 1
-    assert held_against([("int8.fog", "float.ideal")], DRIVES[:3], 0) == ()
-
-
-def test_a_pair_crosses_variants_and_conditions() -> None:
-    [pair] = held_against([("int8.fog", "float.ideal")], DRIVES, 0)
-
+def test_a_pair_crosses_conditions_and_what_was_not_driven_is_left_out() -> None:
+    asked = [("int8.fog", "float.ideal")]
+    [pair] = held_against(asked, DRIVES, 0)
     assert pair.driving_score.value == pytest.approx((-40 - 10 - 20 - 40) / 4)
     assert pair.to_json()["beyond_baseline"]["driving_score"] is None
+    missing = DriveRecord("int8", "fog", reason="it failed")
+    assert len(changes(CONDITIONS, (*DRIVES[:3], missing), "float", 0)) == 1
+    assert held_against(asked, DRIVES[:3], 0) == ()
 
 
 def test_tables_of_changes_and_pairs(make: Make) -> None:

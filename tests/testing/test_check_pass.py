@@ -11,6 +11,7 @@ from me2e_compress.passes.ablate_modules import AblateModules
 from me2e_compress.registry import options_of
 from me2e_compress.testing import check_pass
 from tests.manager import passes
+from tests.nets import parsed
 
 EXACT = [
     cls
@@ -71,7 +72,6 @@ class LeavesWhatIsUnread(Pass):
 
 
 NEGATIONS = """
-<ir_version: 9, opset_import: ["" : 17]>
 m (float[1,4] x) => (float[1,4] y) {
     ["/backbone/a"] a = Neg(x)
     ["/backbone/b"] b = Neg(a)
@@ -122,11 +122,10 @@ def test_a_wrong_pass_is_caught(wrong: Pass, message: str, context: Context) -> 
     tanh = isinstance(wrong, Wrong)
     text = NEGATIONS.replace("c = Neg(b)", "c = Tanh(b)") if tanh else NEGATIONS
     with pytest.raises(VerificationError, match=message):
-        check_pass(wrong, ir.from_onnx_text(text), context)
+        check_pass(wrong, parsed(text), context)
 
 
 SOFTENED = """
-<ir_version: 9, opset_import: ["" : 17]>
 m (float[1,4] x) => (float[1,4] y) {
     a = Relu(x)
     y = Neg(a)
@@ -135,5 +134,5 @@ m (float[1,4] x) => (float[1,4] y) {
 
 
 def test_a_graph_of_no_known_stack_is_one_module() -> None:
-    result = check_pass(PASSES.build("fuse-basic", {}), ir.from_onnx_text(SOFTENED))
+    result = check_pass(PASSES.build("fuse-basic", {}), parsed(SOFTENED))
     assert {provenance.module_of(node) for node in result.model.graph} == {"model"}

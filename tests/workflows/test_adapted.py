@@ -4,7 +4,6 @@ import json
 from pathlib import Path
 
 import numpy as np
-import onnx_ir as ir
 import pytest
 
 from me2e_compress import graph
@@ -29,9 +28,10 @@ from me2e_compress.workflows.options import (
 )
 from me2e_compress.workflows.profile import profile
 from me2e_compress.workflows.search import measure_sensitivity
+from tests.frames import record
+from tests.nets import parsed
 
 MINE = """
-<ir_version: 9, opset_import: ["" : 17]>
 mine (float[1,8,12] seen, float[1,8,12] memory)
     => (float[1,48,2] waypoints, float[1,8,12] remembered)
     <float[12,12] weight = {WEIGHT}, int64[3] shape = {1, 48, 2}>
@@ -57,7 +57,7 @@ output = "waypoints"
 def mine(tmp_path: Path) -> Path:
     weight = np.random.default_rng(0).standard_normal(144) / 4
     text = MINE.replace("WEIGHT", ", ".join(f"{each:.6f}" for each in weight))
-    graph.save(ir.from_onnx_text(text), tmp_path / "mine.onnx")
+    graph.save(parsed(text), tmp_path / "mine.onnx")
     return tmp_path / "mine.onnx"
 
 
@@ -84,13 +84,8 @@ def parts(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def frames(tmp_path: Path) -> Path:
-    folder, random = tmp_path / "frames", np.random.default_rng(1)
-    folder.mkdir()
-    for at in range(4):
-        seen = random.standard_normal((1, 8, 12)).astype(np.float32)
-        np.savez(folder / f"{at:06d}.npz", seen=seen)
-    (folder / "scenes.json").write_text('{"scenes": [0]}')
-    return folder
+    seen = np.random.default_rng(1).standard_normal((4, 1, 8, 12)).astype(np.float32)
+    return record(tmp_path / "frames", [{"seen": each} for each in seen])
 
 
 def test_compare_knows_the_plan_and_the_state(
@@ -248,9 +243,7 @@ def test_presets_name_plan_and_state(
     preset: str, plan: str, taken: str, given: str
 ) -> None:
     text = MINE.replace("WEIGHT", ", ".join(["0.0"] * 144)).replace("waypoints", plan)
-    model = ir.from_onnx_text(
-        text.replace("memory", taken).replace("remembered", given)
-    )
+    model = parsed(text.replace("memory", taken).replace("remembered", given))
 
     adapted(model, None, preset)
 

@@ -15,10 +15,9 @@ from me2e_compress.calibration.calibrator import Calibrator
 from me2e_compress.workflows.measured_loss import ADVICE
 from tests.command import Command
 from tests.frames import record
-from tests.nets import conv_attention, net
+from tests.nets import MAP_TEXT, conv_attention, map_text, net
 
 PROJECTION = """
-<ir_version: 9, opset_import: ["" : 17]>
 net (float[1,8,64] img, float[6,4,4] lidar2img, float[4,256] points,
      float[64,64] first, float[64,64] second, float[64,12] out)
     => (float[1,6,2] plan, float[6,2,256] bev)
@@ -40,14 +39,7 @@ net (float[1,8,64] img, float[6,4,4] lidar2img, float[4,256] points,
 }
 """
 
-MAP = "".join(
-    f'[modules.{name}]\nrole = "{role}"\npatterns = ["{name}"]\n'
-    for name, role in (
-        ("backbone", "feature"),
-        ("bev_encoder", "feature"),
-        ("plan_head", "prediction"),
-    )
-)
+MAP = map_text(backbone="feature", bev_encoder="feature", plan_head="prediction")
 
 
 def projection() -> ir.Model:
@@ -200,9 +192,7 @@ def test_state_is_fed_forward_on_held_out_frames(tmp_path: Path) -> None:
         {"image": generator.standard_normal((1, 3, 8, 8)).astype("f")} for _ in range(8)
     ]
     record(tmp_path / "frames", frames)
-    names = '[modules.{0}]\nrole = "{1}"\npatterns = ["{0}"]\n'
-    roles = ("backbone", "feature"), ("head", "prediction")
-    (tmp_path / "map.toml").write_text("".join(names.format(*each) for each in roles))
+    (tmp_path / "map.toml").write_text(MAP_TEXT)
     options = me2e.CompressOptions(
         scheme="full", rules="paper", module_map=tmp_path / "map.toml", verify_frames=0
     )
@@ -222,7 +212,6 @@ def test_state_is_fed_forward_on_held_out_frames(tmp_path: Path) -> None:
 
 
 LOGARITHM = """
-<ir_version: 9, opset_import: ["" : 17]>
 net (float[1,16,16] x, float[16,16] w) => (float[1,16,16] y) {
     ["/backbone/MatMul"] a = MatMul(x, w)
     ["/backbone/Abs"] b = Abs(a)
@@ -238,7 +227,7 @@ def test_an_output_that_is_no_longer_finite_is_not_overlooked(tmp_path: Path) ->
     values = np.full((1, 16, 16), 1e-3, np.float32)
     values[0, 0] = 10.0
     record(tmp_path / "frames", [{"x": values}])
-    (tmp_path / "map.toml").write_text(MAP[: MAP.index("[modules.bev")])
+    (tmp_path / "map.toml").write_text(map_text(backbone="feature"))
     options = me2e.CompressOptions(
         scheme="full", rules="paper", module_map=tmp_path / "map.toml"
     )

@@ -13,7 +13,6 @@ from tests.frames import record
 from tests.nets import net
 
 NO_LAYER = """
-<ir_version: 9, opset_import: ["" : 17]>
 net (float[4,1,32] x, float[1,128,32] w, float[1,128,32] r) => (float[4,1,1,32] y) {
     ["/head/LSTM"] y = LSTM<hidden_size=32>(x, w, r)
 }

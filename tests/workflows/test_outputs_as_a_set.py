@@ -6,7 +6,6 @@ import os
 from collections.abc import Callable
 from pathlib import Path
 
-import onnx_ir as ir
 import pytest
 
 from me2e_compress import graph
@@ -14,6 +13,7 @@ from me2e_compress.registry import drafts
 from me2e_compress.runtime.atomic import write_bytes
 from me2e_compress.workflows import compress
 from tests.command import Command, contents
+from tests.nets import parsed
 
 COMPRESS = ("compress", "in.onnx", "-o", "out.onnx", "--passes")
 
@@ -53,8 +53,7 @@ def test_what_was_there_before_comes_back(
 ) -> None:
     monkeypatch.chdir(files)
     if external:
-        model = ir.from_onnx_text(
-            '<ir_version: 9, opset_import: ["" : 17]>\n'
+        model = parsed(
             "g (float[1,4] x) => (float[1,4] y) <float[1,4] w = {1, 2, 3, 4}>"
             " { y = Add(x, w) }"
         )

@@ -29,17 +29,13 @@ def test_a_result_is_one_line() -> None:
 NASTY = "a\x1b[31m[red]|<b>\n\u202eb\udcff"
 
 
-def test_names_do_not_steer_a_terminal() -> None:
-    shown = table("t" + NASTY, ["name"], [[NASTY]], note="one\ntwo\x07").printable()
+def test_names_do_not_steer_a_terminal_and_are_no_markup_in_markdown() -> None:
+    found = table("t" + NASTY, ["name"], [[NASTY]], note="one\ntwo\x07 < b")
+    shown, written = found.printable(), found.markdown()
 
     assert shown.rows[0][0].text == r"a\x1b[31m[red]|<b>\n\u202eb\udcff"
     assert shown.title == r"ta\x1b[31m[red]|<b>\n\u202eb\udcff"
-    assert shown.note == "one\ntwo\\x07"
-
-
-def test_names_are_no_markup_in_markdown() -> None:
-    written = table("<i>", ["name"], [[NASTY]], note="a < b").markdown()
-
-    assert written.startswith("**&lt;i&gt;**")
+    assert shown.note == "one\ntwo\\x07 < b"
+    assert written.startswith(r"**ta\x1b[31m[red]\|&lt;b&gt;")
     assert r"| a\x1b[31m[red]\|&lt;b&gt; \u202eb\udcff |" in written
-    assert "a &lt; b" in written
+    assert r"two\x07 &lt; b" in written

@@ -13,7 +13,6 @@ from tests.frames import record
 from tests.nets import net
 
 DEAD = """
-<ir_version: 9, opset_import: ["" : 17]>
 net (float[1,32,8,8] x, float[32,32,3,3] first, float[32] b, float[32,32,1,1] second)
     => (float[1,32,8,8] y) {
     c = Conv<kernel_shape=[3,3], pads=[1,1,1,1]>(x, first, b)

@@ -218,9 +218,16 @@ def test_the_wrong_choice_costs_and_into_the_car_ahead_it_is_not_safe(
     assert plan_losses(chosen, wanted, AREA)[loss] > least
 
 
-def test_harm_is_what_really_was_there(wanted: Labels) -> None:
+def test_harm_is_a_car_a_red_light_and_ground_that_is_no_road(wanted: Labels) -> None:
     harm = true_harm(candidates(wanted, away_m=-18.0), wanted, AREA)
     assert harm[0].tolist() == pytest.approx([0, 1], abs=0.1)
+    wanted.signals[:, 0] = torch.tensor([1.0, 10.0, 0.0])  # beyond its line
+    harm = true_harm(candidates(wanted, away_m=12.0), wanted, AREA)
+    assert harm[0].tolist() == pytest.approx([1, 0], abs=0.1)
+    wanted.signals[:, 0, 0] = 0.0
+    assert (true_harm(candidates(wanted), wanted, AREA) < 1).any()
+    wanted.raster[:] = 0
+    assert (true_harm(candidates(wanted), wanted, AREA) >= 1).all()
 
 
 def test_a_plan_into_the_car_ahead_is_no_example(wanted: Labels) -> None:
@@ -228,17 +235,6 @@ def test_a_plan_into_the_car_ahead_is_no_example(wanted: Labels) -> None:
     ahead = wanted.plan[0] + torch.tensor([18.0, 0.0])  # into the car 20 m ahead
     into = replace(wanted, plan=torch.stack([ahead, wanted.plan[1]]))
     assert doomed(into).tolist() == [True, False]
-
-
-def test_a_red_light_is_harm_beyond_its_line(wanted: Labels) -> None:
-    wanted.signals[:, 0] = torch.tensor([1.0, 10.0, 0.0])
-    harm = true_harm(candidates(wanted, away_m=12.0), wanted, AREA)
-    assert harm[0].tolist() == pytest.approx([1, 0], abs=0.1)
-
-
-def test_ground_that_is_no_road_is_harm(wanted: Labels) -> None:
-    wanted.raster[:] = 0
-    assert (true_harm(candidates(wanted), wanted, AREA) >= 1).all()
 
 
 def test_displacement_is_in_metres(wanted: Labels) -> None:

@@ -187,21 +187,15 @@ def changed(before: PlannerInput, after: PlannerInput) -> set[str]:
     return {n for n in names if not torch.equal(getattr(before, n), getattr(after, n))}
 
 
-def test_overlooked_agents_leave_occupancy_as_it_is(world: PlannerInput) -> None:
+def test_agents_or_occupancy_are_dropped_and_never_both(world: PlannerInput) -> None:
     found = told(world, 0.0, 0.5)
     assert changed(world, found) == {"score"}
     shown = found.score == world.score
     assert 0.3 < shown.float().mean() < 0.7
     assert not found.score[~shown].any()
-
-
-def test_without_occupancy_no_agent_is_overlooked(world: PlannerInput) -> None:
     found = told(world, 1.0, 1.0)
     assert changed(world, found) == {"occupancy"}
     assert torch.equal(found.occupancy, world.occupancy.mean(0).expand(4, -1, -1, -1))
-
-
-def test_where_nothing_is_dropped_the_planner_reads_all(world: PlannerInput) -> None:
     assert changed(world, told(world, 0.0, 0.0)) == set()
 
 

@@ -14,6 +14,7 @@ from me2e_compress import graph
 from me2e_compress.errors import GraphError
 from me2e_compress.graph import rewrite
 from me2e_compress.manager.attempt import check_valid
+from tests.nets import parsed
 
 X = np.array([[-2.0, 0.5, 3.0]], np.float32)
 
@@ -32,8 +33,7 @@ def models(draw: st.DrawFn) -> ir.Model:
     made = known[2:]
     outputs = draw(st.lists(st.sampled_from(made), min_size=1, unique=True))
     ports = ", ".join(f"float[1,3] {name}" for name in outputs)
-    return ir.from_onnx_text(
-        '<ir_version: 9, opset_import: ["" : 17]>\n'
+    return parsed(
         f"g (float[1,3] x) => ({ports})\n"
         "<float[1,3] w = {1.0, -1.0, 2.0}> {\n" + "\n".join(lines) + "\n}"
     )
@@ -94,7 +94,6 @@ def test_replace_value_refuses_what_would_change_the_interface(
 
 
 TWO_OUTPUTS = """
-<ir_version: 9, opset_import: ["" : 17]>
 g (float[2,3] x) => (float[1,3] y) {
     a, b = Split(x)
     y = Add(a, b)
@@ -103,7 +102,7 @@ g (float[2,3] x) => (float[1,3] y) {
 
 
 def test_a_node_whose_other_outputs_are_read_is_not_replaced() -> None:
-    model = ir.from_onnx_text(TWO_OUTPUTS)
+    model = parsed(TWO_OUTPUTS)
     before = graph.digest(model)
     split = model.graph[0]
 
@@ -114,7 +113,6 @@ def test_a_node_whose_other_outputs_are_read_is_not_replaced() -> None:
 
 
 CALLED_REPLACED = """
-<ir_version: 9, opset_import: ["" : 17]>
 g (float[1,3] x) => (float[1,3] y, float[1,3] y_replaced) {
     a = Neg(x)
     y = Identity(a)
@@ -124,7 +122,7 @@ g (float[1,3] x) => (float[1,3] y, float[1,3] y_replaced) {
 
 
 def test_the_value_that_was_an_output_takes_a_free_name() -> None:
-    model = ir.from_onnx_text(CALLED_REPLACED)
+    model = parsed(CALLED_REPLACED)
     neg, identity, _ = model.graph
     ports = graph.interface(model)
     onnx.checker.check_model(ir.to_proto(model))

@@ -101,15 +101,6 @@ def test_a_file_that_contradicts_itself_is_one_line(
     assert "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize("text", ["", "[]", "{}", '{"joules": NaN}', '{"joules": 1'])
-def test_what_is_no_energy_file_is_one_line(text: str, tmp_path: Path) -> None:
-    path = tmp_path / "energy.json"
-    path.write_text(text)
-
-    with pytest.raises(EnergyError, match="not an energy file"):
-        EnergyResult.load(path)
-
-
 BY = ("nvml-total", "a GPU", "board", 0.1)
 
 
@@ -155,13 +146,18 @@ def test_students_t(free: int) -> None:
     assert student_t(free) == pytest.approx(stats.t.ppf(0.975, free), abs=2e-3)
 
 
-def test_windows_of_whole_steps_are_as_sure_as_the_step_is() -> None:
-    mean, _, high = estimate(windows(*[100.0] * 5), step_s=0.1)
+@pytest.mark.parametrize(
+    ("length", "beyond"),
+    [(10.0, 0.002), (10.05, 0.05)],  # the step is unsure: 2 ms of 10 s
+)
+def test_windows_that_agree_are_as_sure_as_the_step_is(
+    length: float, beyond: float
+) -> None:
+    _, low, high = estimate(windows(*[10 * length] * 5, length=length), step_s=0.1)
 
-    # windows of 10 s: 2 ms of a step of 100 ms
-    ends = mean / 10.0 * math.sqrt(0.002 * 0.098)
-    half = student_t(3) * ends / math.sqrt(5)
-    assert high - mean == pytest.approx(half, rel=1e-6)
+    # power x sqrt(r (step - r)), a frame
+    ends = 10.0 / 10 * math.sqrt(beyond * (0.1 - beyond))
+    assert high - low == pytest.approx(2 * student_t(3) * ends / math.sqrt(5), rel=1e-6)
 
 
 def test_a_drift_in_a_line_is_no_noise() -> None:
@@ -179,14 +175,6 @@ def test_what_is_left_of_the_line_is_the_spread() -> None:
     left = drawn / 10 - line.intercept - line.slope * np.arange(6)
     half = stats.t.ppf(0.975, 4) * math.sqrt(left @ left / 4 / 6)
     assert high - low == pytest.approx(2 * half, rel=1e-3)
-
-
-def test_windows_that_agree_are_no_better_than_the_step() -> None:
-    _, low, high = estimate(windows(*[100.5] * 5, length=10.05), step_s=0.1)
-
-    one = 10.0 * 0.05 / 10  # power x sqrt(r (step - r)), a frame
-    half = student_t(3) * one / math.sqrt(5)
-    assert high - low == pytest.approx(2 * half)
 
 
 # Counters are found by asking them: they answer in joules, or say why not.
@@ -269,23 +257,25 @@ def test_a_counter_without_power_beside_it_and_power_without_a_counter(
     assert reader.state().clocks_mhz == {}
 
 
-def test_a_driver_that_answers_and_supports_nothing(
-    monkeypatch: pytest.MonkeyPatch,
+LOST = {"energy": UNSUPPORTED, "power": UNSUPPORTED}
+NOT_FOUND = -pynvml.NVML_ERROR_NOT_FOUND
+
+
+@pytest.mark.parametrize(
+    ("says", "why", "shut"),
+    [
+        (LOST, "no energy: total energy: Not Supported; instant power: Not Supp", 1),
+        ({"init": NOT_FOUND}, "Not Found", 0),
+        ({"gpu": NOT_FOUND}, "Not Found", 1),
+    ],
+)
+def test_a_driver_that_is_not_there_or_supports_nothing(
+    says: dict[str, int], why: str, shut: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    driver = Driver(monkeypatch, energy=UNSUPPORTED, power=UNSUPPORTED)
+    driver = Driver(monkeypatch, **says)
 
-    assert reason(Nvml().open()) == (
-        "A GPU tells no energy: total energy: Not Supported;"
-        " instant power: Not Supported"
-    )
-    assert driver.shut == 1
-
-
-@pytest.mark.parametrize("what", ["init", "gpu"])
-def test_no_driver_or_no_such_gpu(what: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    Driver(monkeypatch, **{what: -pynvml.NVML_ERROR_NOT_FOUND})
-
-    assert "Not Found" in reason(Nvml(1).open())
+    assert why in reason(Nvml(1).open())
+    assert driver.shut == shut
 
 
 def test_a_gpu_that_is_lost_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -107,20 +107,16 @@ def test_power_stands_beside_the_counter(factor: float, alerts: int) -> None:
     assert len(found.alerts()) == alerts
 
 
-def test_power_alone_that_is_read_too_seldom_is_an_error() -> None:
+def test_power_that_is_read_too_seldom_is_an_error_without_a_counter() -> None:
     world = World(tells_power=True)
-    world.counts = False
-
-    with pytest.raises(EnergyError, match="power was read 10 times"):
-        meter(world, seldom=10).measure({"m": world.model("m", 0.03, 300)})
-
-
-def test_power_that_is_read_too_seldom_spoils_no_counter() -> None:
-    world = World(tells_power=True)
-    found = meter(world, seldom=10).measure({"m": world.model("m", 0.03, 300)})["m"]
-
+    models = {"m": world.model("m", 0.03, 300)}
+    found = meter(world, seldom=10).measure(models)["m"]
     assert found.j_per_frame == pytest.approx(9.0, rel=0.03)
     assert found.power_j_per_frame is None
+
+    world.counts = False
+    with pytest.raises(EnergyError, match="power was read 10 times"):
+        meter(world, seldom=10).measure(models)
 
 
 @pytest.mark.parametrize("frame_s", [0.013, 0.05, 0.1])
@@ -317,27 +313,20 @@ def test_json_that_is_no_recording(text: str, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("watts", "schedule", "fault"),
+    ("table", "schedule", "fault"),
     [
-        (0.0, CUT, "stands still from 10 to 14 s"),
-        (None, EnergySchedule(), "3 windows of 10 s and 100 frames"),
+        (columns(watts=0.0), CUT, "stands still from 10 to 14 s"),
+        (columns(), EnergySchedule(), "3 windows of 10 s and 100 frames"),
+        ({**columns(), "frames": [0.0] * 701}, CUT, "no frame is done"),
     ],
 )
 def test_a_recording_that_cannot_be_measured(
-    watts: float | None, schedule: EnergySchedule, fault: str, tmp_path: Path
+    table: dict[str, list[float]], schedule: EnergySchedule, fault: str, tmp_path: Path
 ) -> None:
-    made = columns() if watts is None else columns(watts=watts)
-    recording = written(tmp_path / "r.csv", as_csv(made)).open()
+    recording = written(tmp_path / "r.csv", as_csv(table)).open()
 
     with pytest.raises(EnergyError, match=fault):
         recording.measured(schedule)
-
-
-def test_a_recording_without_frames(tmp_path: Path) -> None:
-    table = {**columns(), "frames": [0.0] * 701}
-
-    with pytest.raises(EnergyError, match="no frame is done"):
-        written(tmp_path / "r.csv", as_csv(table)).open().measured(CUT)
 
 
 @given(content=st.binary(max_size=60), ending=st.sampled_from(["csv", "json"]))

@@ -1,14 +1,16 @@
 """Draw single nodes with all their attributes, and run them."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-import onnx
 import onnx_ir as ir
-import onnxruntime as ort
-from onnx import TensorProto, helper, numpy_helper
+from onnx_ir import convenience
 
+from me2e_compress.graph import rewrite
+from me2e_compress.runtime.session import Session
+from tests.nets import parsed
 from tests.targets.onnxruntime.lowered import Floats
 
 Draw = Callable[[np.random.Generator], tuple[dict[str, object], list[object]]]
@@ -82,66 +84,59 @@ AVERAGED: Mapping[str, Draw] = {
 }
 
 
-def one_node(op: str, rng: np.random.Generator) -> onnx.ModelProto:
+def of_node(
+    op: str,
+    attributes: Mapping[str, Any],
+    others: Sequence[object] = (),
+    shape: tuple[int, ...] = SHAPE,
+) -> ir.Model:
+    """Return ``y = op(x, ...)``, other inputs constants or left out (None)."""
+    head = '<ir_version: 9, opset_import: ["" : 19]>'
+    made = parsed(f"{head} one (float{list(shape)} x) => (float[] y) {{ y = {op}(x) }}")
+    node = made.graph[0]
+    node.resize_inputs(1 + len(others))
+    for at, each in enumerate(others, 1):
+        if each is not None:
+            constant = rewrite.add_constant(made.graph, np.asarray(each), f"i{at}")
+            node.replace_input_with(at, constant)
+    for attribute in convenience.convert_attributes(attributes):
+        node.attributes.add(attribute)
+    return made
+
+
+def one_node(
+    op: str, rng: np.random.Generator, shape: tuple[int, ...] = SHAPE
+) -> ir.Model:
     """Draw ``y = op(x, ...)``."""
-    attributes, others = {**MOVED, **AVERAGED}[op](rng)
-    arrays = {f"i{at}": each for at, each in enumerate(others) if each is not None}
-    names = ["" if each is None else f"i{at}" for at, each in enumerate(others)]
-    node = helper.make_node(op, ["x", *names], ["y"])
-    node.attribute.extend(helper.make_attribute(*each) for each in attributes.items())
-    return helper.make_model(
-        helper.make_graph(
-            [node],
-            "one",
-            [helper.make_tensor_value_info("x", TensorProto.FLOAT, SHAPE)],
-            [helper.make_tensor_value_info("y", TensorProto.FLOAT, None)],
-            [numpy_helper.from_array(np.asarray(a), n) for n, a in arrays.items()],
-        ),
-        opset_imports=[helper.make_opsetid("", 19)],
-        ir_version=9,
-    )
+    return of_node(op, *{**MOVED, **AVERAGED}[op](rng), shape)
 
 
 def paired(
-    model: onnx.ModelProto, before: tuple[float, int], behind: tuple[float, int]
-) -> onnx.ModelProto:
+    model: ir.Model, before: tuple[float, int], behind: tuple[float, int]
+) -> ir.Model:
     """Put pairs before and behind the node, on grids of (scale, zero point)."""
-    (node,), copy = model.graph.node, onnx.ModelProto()
-    copy.CopyFrom(model)
-    for name, (scale, zero) in (("x", before), ("y", behind)):
-        constants = (np.float32(scale), f"{name}_s"), (np.uint8(zero), f"{name}_z")
-        copy.graph.initializer.extend(
-            numpy_helper.from_array(np.asarray(each), label)
-            for each, label in constants
-        )
-    middle = onnx.NodeProto()
-    middle.CopyFrom(node)
-    middle.input[0], middle.output[0] = "x_d", "m"
-    grids = ["x_s", "x_z"], ["y_s", "y_z"]
-    nodes = [
-        helper.make_node("QuantizeLinear", ["x", *grids[0]], ["x_q"]),
-        helper.make_node("DequantizeLinear", ["x_q", *grids[0]], ["x_d"]),
-        middle,
-        helper.make_node("QuantizeLinear", ["m", *grids[1]], ["y_q"]),
-        helper.make_node("DequantizeLinear", ["y_q", *grids[1]], ["y"]),
-    ]
-    del copy.graph.node[:]
-    copy.graph.node.extend(nodes)
+    copy = ir.from_proto(ir.to_proto(model))
+    node = copy.graph[0]
+
+    def pair(value: ir.Value | None, scale: float, zero: int) -> list[ir.Node]:
+        constants = np.asarray(np.float32(scale)), np.asarray(np.uint8(zero))
+        grid = [rewrite.add_constant(copy.graph, each, "grid") for each in constants]
+        first = ir.node("QuantizeLinear", [value, *grid])
+        return [first, ir.node("DequantizeLinear", [first.outputs[0], *grid])]
+
+    fed, answered = pair(node.inputs[0], *before), pair(node.outputs[0], *behind)
+    copy.graph.insert_before(node, fed)
+    node.replace_input_with(0, fed[1].outputs[0])
+    copy.graph.insert_after(node, answered)
+    copy.graph.outputs[0] = answered[1].outputs[0]
+    copy.graph.outputs[0].type = ir.TensorType(ir.DataType.FLOAT)
     return copy
 
 
-def answer(model: onnx.ModelProto, x: Floats, *, optimize: bool = False) -> Floats:
-    options = ort.SessionOptions()
-    options.log_severity_level = 4
-    options.intra_op_num_threads = 1
-    levels = ort.GraphOptimizationLevel
-    options.graph_optimization_level = (
-        levels.ORT_ENABLE_ALL if optimize else levels.ORT_DISABLE_ALL
-    )
-    session = ort.InferenceSession(
-        model.SerializeToString(), options, providers=["CPUExecutionProvider"]
-    )
-    (found,) = session.run(None, {"x": x})
+def answer(model: ir.Model, x: Floats, *, optimize: bool = False) -> Floats:
+    """Run in onnxruntime's own int8, if at all in int8."""
+    session = Session(model, threads=1, optimize=optimize, stock=True)
+    (found,) = session.run({"x": x}).values()
     return np.asarray(found, np.float32)
 
 
@@ -149,7 +144,3 @@ def on_grid(array: npt.NDArray[np.floating], scale: float, zero: int) -> Floats:
     """Round to a uint8 grid, in float64."""
     steps = np.rint(array.astype(np.float64) / np.float32(scale)) + zero
     return np.asarray((np.clip(steps, 0, 255) - zero) * np.float32(scale), np.float32)
-
-
-def node_of(model: onnx.ModelProto) -> ir.Node:
-    return next(iter(ir.from_proto(model).graph))

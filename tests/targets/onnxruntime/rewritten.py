@@ -4,11 +4,10 @@ import dataclasses
 from typing import Any
 
 import numpy as np
-import onnx
 import onnx_ir as ir
-from onnx import TensorProto, helper, numpy_helper
 
 from me2e_compress import graph
+from tests.nets import parsed, stored
 
 SIZE = 8
 """Channels and columns."""
@@ -65,39 +64,29 @@ class Drawn:
         zero = np.array(128 if self.kind == "uint8" else 0, self.kind)
         constants: dict[str, Any] = {"s": np.float32(STEP), "z": zero}
         constants["t"] = np.float32(0.06)
-        zeros = [] if self.without_zero == "input" else ["z"]
-        nodes = [
-            helper.make_node("QuantizeLinear", ["x", "s", "z"], ["xq"]),
-            helper.make_node("DequantizeLinear", ["xq", "s", *zeros], ["xd"]),
+        written = "" if self.without_zero == "input" else ", z"
+        last = "r" if self.behind else "c"
+        lines = [
+            "xq = QuantizeLinear(x, s, z)",
+            f"xd = DequantizeLinear(xq, s{written})",
             *self._operands(constants),
             *self._layer(),
-        ]
-        last = "c"
-        if self.behind:
-            nodes.append(helper.make_node(self.behind, ["c"], ["r"]))
-            last = "r"
-        if self.answered:
-            nodes.append(helper.make_node("QuantizeLinear", [last, "t", "z"], ["a"]))
-            nodes.append(helper.make_node("DequantizeLinear", ["a", "t", "z"], ["y"]))
-        else:
-            nodes.append(helper.make_node("Tanh", [last], ["y"]))
-        ports = [
-            helper.make_tensor_value_info(name, TensorProto.FLOAT, shape)
-            for name, shape in (("x", self.shape), ("y", None))
-        ]
-        stored = [
-            numpy_helper.from_array(np.asarray(a), n) for n, a in constants.items()
-        ]
-        made = helper.make_graph(nodes, "m", ports[:1], ports[1:], stored)
-        opset = [helper.make_opsetid("", self.opset)]
-        proto: onnx.ModelProto = helper.make_model(
-            made, opset_imports=opset, ir_version=9
-        )
-        model = ir.from_proto(proto)
+            *([f"r = {self.behind}(c)"] if self.behind else []),
+            *([f"a = QuantizeLinear({last}, t, z)", "y = DequantizeLinear(a, t, z)"]
+              if self.answered else [f"y = Tanh({last})"]),
+        ]  # fmt: skip
+        arrays = {name: np.asarray(each) for name, each in constants.items()}
+        ports = [f"float{list(self.shape)} x"]
+        for name, each in arrays.items():
+            kind = ir.DataType.from_numpy(each.dtype).name.lower()
+            ports.append(f"{kind}{list(each.shape) or ''} {name}")
+        head = f'<ir_version: 9, opset_import: ["" : {self.opset}]> m'
+        inputs, body = ", ".join(ports), "\n".join(lines)
+        model = stored(parsed(f"{head} ({inputs}) => (float[] y) {{ {body} }}"), arrays)
         graph.infer_shapes(model)
         return model
 
-    def _operands(self, constants: dict[str, Any]) -> list[onnx.NodeProto]:
+    def _operands(self, constants: dict[str, Any]) -> list[str]:
         """Store weight and bias, and return the nodes that give them."""
         random = np.random.default_rng(self.seed)
         size = (SIZE, SIZE, 3, 3) if self.op.startswith("Conv") else (SIZE, SIZE)
@@ -109,42 +98,32 @@ class Drawn:
             scales = scales if by_channel else scales[3]
         scales = scales.astype(np.float32)
         bias = random.uniform(1, 3, self.bias_shape)
-        along: dict[str, Any] = {"axis": axis} if by_channel else {}
         # small integers of 7 bits do not overflow 16 on any processor
         integers = random.integers(-63, 64, size).astype(np.int8)
-        constants |= {"w": integers, "ws": scales, "wz": np.zeros(scales.shape, "i1")}
-        stored = ["w", "ws"] if self.without_zero == "weight" else ["w", "ws", "wz"]
-        nodes = [helper.make_node("DequantizeLinear", stored, ["wd"], **along)]
         if self.weight == "float":
             constants["w"] = random.normal(0, 0.2, size).astype(np.float32)
-            nodes = [helper.make_node("Identity", ["w"], ["wd"])]
+            lines = ["wd = Identity(w)"]
+        else:
+            zeros = np.zeros(scales.shape, np.int8)
+            constants |= {"w": integers, "ws": scales, "wz": zeros}
+            along = f"<axis={axis}>" if by_channel else ""
+            written = "" if self.without_zero == "weight" else ", wz"
+            lines = [f"wd = DequantizeLinear{along}(w, ws{written})"]
         if self.bias in ("own", "right"):
             own = self.bias == "own"
             units = np.asarray(0.001 if own else STEP * scales, np.float32)
             constants |= {"b": np.rint(bias / units).astype(np.int32), "bs": units}
-            along = {"axis": 0} if np.ndim(units) else {}
-            nodes += [
-                helper.make_node("DequantizeLinear", ["b", "bs"], ["bd"], **along)
-            ]
+            along = "<axis=0>" if np.ndim(units) else ""
+            lines.append(f"bd = DequantizeLinear{along}(b, bs)")
         elif self.bias != "none":
-            wide = np.float64 if self.constant == "Cast" else np.float32
-            constants["b"] = bias.astype(wide)
-            to: dict[str, Any] = (
-                {"to": TensorProto.FLOAT} if self.constant == "Cast" else {}
-            )
-            given = self.constant or "Identity"
-            nodes += [helper.make_node(given, ["b"], ["bd"], **to)]
-        return nodes
+            cast = self.constant == "Cast"
+            constants["b"] = bias.astype(np.float64 if cast else np.float32)
+            lines.append(f"bd = {'Cast<to=1>' if cast else 'Identity'}(b)")
+        return lines
 
-    def _layer(self) -> list[onnx.NodeProto]:
-        third = [] if self.bias == "none" else ["bd"]
-        inputs = ["xd", "wd", *third]
+    def _layer(self) -> list[str]:
         if self.op == "Add":
-            return [
-                helper.make_node("MatMul", inputs[:2], ["p"], name="layer"),
-                helper.make_node("Add", ["p", "bd"], ["c"]),
-            ]
-        options: dict[str, Any] = {}
-        if self.op == "Gemm":
-            options = {"transB": int(self.transposed)}
-        return [helper.make_node(self.op, inputs, ["c"], name="layer", **options)]
+            return ['["layer"] p = MatMul(xd, wd)', "c = Add(p, bd)"]
+        turned = f"<transB={int(self.transposed)}>" if self.op == "Gemm" else ""
+        third = "" if self.bias == "none" else ", bd"
+        return [f'["layer"] c = {self.op}{turned}(xd, wd{third})']

@@ -8,7 +8,7 @@ from me2e_compress.errors import PreconditionError
 from me2e_compress.quantization.plan import make_plan
 from me2e_compress.targets.onnxruntime import convert, unranged
 from me2e_compress.targets.tensorrt import TensorRT
-from tests.nets import FULL, PAPER, conv_attention, drawn
+from tests.nets import FULL, PAPER, conv_attention, drawn, parsed
 from tests.targets.onnxruntime.lowered import (
     IMAGE,
     TOKENS,
@@ -71,7 +71,7 @@ def test_only_what_convolutions_answer_is_left_to_calibrate() -> None:
 
 
 def test_weights_behind_a_pair_become_stored_integers() -> None:
-    source = ir.from_onnx_text(PAIRED)
+    source = parsed(PAIRED)
     small = convert(source)
 
     stored = [
@@ -121,7 +121,7 @@ def test_an_output_behind_a_pair_stays_an_output() -> None:
     y = DequantizeLinear(yq, s, z)""",
     )
     x = np.random.default_rng(0).uniform(-0.3, 0.3, (4, 6)).astype(np.float32)
-    source = ir.from_onnx_text(text)
+    source = parsed(text)
 
     result = convert(source)
 
@@ -141,7 +141,7 @@ def test_a_bias_stored_as_integers_is_read() -> None:
     )
     x = np.zeros((4, 6), np.float32)
 
-    got = ran(convert(ir.from_onnx_text(text)), {"x": x})["y"]
+    got = ran(convert(parsed(text)), {"x": x})["y"]
 
     np.testing.assert_allclose(got, [[1.0, -2.0, 0.0]] * 4, atol=1e-6)
 
@@ -178,7 +178,7 @@ def test_other_grids_are_refused(changes: list[tuple[str, str]], message: str) -
         text = text.replace(old, new)
 
     with pytest.raises(PreconditionError, match=message):
-        convert(ir.from_onnx_text(text))
+        convert(parsed(text))
 
 
 def test_a_float_graph_is_refused() -> None:
@@ -187,7 +187,6 @@ def test_a_float_graph_is_refused() -> None:
 
 
 BATCHED = """
-<ir_version: 9, opset_import: ["" : 17]>
 batched (float[3,4,32] x, float[%s] w) => (float[3,4,16] y) { y = MatMul(x, w) }
 """
 
@@ -215,7 +214,7 @@ def test_a_matrix_with_scales_along_its_rows_stays_float() -> None:
         .replace(*SIX[1])
         .replace(*SIX[2])
     )
-    source = ir.from_onnx_text(text)
+    source = parsed(text)
     x = np.random.default_rng(0).uniform(-0.3, 0.3, (1, 4, 6)).astype(np.float32)
 
     result = convert(source)

@@ -1,12 +1,10 @@
 """What keeps a grid, what has its own, and what is never negative: by numbers."""
 
 import numpy as np
-import onnx
 import onnx_ir as ir
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from onnx import helper
 
 from me2e_compress.targets.onnxruntime.region import (
     MOVES,
@@ -21,7 +19,7 @@ from tests.targets.onnxruntime.draws import (
     MOVED,
     SHAPE,
     answer,
-    node_of,
+    of_node,
     on_grid,
     one_node,
     paired,
@@ -31,14 +29,11 @@ from tests.targets.onnxruntime.lowered import Floats
 SEEDS = st.integers(0, 2**32 - 1)
 
 
-def drawn(op: str, seed: int) -> tuple[onnx.ModelProto, Floats]:
+def drawn(op: str, seed: int) -> tuple[ir.Model, Floats]:
     rng = np.random.default_rng(seed)
     shape = (2, 4, 1, 8) if op == "Squeeze" else SHAPE
     x = (rng.standard_normal(shape) * rng.uniform(0.1, 9)).astype(np.float32)
-    model = one_node(op, rng)
-    for at, size in enumerate(shape):
-        model.graph.input[0].type.tensor_type.shape.dim[at].dim_value = size
-    return model, x
+    return one_node(op, rng, shape), x
 
 
 def test_every_operator_that_moves_is_drawn() -> None:
@@ -51,7 +46,7 @@ def test_what_moves_gives_the_same_integers_before_and_behind(
     op: str, seed: int, zero: int
 ) -> None:
     model, x = drawn(op, seed)
-    if not is_move(node_of(model)):
+    if not is_move(model.graph[0]):
         return
     grid = float(np.abs(x).max()) / (255 - zero), zero
 
@@ -70,20 +65,18 @@ def test_what_moves_gives_the_same_integers_before_and_behind(
 def test_an_average_has_a_range_of_its_own(seed: int) -> None:
     rng = np.random.default_rng(seed)
     x = np.maximum(rng.standard_normal((1, 4, 32, 32)) - 2, 0).astype(np.float32)
-    model = one_node("GlobalAveragePool", rng)
-    for at, size in enumerate(x.shape):
-        model.graph.input[0].type.tensor_type.shape.dim[at].dim_value = size
+    model = one_node("GlobalAveragePool", rng, x.shape)
     mean = answer(model, x)
 
     # sparse features: the average would get 10 of 255 steps
-    assert not is_move(node_of(model))
+    assert not is_move(model.graph[0])
     assert 10 * mean.max() < x.max()
 
 
 @given(st.sampled_from(sorted(AVERAGED)), SEEDS, st.sampled_from([0, 128]))
 def test_int8_averages_are_those_of_the_nodes(op: str, seed: int, zero: int) -> None:
     model, x = drawn(op, seed)
-    if not has_average_kernel(node_of(model)):
+    if not has_average_kernel(model.graph[0]):
         return
     x = np.abs(x) if zero == 0 else x
     mean = answer(model, x)
@@ -122,14 +115,12 @@ UNARY = (
 def test_what_counts_as_never_negative_is_not(op: str, seed: int) -> None:
     rng = np.random.default_rng(seed)
     x = (rng.standard_normal(SHAPE) * rng.uniform(0.1, 9)).astype(np.float32)
-    more, alpha = (["x"] if op == "PRelu" else []), float(rng.uniform(-1, 1))
-    model = one_node("GlobalAveragePool", rng)
-    node = model.graph.node[0]
-    node.CopyFrom(helper.make_node(op, ["x", *more], ["y"]))
-    for name in ("alpha", "beta") if op == "HardSigmoid" else ():
-        node.attribute.append(helper.make_attribute(name, alpha))
+    alpha = float(rng.uniform(-1, 1))
+    slopes = [np.full(8, alpha, np.float32)] if op == "PRelu" else []
+    names = ("alpha", "beta") if op == "HardSigmoid" else ()
+    model = of_node(op, dict.fromkeys(names, alpha), slopes)
 
-    if never_negative(node_of(model).outputs[0]):
+    if never_negative(model.graph[0].outputs[0]):
         assert not (answer(model, x) < 0).any()
 
 
@@ -138,11 +129,12 @@ def test_what_counts_as_never_negative_is_not(op: str, seed: int) -> None:
 def test_what_hands_on_that_nothing_is_negative_does(op: str, seed: int) -> None:
     model, x = drawn(op, seed)
     relu = ir.node("Relu", [ir.Value(name="r")])
-    node = node_of(model)
+    answers = answer(model, np.maximum(x, 0))
+    node = model.graph[0]
     node.replace_input_with(0, relu.outputs[0])
 
     if never_negative(node.outputs[0]):
-        assert not (answer(model, np.maximum(x, 0)) < 0).any()
+        assert not (answers < 0).any()
     else:  # it interpolates, or brings a value of its own
         assert op == "Resize"
 
