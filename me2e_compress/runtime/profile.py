@@ -123,18 +123,21 @@ def record_traces(
     warm_up: int = WARM_UP,
     threads: int = 1,
     provider: Provider = CPU,
+    said: Mapping[str, Mapping[str, str]] | None = None,
     on_sample: Callable[[int, int, str], None] = lambda done, total, name: None,
 ) -> dict[str, LatencyTrace]:
     """Record the latency of models, each warm, in alternating blocks.
 
     Recurrent state is fed forward and reset where scenes begin; the recording is
-    repeated as often as needed. ``models`` has ONNX files;
+    repeated as often as needed. ``models`` has ONNX files, ``said`` metadata of them;
     ``samples`` and ``warm_up`` count for each model; ``on_sample`` is called with
     samples done, all samples and the model's name.
     """
     check_work(samples, warm_up, frames)
     sessions = {
-        name: TimedSession(path, threads=threads, provider=provider)
+        name: TimedSession(
+            path, threads=threads, provider=provider, said=(said or {}).get(name)
+        )
         for name, path in models.items()
     }
     # Every model replays the recording endlessly, and warms up.

@@ -136,6 +136,8 @@ class Variant:
         if isinstance(driver, OnnxDriver):
             object.__setattr__(self, "policy", str(driver.path))
             object.__setattr__(self, "adapter", self.adapter or driver.adapter)
+            modules = self.module_map or driver.module_map
+            object.__setattr__(self, "module_map", modules)
             stage = self.host_stage or str(driver.host_stage or "")
             object.__setattr__(self, "host_stage", stage)
         elif driver is not None and any(

@@ -149,6 +149,7 @@ def _measured(
     traces = record_traces(
         {each.variant.name: each.model for each in timed if each.model is not None},
         frames,
+        said={each.variant.name: each.said for each in timed},
         samples=study.timing.samples,
         threads=study.timing.threads,
         provider=study.provider,
@@ -301,8 +302,11 @@ def judge(
     recording = CalibrationSet(study.held_out)
     stage = f"fidelity of {prepared.variant.name}"
     left, right = (
-        Session(path, provider=study.provider)
-        for path in (baseline.model, prepared.model)
+        Session(path, provider=study.provider, said=said)
+        for path, said in (
+            (baseline.model, baseline.said),
+            (prepared.model, prepared.said),
+        )
     )
 
     def reported() -> Iterator[Frame]:

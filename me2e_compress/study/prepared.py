@@ -1,13 +1,16 @@
 """The file that drives: given, or made by passes once and kept."""
 
 import hashlib
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from google.protobuf.message import DecodeError
 
 from me2e_compress import graph
 from me2e_compress.calibration.dataset import CalibrationSet
+from me2e_compress.driving.adapter import Adapter
+from me2e_compress.driving.adapter.outputs import adapted
 from me2e_compress.driving.host_stage import HOST_STAGES
 from me2e_compress.driving.policies import Driver, driver_named
 from me2e_compress.errors import GraphError, Me2eError, StudyError
@@ -38,6 +41,7 @@ class PreparedVariant:
         failure: Why there is no model that can drive; empty if there is one.
         weights: Origin of the weights in a line, such as a checkpoint; empty if
             unknown.
+        said: What adapter and map state of plan and state, as metadata.
     """
 
     variant: Variant
@@ -49,6 +53,7 @@ class PreparedVariant:
     size_bytes: int | None = None
     failure: str = ""
     weights: str = ""
+    said: Mapping[str, str] = field(default_factory=dict)
 
 
 def prepare_all(
@@ -73,7 +78,7 @@ def prepare_variant(
 ) -> PreparedVariant:
     """Find or make a variant's driver, and open it once."""
     # drivers without a file need no preparation
-    driver = driver_named(variant.policy, variant.adapter)
+    driver = driver_named(variant.policy, variant.adapter, variant.module_map)
     if not isinstance(driver, OnnxDriver):
         study.driven_by.check_policy(driver)
         return PreparedVariant(variant, driver)
@@ -95,11 +100,12 @@ def prepare_variant(
         origin = _reported_beside(model) or origin
     loaded = graph.load(model)
     weights = named_weights(loaded.metadata_props)
+    said = adapted(loaded, variant.adapter, variant.module_map)
     if slow := slow_here(loaded, study.provider):
         listener.on_warning(f"variant {variant.name}: {slow}")
     size = graph.file_bytes(model)
     return PreparedVariant(
-        variant, driver, model, *origin, sha256, size, weights=weights
+        variant, driver, model, *origin, sha256, size, weights=weights, said=said
     )
 
 
@@ -137,6 +143,7 @@ def _compressed(
     options = CompressOptions(
         force=True,  # what is in the workspace is its own affair
         module_map=variant.module_map,
+        adapter=variant.adapter,
         provider=study.provider,
         measure_frames=0,
         allow_empty=True,
@@ -167,6 +174,7 @@ def _key(
         str(study.seed),
         # as before there was a choice, so that what was made then is still found
         *(() if study.provider == CPU else (PROVIDERS.text(study.provider),)),
+        *(() if variant.adapter is None else (Adapter.digest(variant.adapter),)),
         *contents,
     )
     return hashlib.sha256("\n".join(decisive).encode()).hexdigest()

@@ -102,9 +102,11 @@ def prepare_study(
         ):
             if not (place / "scenes.json").is_file():
                 folder.mkdir(parents=True, exist_ok=True)
-                options = FramesOptions(count=count, seed=seed, provider=study.provider)
-                policy = Path(study.reference.policy)
-                record_frames(policy, place, options, listener)
+                by, provider = study.reference, study.provider
+                options = FramesOptions(
+                    count=count, seed=seed, adapter=by.adapter, provider=provider
+                )
+                record_frames(Path(by.policy), place, options, listener)
         study = replace(study, frames=frames, held_out=held_out, to_record=None)
     prepared = prepare_all(study, workspace, listener)
     clock = time_all(study, prepared, workspace, listener)

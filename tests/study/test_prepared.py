@@ -80,7 +80,7 @@ def test_the_checkpoint_of_a_model_is_kept(study: Study, tmp_path: Path) -> None
     assert made(plain, tmp_path).weights == "weights: a.pth, sha256 ab"
 
 
-@pytest.mark.parametrize("change", ["frames", "source", "passes", "seed"])
+@pytest.mark.parametrize("change", ["frames", "source", "passes", "seed", "adapter"])
 def test_what_decides_the_model_decides_its_name(
     study: Study, tmp_path: Path, change: str
 ) -> None:
@@ -90,6 +90,10 @@ def test_what_decides_the_model_decides_its_name(
         study = dataclasses.replace(study, frames=tmp_path / "others")
     elif change == "seed":
         study = dataclasses.replace(study, seed=1)
+    elif change == "adapter":
+        (tmp_path / "a.toml").write_text("")
+        variant = dataclasses.replace(variant, adapter=tmp_path / "a.toml")
+        study = dataclasses.replace(study, variants=(variant,))
     elif change == "source":
         write_model(tmp_path / "m.onnx", seed=1)
     else:

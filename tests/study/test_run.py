@@ -13,6 +13,7 @@ import pytest
 
 from me2e_compress.errors import EvaluationError, StudyError
 from me2e_compress.evaluators.results import ResultsFolder
+from me2e_compress.manager import recipe
 from me2e_compress.metrics.route_summary import RouteSummary
 from me2e_compress.metrics.scores import score
 from me2e_compress.study import (
@@ -28,6 +29,7 @@ from me2e_compress.study import (
 from me2e_compress.study.definition import FramesToRecord
 from me2e_compress.study.drive_record import DriveRecord, changes, held_against
 from me2e_compress.study.study_result import change_tables
+from tests.evaluators.highway.drivers import straight_on
 from tests.study.conftest import BLIND, IDEAL, ROUTES, SLOW, Here, Make
 
 STUDY = """
@@ -232,9 +234,11 @@ def test_who_listens_hears_every_stage(make: Make, tmp_path: Path) -> None:
 
 
 def test_frames_of_its_own_are_of_other_routes_each(make: Make, tmp_path: Path) -> None:
-    slow = make().variants[1]
+    body, outputs = "way = Identity (ahead)", "float[1, 6, 2] way"
+    model = straight_on(tmp_path / "m.onnx", body=body, outputs=outputs)
+    (tmp_path / "a.toml").write_text('[plan]\noutput = "way"')
     asked = make(
-        variants=(slow,),
+        variants=(Variant("slow", str(model), adapter=tmp_path / "a.toml"),),
         conditions=(IDEAL,),
         routes=ROUTES[:1],
         held_out=None,
@@ -248,6 +252,57 @@ def test_frames_of_its_own_are_of_other_routes_each(make: Make, tmp_path: Path) 
         for name in ("frames", "frames-held-out")
     ]
     assert [each["seed"] for each in about] == [4, 5]
+
+
+STATED = """
+[modules.all]
+role = "feature"
+optional = ["**"]
+
+[recurrent]
+before = "kept"
+
+[plan]
+output = "way"
+"""
+
+
+@pytest.mark.parametrize("by", ["map", "adapter", "policy"])
+def test_state_and_plan_are_those_of_the_variant(
+    make: Make, models: Path, tmp_path: Path, by: str
+) -> None:
+    model = straight_on(
+        tmp_path / "m.onnx",
+        inputs="int64[1] command, float[1, 2] before",
+        body="kept = Identity (before) way = Add (ahead, kept)",
+        outputs="float[1, 6, 2] way, float[1, 2] kept",
+    )
+    file = tmp_path / "stated.toml"
+    file.write_text(STATED[STATED.index("[rec") :] if by == "adapter" else STATED)
+    given = Variant("given", str(model))
+    if by == "map":
+        given = replace(given, module_map=str(file))
+    elif by == "adapter":
+        given = replace(given, adapter=file)
+    else:
+        given = Variant("given", f"onnx{{path={model}, module_map={file}}}")
+    asked = make(
+        variants=(
+            given,
+            replace(given, name="small", passes=recipe.parse("eliminate-redundant")),
+        ),
+        conditions=(IDEAL,),
+        routes=ROUTES[:1],
+        baseline="given",
+        frames=models / "frames",
+        timing=Timing(2),
+    )
+
+    found = run_study(asked, tmp_path / "study", Here())
+
+    assert all(each.latency_ms[50].value for each in found.variants)
+    assert found.variants[1].fidelity.mean_m.value == 0.0
+    assert [len(each.routes) for each in found.drives] == [1, 1]
 
 
 # Records of finished drives: what they keep, and which are not taken.
