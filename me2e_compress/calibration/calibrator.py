@@ -15,14 +15,20 @@ import onnx_ir.passes.common as common
 
 from me2e_compress import graph
 from me2e_compress.calibration.dataset import CalibrationSet, archive_of, load_arrays
+from me2e_compress.calibration.not_finite import (
+    are_bad,
+    check_finite,
+    first_maker,
+    places_of,
+)
 from me2e_compress.calibration.observers import DEFAULT_METHOD, OBSERVERS
 from me2e_compress.calibration.ranges import Ranges
 from me2e_compress.calibration.statistics import (
     BINS,
+    NOT_FINITE,
     Floats,
     Statistics,
     checksum,
-    no_element,
 )
 from me2e_compress.errors import FramesError, GraphError
 from me2e_compress.graph.nodes import makers_of, reads_of
@@ -309,6 +315,8 @@ class _Job:
         }
         self.checkpoint = CalibrationCheckpoint(settings.checkpoint, key)
         self.begun = self.checkpoint.read()
+        known = set(blank.tensors)
+        self.places = [name for name in places_of(model) if name not in known]
         # Continue from the checkpoint, if there is one.
         measured = self.begun.results.get("measured", blank.measured)
         counts = self.begun.results.get("counts")
@@ -319,18 +327,28 @@ class _Job:
             measured=np.asarray(measured, np.float32),
             checksums=np.asarray(checksums, np.int64),
             counts=None if counts is None else np.array(counts, np.int64),
+            not_finite=str(self.begun.results.get("not_finite", "")),
         )
 
     def extremes(self) -> None:
         """Measure minimum, maximum and mean square of every tensor and frame."""
         rows, sums = list(self.seen.measured), self.seen.checksums.tolist()
         ports = (*self.seen.inputs, *self.seen.outputs)
-        for readings, held, place in self._pass(Extremes(), 0):
-            check_finite(readings, self.seen.tensors, place)
-            rows.append(readings)
+        for readings, held, place in self._pass(Extremes(), 0, self.places):
             sums.append([checksum(held[name]) for name in ports])
+            cause = self.seen.not_finite
+            if not cause and (are_bad(readings).any() or NOT_FINITE in sums[-1]):
+                seen = {*self.seen.tensors, *self.places, *self.seen.outputs}
+                provider = self.settings.provider
+                cause = first_maker(self.model, held, seen, Extremes(), provider)
+            watched = readings[: len(self.seen.tensors)]
+            check_finite(watched, self.seen.tensors, place, cause)
+            rows.append(watched)
             self.seen = dataclasses.replace(
-                self.seen, measured=np.stack(rows), checksums=np.array(sums, np.int64)
+                self.seen,
+                measured=np.stack(rows),
+                checksums=np.array(sums, np.int64),
+                not_finite=cause,
             )
 
     def counts(self) -> None:
@@ -343,12 +361,12 @@ class _Job:
             np.add(total, readings.astype(np.int64), out=total)
 
     def _pass(
-        self, probe: Probe, before: int
+        self, probe: Probe, before: int, beside: Sequence[str] = ()
     ) -> Iterator[tuple[Floats, Mapping[str, Array], int]]:
         """Run the rest of a pass; ``before`` frames belong to earlier passes.
 
-        Yields the readings of each frame [tensors, width of the probe], its inputs and
-        outputs, and its index.
+        Yields the readings of each frame [tensors, width of the probe], then those of
+        tensors ``beside``, its inputs and outputs, and its index.
         """
         # Skip what an interrupted run has done.
         begin = max(self.begun.done - before, 0)
@@ -356,7 +374,7 @@ class _Job:
             return
         session = probed_session(
             self.model,
-            self.seen.tensors,
+            (*self.seen.tensors, *beside),
             probe,
             threads=self.settings.threads,
             optimize=self.settings.optimize,
@@ -376,6 +394,7 @@ class _Job:
                 results: dict[str, Array] = {
                     "measured": self.seen.measured,
                     "checksums": self.seen.checksums,
+                    "not_finite": np.array(self.seen.not_finite),
                 }
                 if self.seen.counts is not None:
                     results["counts"] = self.seen.counts
@@ -394,22 +413,6 @@ def _ports(values: Iterable[ir.Value]) -> tuple[str, ...]:
         and each.type.dtype.numpy() in DTYPES.values()
     ]
     return tuple(str(each.name) for each in numbers)
-
-
-def check_finite(readings: Floats, tensors: Sequence[str], place: int) -> None:
-    """Raise a FramesError for a NaN or infinite element; mean squares may overflow."""
-    bad = np.isnan(readings).any(1) | np.isinf(readings[:, :2]).any(1)
-    bad &= ~no_element(readings)
-    if not bad.any():
-        return
-    # Name the first tensor, and how many more there are.
-    names = [tensors[at] for at in np.flatnonzero(bad).tolist()]
-    kind = "NaN" if np.isnan(readings[bad][0]).any() else "infinite"
-    more = f" ({', '.join(names[1:5])}{', ...' if len(names) > 5 else ''})"
-    raise FramesError(
-        f"frame {place} makes tensor {names[0]} {kind}, and {len(names) - 1} more of"
-        f" {len(tensors)}{more if len(names) > 1 else ''}: no range can be read from it"
-    )
 
 
 def probed_session(

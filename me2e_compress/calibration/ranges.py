@@ -51,6 +51,8 @@ class Ranges:
         scenes: number of scenes; None where it is not known.
         inputs: what each input of the graph did; empty where it is not known.
         outputs: what each output of the graph did; empty where it is not known.
+        not_finite: the node that is first to make NaN or infinity, in a sentence; else
+            empty, and not written.
     """
 
     tensors: dict[str, tuple[float, float]]
@@ -63,6 +65,7 @@ class Ranges:
     scenes: int | None = None
     inputs: dict[str, Activity] = dataclasses.field(default_factory=dict)
     outputs: dict[str, Activity] = dataclasses.field(default_factory=dict)
+    not_finite: str = ""
 
     @classmethod
     def of(cls, seen: Statistics, method: Observer) -> Self:
@@ -79,6 +82,7 @@ class Ranges:
             scenes=len(seen.scenes) or None,
             inputs=_activities(seen, seen.inputs, 0),
             outputs=_activities(seen, seen.outputs, len(seen.inputs)),
+            not_finite=seen.not_finite,
         )
 
     @property
@@ -115,7 +119,10 @@ class Ranges:
 
     def save(self, path: Path) -> None:
         """Write JSON atomically."""
-        write_document(path, dataclasses.asdict(self), indent=1)
+        told = dataclasses.asdict(self)
+        if not self.not_finite:
+            del told["not_finite"]
+        write_document(path, told, indent=1)
 
     @classmethod
     def load(cls, path: Path) -> Self:

@@ -23,6 +23,8 @@ FEW_SCENES = 8
 4 of 16 scenes miss more than a fifth of the range of 9 % of the driver's tensors, 8 of
 3 %, one of 35 % (benchmarks/bench_observers.py)."""
 
+NOT_FINITE = "Runtimes answer it each in their own way: guard what makes it"
+
 _SHOWN = 5
 """Number of tensors that a line lists."""
 
@@ -69,6 +71,8 @@ class RangeFinding:
 def review(ranges: Ranges) -> tuple[RangeFinding, ...]:
     """Judge ranges by what they say themselves; warnings first."""
     found = [*_scales(ranges), *_ports(ranges)]
+    if said := ranges.not_finite:
+        found.append(RangeFinding("not finite", "warning", said, advice=NOT_FINITE))
     if ranges.scenes is not None and ranges.scenes < FEW_SCENES:
         said = f"{counted(ranges.frames, 'frame')} in {counted(ranges.scenes, 'scene')}"
         advice = (

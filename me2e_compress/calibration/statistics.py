@@ -40,6 +40,8 @@ class Statistics:
         outputs: names of the graph's outputs.
         checksums: int64 [frames, inputs + outputs]: :func:`checksum` of what each was.
         scenes: indices of the frames that begin a scene.
+        not_finite: the node that is first to make NaN or infinity, in a sentence; else
+            empty.
     """
 
     model: str
@@ -54,6 +56,7 @@ class Statistics:
         default_factory=lambda: np.empty((0, 0), np.int64)
     )
     scenes: tuple[int, ...] = ()
+    not_finite: str = ""
 
     @functools.cached_property
     def readings(self) -> Floats:

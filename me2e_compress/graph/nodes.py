@@ -132,6 +132,12 @@ def input_at(node: ir.Node, index: int) -> ir.Value | None:
     return node.inputs[index] if index < len(node.inputs) else None
 
 
+def grid_of(node: ir.Node) -> ir.Value | None:
+    """Return where GridSample, or a plugin of it, samples; None of other nodes."""
+    samples = node.op_type.startswith(("GridSample", "grid_sampler"))
+    return input_at(node, 1) if samples else None
+
+
 def producer_of(value: ir.Value | None) -> ir.Node | None:
     """Return the node that computes a value; None for inputs and initializers."""
     return None if value is None else value.producer()

@@ -8,6 +8,7 @@ import dataclasses
 from collections.abc import Callable, Collection, Iterable, Iterator
 from typing import ClassVar, Literal, TypeAlias, get_args
 
+import numpy as np
 import onnx
 import onnx_ir as ir
 
@@ -15,6 +16,7 @@ from me2e_compress import graph
 from me2e_compress.calibration.ranges import Ranges
 from me2e_compress.errors import PreconditionError, RecipeError
 from me2e_compress.graph import is_standard, opset_of
+from me2e_compress.graph.nodes import LAYOUT_OPERATORS, grid_of
 from me2e_compress.graph.validity import refusal
 from me2e_compress.quantization.costs import Costs
 from me2e_compress.quantization.decision import KeptFloat, QuantPlan
@@ -28,6 +30,7 @@ __all__ = [
     "LintRule",
     "Severity",
     "Target",
+    "divided_grids",
     "error",
     "of_opset",
     "valid",
@@ -106,6 +109,67 @@ def of_opset(model: ir.Model) -> Iterator[LintFinding]:
                 )
                 message = f"{name} came with opset {since}, the graph is of {opset}"
                 yield error("operator-of-opset", node, message)
+
+
+def divided_grids(model: ir.Model) -> Iterator[LintFinding]:
+    """Find divisions by what may be 0 on the way to where GridSample samples.
+
+    Points of depth 0 give 0 / 0 there.
+    """
+    seen, positive = set[ir.Node](), dict[ir.Value, bool]()
+    for node in graph.nodes_of(model):
+        pending = [grid_of(node)]
+        while pending:
+            made = graph.producer_of(pending.pop())
+            if made is None or made in seen or made.op_type not in _TO_A_GRID:
+                continue
+            seen.add(made)
+            pending += made.inputs
+            divisor = made.inputs[-1]
+            if made.op_type not in ("Div", "Reciprocal") or divisor is None:
+                continue
+            if graph.array_of(divisor) is None and not _is_positive(divisor, positive):
+                yield warning(
+                    "divided-grid",
+                    made,
+                    f"{divisor.name}, by which it divides, may be 0, and"
+                    f" {node.op_type} {name_of(node)!r} samples there: of NaN"
+                    " onnxruntime 1.31 makes a pixel, OpenVINO NaN (measured); bound it"
+                    " by Max or Clip",
+                )
+
+
+_MOVES = LAYOUT_OPERATORS | {"Cast", "Expand", "Gather", "Slice", "Split", "Tile"}
+_TO_A_GRID = _MOVES | {
+    *("Add", "Clip", "Concat", "Div", "Max", "Min", "Mul", "Neg", "Reciprocal", "Sub"),
+}
+_POSITIVE = frozenset({"Exp", "Shape", "Sigmoid", "Size", "Softmax", "Softplus"})
+_OF_POSITIVE = _MOVES | {"ReduceMax", "ReduceMean", "ReduceMin", "ReduceSum", "Sqrt"}
+
+
+def _is_positive(value: ir.Value | None, known: dict[ir.Value, bool]) -> bool:
+    """Tell whether something keeps a value above 0: constants, bounds, what is added.
+
+    One side that is positive guards an Add, a Max and a Where.
+    """
+    if (array := graph.array_of(value)) is not None:
+        return bool(np.all(array.astype(np.float64) > 0))
+    if value is None or (node := value.producer()) is None:
+        return False
+    if value not in known:
+        kind, inputs = node.op_type, node.inputs
+        sides = (_is_positive(each, known) for each in inputs)
+        if kind == "Clip":
+            low = node.attributes.get_float("min", 0.0)
+            known[value] = low > 0 or _is_positive(graph.input_at(node, 1), known)
+        elif kind in ("Add", "Max", "Where"):
+            known[value] = any(sides)
+        elif kind in ("Concat", "Div", "Min", "Mul", "Pow"):
+            known[value] = all(sides)
+        else:
+            moved = kind in _OF_POSITIVE and _is_positive(inputs[0], known)
+            known[value] = moved or kind in _POSITIVE
+    return known[value]
 
 
 def name_of(node: ir.Node | None) -> str:

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any, TypeAlias
 
 from me2e_compress import graph
+from me2e_compress.calibration.review import NOT_FINITE
 from me2e_compress.display import megabytes
 from me2e_compress.errors import PreconditionError, RecipeError
 from me2e_compress.fidelity.floor import Floor
@@ -110,6 +111,7 @@ class CompressResult(Result):
             (
                 *(() if self.loss is None else self.loss.alerts()),
                 *filter(None, ["" if self.int8 is None else self.int8.empty]),
+                *(n for s in self.report.steps for n in s.notes if NOT_FINITE in n),
                 *(f"lint: {line}" for line in wrong),
             ),
             error,

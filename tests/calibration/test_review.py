@@ -29,6 +29,7 @@ from me2e_compress.calibration.ranges import IMPORTED, Activity, Ranges
 from me2e_compress.calibration.review import ratios_of, review, review_beside
 from me2e_compress.calibration.statistics import BINS, Statistics
 from me2e_compress.errors import FramesError, RecipeError
+from me2e_compress.graph import infer_shapes
 from tests.frames import record
 from tests.installed import install
 from tests.nets import conv_attention, image, parsed
@@ -163,6 +164,53 @@ def test_an_output_that_no_tensor_shows_to_be_infinite_is_found(tmp_path: Path) 
     )
 
     assert found.outputs == {"y": "not finite", "z": "varies"}
+    assert found.not_finite.startswith("y (Log) is first to make NaN or infinity, in y")
+
+
+SAMPLED = """
+m (float[1,1,4,4] x, float[1,2,2,2] xy, float[1,2,2,1] depth, bool[1] hidden)
+    => (float[1,1,2,2] y) <float never = {-inf}, float one = {1}, float two = {2}>
+{
+    zero = Cast <to = 1> (hidden)
+    off = Where(hidden, never, zero)
+    weight = Softplus(off)
+    [project] uv = Div(xy, depth)
+    turned = Mul(uv, two)
+    grid = Add(turned, weight)
+    sampled = GridSample(x, grid)
+    y = Relu(sampled)
+}
+"""
+
+
+def test_who_made_the_grid_not_a_number_is_named(tmp_path: Path) -> None:
+    flat = np.zeros((1, 2, 2, 2), np.float32)
+    frames = [
+        {
+            "x": np.ones((1, 1, 4, 4), np.float32),
+            "xy": flat,
+            "depth": flat[..., :1] + depth,
+            "hidden": np.array([True]),
+        }
+        for depth in (1, 0, 1)
+    ]
+    recording, model = (
+        CalibrationSet(record(tmp_path / "frames", frames)),
+        parsed(SAMPLED),
+    )
+    infer_shapes(model)
+
+    found = Calibrator(threads=1).run(model, ["x", "y"], recording)
+
+    assert found.not_finite == (
+        "project (Div) is first to make NaN or infinity, in uv; 2 tensors behind it"
+    )
+    (line,) = (each for each in review(found) if each.kind == "not finite")
+    assert str(line).startswith(found.not_finite)
+    found.save(tmp_path / "r.json")
+    assert Ranges.load(tmp_path / "r.json") == found
+    with pytest.raises(FramesError, match=r"read from it; project \(Div\) is first"):
+        Calibrator(threads=1).run(model, ["turned"], recording)
 
 
 def test_the_root_mean_square_is_over_all_frames(tmp_path: Path) -> None:

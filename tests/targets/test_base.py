@@ -21,6 +21,50 @@ def test_operators_younger_than_the_graph(target: str) -> None:
     assert not TARGETS.parse(target).lint(ir.from_onnx_text(GRID % 16))
 
 
+PROJECTED = """<ir_version: 9, opset_import: ["" : 16]>
+m (float[1,1,4,4] x, float[1,2,2,2] p, float[1,2,2,1] depth, bool[1] near)
+    => (float[1,1,2,2] y)
+    <float eps = {{1e-5}}, float minus = {{-1}}, float half = {{2}}>
+{{
+    {guard}
+    [project] uv = {division}
+    scaled = Mul(uv, half)
+    grid = {last}
+    y = GridSample(x, grid)
+}}
+"""
+
+
+@pytest.mark.parametrize(
+    ("guard", "division", "last", "is_told"),
+    [
+        ("d = Identity(depth)", "Div(p, d)", "Sub(scaled, eps)", True),
+        ("r = Reciprocal(depth)", "Mul(p, r)", "Identity(scaled)", True),
+        ("d = Max(depth, minus)", "Div(p, d)", "Identity(scaled)", True),
+        ("d = Clip(depth, minus)", "Div(p, d)", "Identity(scaled)", True),
+        ("d = Mul(depth, eps)", "Div(p, d)", "Identity(scaled)", True),
+        ("d = Max(depth, eps)", "Div(p, d)", "Identity(scaled)", False),
+        ("d = Clip(depth, eps)", "Div(p, d)", "Identity(scaled)", False),
+        ("d = Add(eps, depth)", "Div(p, d)", "Identity(scaled)", False),
+        ("d = Where(near, depth, eps)", "Div(p, d)", "Identity(scaled)", False),
+        ("e = Exp(depth) d = Mul(e, eps)", "Div(p, d)", "Identity(scaled)", False),
+        ("", "Div(p, half)", "Identity(scaled)", False),
+        ("d = Identity(depth)", "Div(p, d)", "Where(near, scaled, eps)", False),
+    ],
+)
+@pytest.mark.parametrize("target", TARGETS.names())
+def test_divisions_on_the_way_to_a_grid(
+    target: str, guard: str, division: str, last: str, is_told: bool
+) -> None:
+    text = PROJECTED.format(guard=guard, division=division, last=last)
+
+    found = TARGETS.parse(target).lint(ir.from_onnx_text(text))
+
+    told = [each for each in found if each.rule == "divided-grid"]
+    assert [each.severity for each in told] == ["warning"] * is_told
+    assert all("by which it divides, may be 0, and GridS" in e.message for e in told)
+
+
 @pytest.mark.parametrize("target", TARGETS.names())
 def test_what_is_no_valid_graph(target: str) -> None:
     model = ir.from_onnx_text(GRID % 16)

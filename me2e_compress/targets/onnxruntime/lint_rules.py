@@ -38,6 +38,7 @@ from me2e_compress.runtime.runnable import known_operators
 from me2e_compress.targets import (
     LintFinding,
     LintRule,
+    divided_grids,
     error,
     name_of,
     of_opset,
@@ -427,6 +428,7 @@ def _weighted(model: ir.Model) -> Iterator[ir.Node]:
 RULES: tuple[LintRule, ...] = (
     valid,
     of_opset,
+    divided_grids,
     opset,
     operators,
     kernels,

@@ -27,7 +27,15 @@ from me2e_compress.graph.nodes import is_plugin
 from me2e_compress.graph.shapes import unshaped_plugins
 from me2e_compress.operators import OWN_DOMAIN, Dialect, operators
 from me2e_compress.operators.dialect import INT32
-from me2e_compress.targets import LintFinding, LintRule, error, of_opset, valid, warning
+from me2e_compress.targets import (
+    LintFinding,
+    LintRule,
+    divided_grids,
+    error,
+    of_opset,
+    valid,
+    warning,
+)
 from me2e_compress.targets.quantized import PAIR
 from me2e_compress.targets.tensorrt.lint import qdq
 
@@ -444,4 +452,4 @@ def rules(version: Version | None) -> tuple[LintRule, ...]:
     parser = Parser(version)
     tables = (parser.opset, parser.operators, parser.element_types)
     shapes = (one_type, plugins, plugin_shapes, restrictions)
-    return (valid, of_opset, *tables, *shapes, *qdq.RULES)
+    return (valid, of_opset, divided_grids, *tables, *shapes, *qdq.RULES)
