@@ -10,12 +10,14 @@ import onnx_ir as ir
 from me2e_compress.display import counted
 from me2e_compress.graph import graphs_of, provenance
 from me2e_compress.graph.modules.assign import assign
-from me2e_compress.graph.nodes import is_plugin, nodes_in, nodes_of, opset_of
-from me2e_compress.graph.rewrite import lift_constants
+from me2e_compress.graph.nodes import array_of, is_plugin, nodes_in, nodes_of, opset_of
+from me2e_compress.graph.rewrite import add_constant, lift_constants
 from me2e_compress.graph.rewrite.raise_opset import raise_opset
+from me2e_compress.graph.shapes import static_shape
 from me2e_compress.graph.validity import ORIGINAL_DOMAIN, PLUGIN_DOMAIN
 from me2e_compress.passes.base import Context, Pass, PassResult
 from me2e_compress.passes.einsum_products import write_products
+from me2e_compress.targets.quantized import PAIR
 
 __all__ = [
     "ORIGINAL_DOMAIN",
@@ -185,6 +187,8 @@ class ImportNormalize(Pass):
        imported.
     8. An Einsum that is a product becomes a MatMul, and a weight in front of its
        columns a Conv of kernel 1: layers, which become int8.
+    9. Scales by channel that have dimensions of 1 beside become vectors: no runtime
+       takes ``[64, 1, 1]``.
 
     Subgraphs and function bodies are included. Unknown operators are left alone.
 
@@ -220,8 +224,29 @@ class ImportNormalize(Pass):
                 if node.domain not in body.opset_imports:
                     body.opset_imports[node.domain] = 1
                     changes += 1
-        changes += write_products(model, self.name)
+        changes += write_products(model, self.name) + _flatten_scales(model, self.name)
         return PassResult(model, changes, tuple(filter(None, (raise_note, note))))
+
+
+def _flatten_scales(model: ir.Model, by: str) -> int:
+    """Write stored scales and zero points by channel as vectors, and count them."""
+    count = 0
+    for node in model.graph:
+        shape = static_shape(node.inputs[0]) if node.op_type in PAIR else None
+        axis = node.attributes.get_int("axis", 1)
+        if not shape or axis >= len(shape) or "block_size" in node.attributes:
+            continue
+        for index, value in enumerate(node.inputs[:3]):
+            array = array_of(value)
+            if array is None or not index or array.ndim < 2:
+                continue
+            if array.size == max(array.shape) == shape[axis]:
+                name = f"{node.name}_vector_{index}"
+                vector = add_constant(model.graph, array.reshape(-1), name)
+                node.replace_input_with(index, vector)
+                provenance.inherit(node, [node], by=by)
+                count += 1
+    return count
 
 
 def needs_import(model: ir.Model) -> bool:

@@ -16,6 +16,7 @@ from me2e_compress.errors import EvaluationError, GraphError
 from me2e_compress.graph import provenance
 from me2e_compress.graph.modules.assign import Item, assign, itemise
 from me2e_compress.graph.modules.module_map import ModuleMap
+from me2e_compress.graph.nodes import is_read
 from me2e_compress.graph.opset import lowered
 from me2e_compress.graph.recurrence import recurrent_inputs
 from me2e_compress.graph.summary import (
@@ -267,6 +268,8 @@ def inspect(model: str | Path, options: InspectOptions | None = None) -> Inspect
         fed_back = recurrent_inputs(loaded)
     except GraphError as error:
         wrong = str(error)
+    unread = [str(e.name) for e in loaded.graph.inputs if not is_read(e)]
+    idle = f"nothing reads input {', '.join(unread)}" if unread else ""
     total = sum(item.macs or 0 for item in costs.values())
     unknown = sum(item.unknown_macs_nodes or 0 for item in costs.values())
     return InspectResult(
@@ -284,7 +287,7 @@ def inspect(model: str | Path, options: InspectOptions | None = None) -> Inspect
         dict(Counter(map(why_uncounted, uncounted)).most_common()),
         tuple(open_dimensions(loaded)),
         lowered(loaded),
-        "; ".join(filter(None, (lacking_shapes(loaded), wrong))),
+        "; ".join(filter(None, (lacking_shapes(loaded), wrong, idle))),
         fed_back,
         weights=named_weights(loaded.metadata_props),
         latency_of="" if taken is None else taken.headline,

@@ -64,6 +64,13 @@ def test_outputs_that_are_fed_back_are_told(
     assert said in cli.done("inspect m.onnx").words
 
 
+def test_an_input_that_nothing_reads_is_told(cli: Cli, tmp_path: Path) -> None:
+    text = "m (float[2] x, float[1] idle) => (float[2] y) { y = Relu(x) }"
+    save_text(tmp_path / "m.onnx", text)
+
+    assert "nothing reads input idle\n" in cli.done("inspect m.onnx").out
+
+
 def test_a_plugin_s_macs_are_unknown_and_a_sum_is_a_lower_bound(
     cli: Cli, files: Path
 ) -> None:

@@ -49,6 +49,18 @@ g (bool c, float[2] x) => (float[2] y) {
 """
 
 
+QUANTIZED = """
+g (float[2,4] x) => (float[2,4] y)
+    <float s = {0.5}, int8 low = {-127}, int8 high = {127}>
+{
+    q = QuantizeLinear(weight, s, low)
+    bounded = Clip(q, low, high)
+    d = DequantizeLinear(bounded, s, low)
+    y = MatMul(x, d)
+}
+"""
+
+
 @pytest.mark.parametrize(
     ("text", "left", "stored"),
     [
@@ -57,6 +69,7 @@ g (bool c, float[2] x) => (float[2] y) {
         (UNKNOWN, ["Plugin", "Reshape"], ["flat"]),
         (ALIKE, ["MatMul", "MatMul"], ["one"]),
         (BRANCHES, ["If", "Add", "Identity"], None),
+        (QUANTIZED, ["DequantizeLinear", "MatMul"], ["s", "low", "bounded"]),
     ],
 )
 def test_what_is_folded(text: str, left: list[str], stored: list[str] | None) -> None:

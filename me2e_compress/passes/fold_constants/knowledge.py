@@ -224,13 +224,8 @@ SMALL = 1024
 LARGEST = 1 << 30
 """Limit in bytes of a computed value: a chain of Concats may claim any size."""
 
-NEVER = DRAWS | {
-    "Constant",
-    "DequantizeLinear",
-    "DynamicQuantizeLinear",
-    "QuantizeLinear",
-}
-"""Random operators, and quantization, which is an instruction to the runtime."""
+NEVER = DRAWS | {"Constant", "DequantizeLinear", "DynamicQuantizeLinear"}
+"""Random operators, and those that tell the runtime to compute in int8."""
 
 COMPUTE = frozenset(
     {"Conv", "ConvTranspose", "Einsum", "Gemm", "GridSample", "MatMul", "Softmax"}

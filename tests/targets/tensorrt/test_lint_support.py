@@ -78,12 +78,37 @@ def test_what_the_parser_does_not_take(call: str, rule: str, message: str) -> No
         "(float[1,1,9] x, float[1,1,3] w) => (float[1,1,7] y) { y = Conv(x, w) }",
         "(float[1,1,9] x) => (float[1,1,7] y) { y = MaxPool<kernel_shape=[3]>(x) }",
         "(float[2] x) => (float[2] y) { y = Relu(x) }",
-        "(float[4] x, int64[2] i, float[2] u) => (float[4] y)"
-        ' { y = ScatterElements<reduction="max">(x, i, u) }',
     ],
 )
 def test_what_the_importers_take_beyond_the_matrix(call: str) -> None:
     assert said(f"m {call}", 19) == []
+
+
+ATTENTION = "(A[1,2,4,8] q) => (A[1,2,4,8] y) { y = Attention(q, q, q) }"
+SCATTER = (
+    "(float[4] x, int64[2] i, float[2] u) => (float[4] y)"
+    ' { y = ScatterElements<reduction="max">(x, i, u) }'
+)
+
+
+@pytest.mark.parametrize(
+    ("call", "said"),
+    [
+        (ATTENTION.replace("A[", "float["), "Attention is parsed, and not built, of"),
+        (ATTENTION.replace("A[", "float16["), None),
+        (SCATTER, "ScatterElements is not parsed with a reduction, by TensorRT-RTX"),
+        (SCATTER.replace("max", "none"), None),
+    ],
+)
+def test_what_tensorrt_rtx_does_not_take_is_a_warning(
+    call: str, said: str | None
+) -> None:
+    model = ir.from_onnx_text(f'<ir_version: 10, opset_import: ["" : 23]> m {call}')
+
+    findings = TensorRT(version="10.15").lint(model)
+
+    told = [each.message for each in findings if each.severity == "warning"]
+    assert [each[: len(said or "")] for each in told] == ([said] if said else [])
 
 
 POWER = "(int64[2] x, int64[2] p) => (int64[2] y) { y = Pow(x, p) }"

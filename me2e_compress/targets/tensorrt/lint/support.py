@@ -349,6 +349,20 @@ def restrictions(model: ir.Model) -> Iterator[LintFinding]:
                 yield error("restriction", node, f"{node.op_type}: {objection}")
 
 
+def rtx(model: ir.Model) -> Iterator[LintFinding]:
+    """Find what TensorRT takes, and TensorRT-RTX 1.7 does not: measured."""
+    for node in nodes_of(model):
+        said, value = "", graph.input_at(node, 0)
+        floats = value is not None and value.dtype == ir.DataType.FLOAT
+        if node.op_type == "Attention" and floats:
+            said = "is parsed, and not built, of float32: convert-float16 helps"
+        elif node.op_type == "ScatterElements" and _no_reduction(node):
+            said = "is not parsed with a reduction"
+        if said and is_standard(node):
+            message = f"{node.op_type} {said}, by TensorRT-RTX 1.7 (measured)"
+            yield warning("rtx", node, message)
+
+
 def _image(node: ir.Node) -> str | None:
     """Check for at most three spatial dimensions; one is made two by the parser."""
     rank = rank_of(node.inputs[0])
@@ -451,5 +465,5 @@ def rules(version: Version | None) -> tuple[LintRule, ...]:
     """Return the rules for a version of TensorRT; None for any since 10.1."""
     parser = Parser(version)
     tables = (parser.opset, parser.operators, parser.element_types)
-    shapes = (one_type, plugins, plugin_shapes, restrictions)
+    shapes = (one_type, plugins, plugin_shapes, restrictions, rtx)
     return (valid, of_opset, divided_grids, *tables, *shapes, *qdq.RULES)
