@@ -10,7 +10,6 @@ from typing import TypeAlias
 
 import onnx_ir as ir
 
-from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.display import counted
 from me2e_compress.errors import FramesError, GraphError, Me2eError
 from me2e_compress.fidelity.first_difference import find_first_difference
@@ -25,6 +24,7 @@ from me2e_compress.manager.verification_inputs import (
     relative,
     tolerances,
 )
+from me2e_compress.runtime.frames import Frames
 from me2e_compress.runtime.session import Session, replay, run_once
 
 NUDGES = 3
@@ -33,7 +33,7 @@ NUDGES = 3
 _BODY = "body"
 """Domain in which a body is run: no kernel is registered for it."""
 
-TryFirst: TypeAlias = Callable[[ir.Model, str, CalibrationSet | None], None]
+TryFirst: TypeAlias = Callable[[ir.Model, str, Frames | None], None]
 """Opens a graph before this process does, and may refuse it."""
 
 

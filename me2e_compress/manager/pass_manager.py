@@ -24,7 +24,10 @@ from me2e_compress.manager.attempt import attempt, blame_file
 from me2e_compress.manager.equivalence import TryFirst
 from me2e_compress.manager.recipe import to_text
 from me2e_compress.manager.report import LossyPass, Report, Step, Verification
-from me2e_compress.manager.verification_inputs import VerificationInputs
+from me2e_compress.manager.verification_inputs import (
+    VerificationInputs,
+    first_seeded,
+)
 from me2e_compress.passes.base import Context, Pass
 from me2e_compress.passes.import_normalize import ImportNormalize, needs_import
 
@@ -169,7 +172,8 @@ class _Run:
         # what onnxruntime dies of is refused here, not merely unproven
         if self.manager.try_first is not None:
             what = f"the graph after {stretch[-1][0].name}"
-            self.manager.try_first(model, what, self._frames())
+            seeded = first_seeded(model, self.context.seed)
+            self.manager.try_first(model, what, self._frames() or seeded)
         found, runnable, inputs = self._compare(stretch, model)
         self.verifications.append(found)
         if found.passed or inputs is None:

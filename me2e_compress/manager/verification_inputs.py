@@ -142,6 +142,14 @@ class VerificationInputs:
         return dataclasses.replace(self, frames=frames)
 
 
+def first_seeded(model: ir.Model, seed: int) -> tuple[Frame, ...] | None:
+    """Return the frame that a graph without frames is run on first, if it has sizes."""
+    try:
+        return tuple(synthetic(model, seed=seed, count=1))
+    except PreconditionError:
+        return None
+
+
 def nudge(
     values: npt.NDArray[np.generic], signs: np.random.Generator
 ) -> npt.NDArray[np.generic]:

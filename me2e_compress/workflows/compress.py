@@ -15,6 +15,7 @@ from me2e_compress.graph.files import data_names
 from me2e_compress.manager import PassManager, Report
 from me2e_compress.manager import recipe as recipes
 from me2e_compress.manager.pass_manager import collector_paused
+from me2e_compress.manager.verification_inputs import first_seeded
 from me2e_compress.passes import Context, Pass
 from me2e_compress.passes.fix_shapes import with_sizes
 from me2e_compress.passes.import_normalize import with_own_domains
@@ -22,6 +23,7 @@ from me2e_compress.passes.quantize_int8 import QuantizeInt8
 from me2e_compress.quantization.decision import plan_of, save_plan
 from me2e_compress.registry import drafts
 from me2e_compress.runtime.atomic import write_document
+from me2e_compress.runtime.frames import Frames
 from me2e_compress.runtime.latency_trace import cpu_seconds
 from me2e_compress.workflows.checks import (
     load_map,
@@ -262,7 +264,10 @@ def compress(
         seen = split_frames(source, loaded, frames, passes, options.measure_frames)
         start, provider = cpu_seconds(), options.runs_on
         first = partial(try_first, listener=listener, provider=provider)
-        first(loaded, source.name, seen.calibration or seen.samples, file=source)
+        shown: Frames | None = seen.calibration or seen.samples
+        if shown is None and options.verify_frames:
+            shown = first_seeded(loaded, options.seed)
+        first(loaded, source.name, shown, file=source)
         # apply the passes, and refuse a result that is unproven or not int8
         context = Context(modules, seen.calibration, options.seed, provider)
         checked = options.verify_frames

@@ -1,18 +1,26 @@
 """Opened in a process of its own, once."""
 
 import subprocess
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import onnx_ir as ir
 import pytest
 
+from me2e_compress import graph
 from me2e_compress.errors import GraphError
+from me2e_compress.graph.modules.module_map import ModuleMap
+from me2e_compress.manager import PassManager
+from me2e_compress.manager.recipe import parse
+from me2e_compress.passes import Context
 from me2e_compress.runtime.children import run_script
 from me2e_compress.runtime.frames import Array, Frame
 from me2e_compress.workflows import checks
 from me2e_compress.workflows.checks import try_first
+from me2e_compress.workflows.compress import compress
 from me2e_compress.workflows.result import SILENT
+from tests.nets import save_text
 from tests.stacks import write_stack
 
 pytestmark = pytest.mark.opens_apart
@@ -99,3 +107,20 @@ def test_a_run_that_kills_onnxruntime_is_named(opened: Path) -> None:
     with pytest.raises(GraphError, match=r"dies of it \(SIGFPE\) at step run"):
         try_first(model, "deadly", [Frame(0, True, arrays)], listener=SILENT)
     assert not opened.exists()
+
+
+def test_seeded_inputs_are_run_apart_too(opened: Path, tmp_path: Path) -> None:
+    """Whole numbers are drawn as 0 or 1."""
+    text = """deadly (int32[1] x) => (int32[1] y)
+        <int32[1] two = {2}, int32[1] least = {-2147483648}, int32[1] minus = {-1}>
+        { none = Div(x, two) low = Add(none, least) y = Div(low, minus) }"""
+    model = save_text(tmp_path / "m.onnx", text)
+
+    with pytest.raises(GraphError, match=r"m.onnx: onnxruntime dies of it \(SIGFPE"):
+        compress(model, tmp_path / "small.onnx", "exact")
+
+    manager = PassManager(
+        parse("import-normalize"), try_first=partial(try_first, listener=SILENT)
+    )
+    with pytest.raises(GraphError, match=r"import-normalize: onnxruntime dies of it"):
+        manager.run(graph.load(model), Context(ModuleMap.whole()))
