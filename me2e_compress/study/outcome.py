@@ -320,6 +320,8 @@ def judge(
         return PlanFidelity.unknown(str(error))
     if fidelity.plan is None:
         return PlanFidelity.unknown(fidelity.plan_reason)
+    if not math.isfinite(fidelity.plan.max_m):
+        return PlanFidelity.unknown("its plan is not finite")
     # an identical plan has an infinite ratio
     noise = {each.name: each.sqnr_db for each in fidelity.outputs}[fidelity.plan_output]
     sqnr = Measure(None, "dB", EXACT if noise == math.inf else "no plan")

@@ -305,6 +305,17 @@ def test_state_and_plan_are_those_of_the_variant(
     assert [len(each.routes) for each in found.drives] == [1, 1]
 
 
+def test_a_plan_that_is_no_number_is_told(make: Make, tmp_path: Path) -> None:
+    body = "none = Sub(ahead, ahead) plan = Div(none, none)"
+    lost = Variant("lost", str(straight_on(tmp_path / "lost.onnx", body=body)))
+    variants = (make().variants[1], lost)
+    asked = make(variants=variants, conditions=(IDEAL,), routes=ROUTES[:1])
+
+    found = run_study(asked, tmp_path / "study", Here())
+
+    assert found.variants[1].fidelity.mean_m.reason == "its plan is not finite"
+
+
 # Records of finished drives: what they keep, and which are not taken.
 
 
