@@ -15,12 +15,6 @@ import onnx_ir.passes.common as common
 
 from me2e_compress import graph
 from me2e_compress.calibration.dataset import CalibrationSet, archive_of, load_arrays
-from me2e_compress.calibration.not_finite import (
-    are_bad,
-    check_finite,
-    first_maker,
-    places_of,
-)
 from me2e_compress.calibration.observers import DEFAULT_METHOD, OBSERVERS
 from me2e_compress.calibration.ranges import Ranges
 from me2e_compress.calibration.statistics import (
@@ -28,7 +22,11 @@ from me2e_compress.calibration.statistics import (
     NOT_FINITE,
     Floats,
     Statistics,
+    are_bad,
+    check_finite,
     checksum,
+    first_maker,
+    places_of,
 )
 from me2e_compress.errors import FramesError, GraphError
 from me2e_compress.graph.nodes import makers_of, reads_of
