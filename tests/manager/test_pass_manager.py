@@ -8,7 +8,6 @@ import onnx_ir as ir
 import pytest
 
 from me2e_compress import graph
-from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.errors import GraphError, PassError, VerificationError
 from me2e_compress.graph import provenance, shapes
 from me2e_compress.manager import PassManager, Report, attempt
@@ -16,6 +15,7 @@ from me2e_compress.passes.base import Context, Pass
 from me2e_compress.passes.eliminate_redundant import EliminateRedundant
 from me2e_compress.passes.fold_constants import FoldConstants
 from me2e_compress.passes.import_normalize import ImportNormalize
+from me2e_compress.runtime.frames import Frames
 from tests.manager import passes
 from tests.nets import parsed
 
@@ -228,7 +228,7 @@ def test_a_pass_s_graph_is_written_once_for_checker_and_inference(
 def test_a_graph_that_kills_its_process_is_refused_before_it_is_run(
     context: Context, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def refuses(model: ir.Model, name: str, frames: CalibrationSet | None) -> None:
+    def refuses(model: ir.Model, name: str, frames: Frames | None) -> None:
         raise GraphError(f"{name} kills {frames}")
 
     def opens(*_: object, **__: object) -> None:
