@@ -4,16 +4,11 @@ from collections.abc import Sequence
 from typing import Literal
 
 from benchmarks.paper.drives import ModelFacts, PaperDrives
+from benchmarks.paper.normalizations import scored
 from benchmarks.paper.published import PublishedDrive
 from me2e_compress.display import Cell
 from me2e_compress.driving.realtime import DT_US, skipped_decisions
-from me2e_compress.metrics.eer import (
-    POINTS,
-    RouteMeasures,
-    eer,
-    rankings,
-    route_measures,
-)
+from me2e_compress.metrics.eer import POINTS, RouteMeasures, eer, route_measures
 from me2e_compress.metrics.measure import Estimate, Measure
 from me2e_compress.metrics.route_summary import DS, ROOM
 from me2e_compress.study.cells import MISSING, estimate_cell, number
@@ -109,10 +104,11 @@ def ranking_note(result: PaperDrives, variants: Sequence[str], condition: str) -
     energy: Energy = "measured"
     if all(result.fact(name).joules is None for name in variants):
         energy = "modelled"
-    found = rankings(measures_by_variant(result, variants, energy, condition))
+    found = scored(measures_by_variant(result, variants, energy, condition))
     orders = dict[tuple[str, ...], list[str]]()
-    for normalization, order in found.items():
-        orders.setdefault(order, []).append(normalization.value)
+    for normalization, each in found.items():
+        if each.scale is not None:
+            orders.setdefault(each.ranking, []).append(normalization.value)
     if not orders:
         return ""
     parts = [f"{' > '.join(order)} ({', '.join(by)})" for order, by in orders.items()]

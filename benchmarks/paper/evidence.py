@@ -9,8 +9,8 @@ import numpy as np
 
 from benchmarks.paper.cells import Energy, measures_by_variant
 from benchmarks.paper.drives import ModelFacts, PaperDrives
+from benchmarks.paper.normalizations import Normalization, scored
 from benchmarks.paper.questions import PaperQuestion, PAt
-from me2e_compress.metrics.eer import Normalization, eer
 from me2e_compress.metrics.episode import InfractionKind
 from me2e_compress.metrics.measure import (
     Estimate,
@@ -229,18 +229,18 @@ def _eer(question: PaperQuestion, result: PaperDrives) -> Found:
     facts = [result.fact(name) for name in names]
     energy: Energy = "measured" if all(f.joules for f in facts) else "modelled"
     variants = measures_by_variant(result, names, energy, condition)
-    scored = {each: eer(variants, normalization=each) for each in Normalization}
-    for found in scored.values():
+    ways_scored = scored(variants)
+    for found in ways_scored.values():
         for name in (one, other):
             if name not in found.routes:
                 return Found(found.scores[name])
-    first, seed = scored[Normalization.MIN_MAX], result.study.seed
+    first, seed = ways_scored[Normalization.MIN_MAX], result.study.seed
     # the types of the routes that all normalizations keep
     types = [each.scenario for each in result.drive(one, condition).routes]
     kinds = [kind for kind, kept in zip(types, first.kept, strict=True) if kept]
     gaps = {
         each: (found.routes[one] - found.routes[other]).tolist()
-        for each, found in scored.items()
+        for each, found in ways_scored.items()
     }
     ways = {each: _way(values, kinds, seed) for each, values in gaps.items()}
     estimate = mean_estimate(gaps[Normalization.MIN_MAX], kinds, POINTS, seed)

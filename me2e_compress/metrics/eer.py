@@ -5,16 +5,14 @@
 
 The x are normalized measures of route i; the weights w come from CRITIC. The paper does
 not say how it normalizes. Here the smallest value of all compared routes and variants
-becomes 0 and the largest 1 (`MIN_MAX`), as in the original CRITIC paper (1995), and the
-weights use the same rows. `rankings` tells whether the order of the variants depends on
-that choice. Scores are comparable only within one call, or between calls that share an
-`EerScale`.
+becomes 0 and the largest 1 (min-max), as in the original CRITIC paper (1995), and the
+weights use the same rows. Scores are comparable only within one call, or between calls
+that share an `EerScale`.
 """
 
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from enum import StrEnum
 
 import numpy as np
 import numpy.typing as npt
@@ -90,20 +88,6 @@ ALIKE = 1e-9
 """Below this share, all measures are redundant."""
 
 
-class Normalization(StrEnum):
-    """How a measure becomes a number that others may be added to."""
-
-    MIN_MAX = "min-max"
-    """Over all routes of all variants: smallest 0, largest 1."""
-    NATURAL = "natural"
-    """Driving score and efficiency over 100 %, comfort as it is, energy over the most
-    that a route took: no measure but energy hangs on what is compared."""
-    Z_SCORE = "z-score"
-    """Over all routes of all variants: mean 0, standard deviation 1."""
-    VARIANT_MEANS = "variant means"
-    """Over the variants' means: smallest 0, largest 1; the weights too."""
-
-
 @dataclass(frozen=True, slots=True)
 class EerScale:
     """Normalization and weights: x = (value - offset) / span, and the weight of each x.
@@ -112,7 +96,6 @@ class EerScale:
     add up to 1, offset and span have the units %, %, ratio and joules.
     """
 
-    normalization: Normalization
     weights: tuple[float, float, float, float]
     offset: tuple[float, float, float, float]
     span: tuple[float, float, float, float]
@@ -147,7 +130,6 @@ class EerResult:
 def eer(
     variants: Mapping[str, RouteMeasures],
     scale: EerScale | None = None,
-    normalization: Normalization = Normalization.MIN_MAX,
     types: Sequence[str] | None = None,
     seed: int = 0,
 ) -> EerResult:
@@ -182,7 +164,7 @@ def eer(
     reason = "" if kept.any() else "no route has all four measures"
     if not reason and scale is None:
         try:
-            scale = scale_of(tables, normalization)
+            scale = scale_of(tables)
         except EvaluationError as error:
             reason = str(error)
     # one estimate per variant, or the reason why there is none
@@ -203,23 +185,13 @@ def eer(
     return EerResult(scores, routes, None if reason else scale, left_out, kept)
 
 
-def scale_of(tables: Mapping[str, Floats], normalization: Normalization) -> EerScale:
+def scale_of(tables: Mapping[str, Floats]) -> EerScale:
     """Return offset, span and CRITIC weights of every measure, from complete tables."""
-    # the values that the scale is taken over
     rows = np.concatenate(list(tables.values()))
-    if normalization is Normalization.VARIANT_MEANS:
-        rows = np.stack([table.mean(axis=0) for table in tables.values()])
-    # offset and span by the normalization
-    if normalization is Normalization.Z_SCORE:
-        offset, span = rows.mean(axis=0), rows.std(axis=0)
-    elif normalization is Normalization.NATURAL:
-        offset = np.zeros(rows.shape[1])
-        span = np.array([100.0, 100.0, 1.0, rows[:, 3].max()])
-    else:
-        offset, span = rows.min(axis=0), np.ptp(rows, axis=0)
+    offset, span = rows.min(axis=0), np.ptp(rows, axis=0)
     span = np.where(span > 0.0, span, 1.0)  # a constant measure has weight 0
     weights = critic_weights((rows - offset) / span)
-    return EerScale(normalization, _four(weights), _four(offset), _four(span))
+    return EerScale(_four(weights), _four(offset), _four(span))
 
 
 def critic_weights(rows: Floats) -> Floats:
@@ -260,14 +232,6 @@ def critic_weights(rows: Floats) -> Floats:
             f"rows {int(varies.sum())} vary, and none tells what another does not"
         )
     return content / total
-
-
-def rankings(
-    variants: Mapping[str, RouteMeasures],
-) -> dict[Normalization, tuple[str, ...]]:
-    """Return the variants, best first, under every normalization that gives weights."""
-    found = {each: eer(variants, normalization=each) for each in Normalization}
-    return {each: result.ranking for each, result in found.items() if result.scale}
 
 
 def _four(values: Floats) -> tuple[float, float, float, float]:

@@ -20,10 +20,8 @@ from me2e_compress.metrics.eer import (
     MEASURES,
     EerResult,
     EerScale,
-    Normalization,
     RouteMeasures,
     eer,
-    rankings,
     route_measures,
 )
 from me2e_compress.metrics.episode import Episode
@@ -44,7 +42,7 @@ class SavedWeights:
     """A scale by the names of the measures; its joules are measured."""
 
     energy: Literal["measured"]
-    normalization: Normalization
+    normalization: Literal["min-max"]
     weights: _Four
     offset: _Four
     span: _Four
@@ -54,7 +52,7 @@ class SavedWeights:
         """Build the saved form of a scale."""
         columns = (scale.weights, scale.offset, scale.span)
         named = [dict(zip(MEASURES, each, strict=True)) for each in columns]
-        return cls("measured", scale.normalization, *named)
+        return cls("measured", "min-max", *named)
 
     @classmethod
     def load(cls, path: Path) -> "SavedWeights":
@@ -76,7 +74,7 @@ class SavedWeights:
             (each[MEASURES[0]], each[MEASURES[1]], each[MEASURES[2]], each[MEASURES[3]])
             for each in (self.weights, self.offset, self.span)
         )
-        return EerScale(self.normalization, weights, offset, span)
+        return EerScale(weights, offset, span)
 
 
 def save_weights(path: Path, result: EerResult) -> None:
@@ -100,10 +98,9 @@ UNPAIRED = "a drive in each"
 
 @dataclasses.dataclass(frozen=True)
 class EerScores:
-    """EER_AV of folders, and their order under every normalization."""
+    """EER_AV of folders, and their order."""
 
     found: EerResult
-    rankings: Mapping[str, tuple[str, ...]]
 
     def tables(self) -> tuple[Table, ...]:
         """Return the scores and their weights."""
@@ -130,29 +127,21 @@ class EerScores:
         left = [f"{n} for want of {name}" for name, n in self.found.left_out.items()]
         note = f"Routes left out of all: {', '.join(left)}." if left else ""
         columns = ("measure", "weight", "0 is", "1 is", "unit")
-        by = f"Weights by CRITIC, {scale.normalization}"
-        return (points, table(by, columns, rows, note))
+        return (points, table("Weights by CRITIC, min-max", columns, rows, note))
 
     def lines(self) -> tuple[str, ...]:
-        """Return whether the order depends on the normalization."""
+        """Return the order of the folders."""
         if self.found.scale is None:
             return ()
-        own = self.found.ranking
-        others = {n: order for n, order in self.rankings.items() if order != own}
-        said = f"EER_AV, best first: {', '.join(own)}"
-        if not others:
-            return (f"{said}; the same under every normalization that has weights",)
-        turned = "; ".join(f"{n}: {', '.join(order)}" for n, order in others.items())
-        return (f"{said}; but {turned}",)
+        return (f"EER_AV, best first: {', '.join(self.found.ranking)}",)
 
     def to_json(self) -> dict[str, Any]:
-        """Return scores, scale, routes left out and orders."""
+        """Return scores, scale and routes left out."""
         found = self.found
         return {
             "scores": {n: each.to_json() for n, each in found.scores.items()},
             "scale": found.scale and dataclasses.asdict(SavedWeights.of(found.scale)),
             "left_out": dict(found.left_out),
-            "rankings": {k: list(v) for k, v in self.rankings.items()},
         }
 
 
@@ -180,8 +169,7 @@ def score_eer(
         found = dataclasses.replace(found, left_out=left_out)
     if options.save_weights is not None:
         save_weights(Path(options.save_weights), found)
-    orders = {str(n): order for n, order in rankings(variants).items()}
-    return EerScores(found, orders)
+    return EerScores(found)
 
 
 def paired_drives(

@@ -13,11 +13,9 @@ from hypothesis.extra.numpy import arrays
 from me2e_compress.errors import EvaluationError
 from me2e_compress.metrics.eer import (
     EerScale,
-    Normalization,
     RouteMeasures,
     critic_weights,
     eer,
-    rankings,
     route_measures,
     scale_of,
 )
@@ -41,7 +39,6 @@ BY_HAND = {
     "b": measures((100, 120, 0.5, 5), (40, 80, 0.0, 5), crashed=".x"),
 }
 EQUAL = EerScale(
-    Normalization.MIN_MAX,
     weights=(0.25, 0.25, 0.25, 0.25),
     offset=(40.0, 80.0, 0.0, 5.0),
     span=(60.0, 40.0, 1.0, 5.0),
@@ -87,7 +84,7 @@ def test_the_scale_is_of_all_routes_and_used_again_on_another_variant() -> None:
 
 def test_weights_come_from_critic_over_routes_and_variants() -> None:
     tables = {name: each.table for name, each in BY_HAND.items()}
-    found = scale_of(tables, Normalization.MIN_MAX).weights
+    found = scale_of(tables).weights
 
     # normalized: DS 1 1/3 1 0, DE 1/2 0 1 0, DC 1 1/2 1/2 0, E 1 1 0 0
     x = np.array([[1, 1 / 3, 1, 0], [0.5, 0, 1, 0], [1, 0.5, 0.5, 0], [1, 1, 0, 0]])
@@ -148,21 +145,6 @@ def test_neither_units_nor_the_order_of_routes_change_a_score(
         again = moved.scores[name]
         assert score.n == again.n
         assert score.value == pytest.approx(again.value, abs=1e-6)
-
-
-def test_the_ranking_under_every_normalization() -> None:
-    drawn = np.random.default_rng(1).uniform(0, 1, (3, 30, 4)) * (100, 100, 1, 10)
-    drawn[0, :, 0] = 100.0
-    variants = {
-        name: RouteMeasures(table, np.zeros(30, np.bool_))
-        for name, table in zip("abc", drawn, strict=True)
-    }
-
-    found = rankings(variants)
-
-    assert set(found) == set(Normalization)
-    assert found[Normalization.MIN_MAX] == eer(variants).ranking
-    assert found[Normalization.MIN_MAX][0] == "a"
 
 
 def test_joules_of_a_route_are_those_of_its_decisions() -> None:

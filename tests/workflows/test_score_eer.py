@@ -53,7 +53,8 @@ def test_every_folder_has_a_score_by_its_own_joules() -> None:
     assert scale is not None
     # 9 and 5 decisions of 2 J, 20 and 14 of 3 J
     assert (scale.offset[3], scale.offset[3] + scale.span[3]) == (10.0, 60.0)
-    assert len(found.found.ranking) == 2
+    first, last = found.found.ranking
+    assert found.lines() == (f"EER_AV, best first: {first}, {last}",)
 
 
 def test_joules_come_from_a_file(tmp_path: Path) -> None:
@@ -90,6 +91,7 @@ def test_weights_are_saved_and_used_again(tmp_path: Path) -> None:
         ("span", {"energy": 0.0}, "a span or a weight is not positive"),
         ("weights", {"joy": 1.0}, "weights: Dictionary should have at most 4"),
         ("energy", "modelled", "energy: Input should be 'measured'"),
+        ("normalization", "z-score", "normalization: Input should be 'min-max'"),
     ],
 )
 def test_spoiled_weights_are_one_line(
