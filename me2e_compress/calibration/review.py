@@ -7,16 +7,10 @@ from typing import Literal
 
 from me2e_compress.calibration.ranges import OUTLIER_CREST, Activity, Ranges
 from me2e_compress.display import counted
-from me2e_compress.errors import FramesError
 
 ROUNDS_AWAY = 254
 """Crest factor from which half an int8 step (range / 254) exceeds the root mean square,
 so that most elements round to zero."""
-
-DISAGREE = 4
-"""Ratio of two ranges of one tensor from which it is named: the wider one costs 12 dB,
-two of seven bits. Between three recordings of 256 frames of other routes, no tensor of
-the driver at the tag ``road-1`` differs by more than 1.61 (bench_observers)."""
 
 FEW_SCENES = 8
 """Fewest scenes of a recording that nothing is said of. At the tag ``road-1``,
@@ -30,8 +24,7 @@ _SHOWN = 5
 
 Kind = Literal[
     "rounds to zero", "few elements", "clipped", "dead tensor", "unfed input",
-    "constant input", "dead output", "not finite", "few scenes", "other range",
-    "only in one", "not in cache",
+    "constant input", "dead output", "not finite", "few scenes", "not in cache",
 ]  # fmt: skip
 
 
@@ -92,61 +85,6 @@ def not_in(cache: Path, missing: Sequence[str]) -> tuple[RangeFinding, ...]:
     return (
         RangeFinding("not in cache", "warning", said, tuple(missing), advice=advice),
     )
-
-
-def review_beside(
-    ranges: Ranges, other: Ranges, called: str = "the second"
-) -> tuple[RangeFinding, ...]:
-    """Judge ranges by those of another recording, or of an imported cache.
-
-    ``other`` is ``called`` so in messages.
-
-    Raises:
-        FramesError: they are of another graph, or have no tensor in common.
-    """
-    if ranges.model and other.model and ranges.model != other.model:
-        raise FramesError(
-            f"{called}: of graph {other.model[:12]}, the first of {ranges.model[:12]}:"
-            " ranges of two graphs cannot be compared"
-        )
-    if ranges.tensors and not any(name in other.tensors for name in ranges.tensors):
-        raise FramesError(
-            f"{called}: of another graph: it has none of"
-            f" {counted(len(ranges.tensors), 'tensor')}, such as"
-            f" {next(iter(ranges.tensors))}"
-        )
-    ratios = ratios_of(ranges, other)
-    worst = sorted(ratios, key=lambda name: -factor(ratios[name]))
-    off = {name: ratios[name] for name in worst if factor(ratios[name]) >= DISAGREE}
-    found = _named(
-        "other range",
-        "warning",
-        f"tensor {DISAGREE} times wider than in {called} or, below 1, narrower",
-        off,
-        "One of them saw what the other did not, or in other units: look at both"
-        " recordings, and record what happened in either",
-    )
-    return (*found, *_only_in_one(ranges, other, called))
-
-
-def ratios_of(ranges: Ranges, other: Ranges) -> dict[str, float]:
-    """Return how many times wider each range is that is not zero in either."""
-    found = {}
-    for name, bounds in ranges.tensors.items():
-        mine, theirs = reach_of(bounds), reach_of(other.tensors.get(name, (0.0, 0.0)))
-        if mine and theirs:
-            found[name] = mine / theirs
-    return found
-
-
-def reach_of(bounds: tuple[float, float]) -> float:
-    """Return the largest magnitude of a range."""
-    return max(abs(bounds[0]), abs(bounds[1]))
-
-
-def factor(ratio: float) -> float:
-    """Return how far off a ratio is, whichever way."""
-    return max(ratio, 1 / ratio)
 
 
 def _scales(ranges: Ranges) -> Iterable[RangeFinding]:
@@ -227,25 +165,6 @@ def _ports(ranges: Ranges) -> Iterable[RangeFinding]:
         still,
         "What makes them was not exercised: record frames in which they answer",
     )
-
-
-def _only_in_one(ranges: Ranges, other: Ranges, called: str) -> Iterable[RangeFinding]:
-    """Name the tensors that are zero, or missing, in one of two files."""
-    sides = ((ranges, other, called), (other, ranges, "the first file"))
-    for here, there, lacks in sides:
-        zero = [name for name, each in there.tensors.items() if not reach_of(each)]
-        zero = [name for name in zero if reach_of(here.tensors.get(name, (0.0, 0.0)))]
-        missing = [name for name in here.tensors if name not in there.tensors]
-        yield from _named(
-            "dead tensor",
-            "warning",
-            f"tensor zero in {lacks} alone",
-            dict.fromkeys(zero),
-            "Its recording did not reach them",
-        )
-        yield from _named(
-            "only in one", "note", f"tensor not in {lacks}", dict.fromkeys(missing)
-        )
 
 
 def _those(activities: Mapping[str, Activity], kind: Activity) -> dict[str, None]:

@@ -210,19 +210,17 @@ def calibrate(
     show_of(workflow, model, frames, output, options)
 
 
-def ranges(first: Path, second: Path | None = None, /) -> None:
+def ranges(ranges: Path, /) -> None:
     """Say which saved ranges deserve a look, and what to record instead.
 
-    Ranges are held against the root mean square of their own tensor and against a
-    second file: another recording's ranges, a TensorRT or an onnxruntime cache.
+    Ranges are held against the root mean square of their own tensor.
 
     Args:
-        first: saved RANGES.json, or another tool's cache
-        second: ranges or a cache to hold them against
+        ranges: saved RANGES.json, or a TensorRT or an onnxruntime cache
     """
     from me2e_compress.workflows.calibrate import ranges as workflow
 
-    show(workflow(first, second))
+    show(workflow(ranges))
 
 
 def compress(

@@ -16,15 +16,7 @@ from me2e_compress.calibration.exchange import (
 )
 from me2e_compress.calibration.observers import OBSERVERS
 from me2e_compress.calibration.ranges import Ranges, rms_of
-from me2e_compress.calibration.review import (
-    RangeFinding,
-    factor,
-    not_in,
-    ratios_of,
-    reach_of,
-    review,
-    review_beside,
-)
+from me2e_compress.calibration.review import RangeFinding, not_in, review
 from me2e_compress.calibration.sample import draw
 from me2e_compress.display import counted, number, table
 from me2e_compress.errors import FramesError
@@ -240,54 +232,43 @@ _SHOWN = 10
 
 @dataclasses.dataclass(frozen=True, repr=False)
 class RangesResult(Result):
-    """Saved ranges, those that they were compared with, and what deserves a look."""
+    """Saved ranges, and what of them deserves a look."""
 
     path: Path
     ranges: Ranges
-    other_path: Path | None
-    other: Ranges | None
     findings: tuple[RangeFinding, ...]
 
     def shown(self) -> Shown:
         """Return the tensors that are furthest off, and what is wrong or may be."""
-        columns = ["low", "high", "rms", "crest"]
-        headlines = [f"{self.path}: {self.ranges.headline}"]
-        if self.other is not None:
-            columns += ["other", "ratio"]
-            headlines.append(f"{self.other_path}: {self.other.headline}")
+        headline = f"{self.path}: {self.ranges.headline}"
         cells = [
-            [str(row["tensor"]), *(_cell(row[each]) for each in columns)]
-            for row in self._rows()[:_SHOWN]
+            [str(name), *(_cell(value) for value in values)]
+            for name, *values in (row.values() for row in self._rows()[:_SHOWN])
         ]
-        heads = {"crest": "range / rms", "other": f"range in {self.other_path}"}
-        named = ["tensor", *(heads.get(each, each) for each in columns)]
+        named = ["tensor", "low", "high", "rms", "range / rms"]
         return Shown(
-            headlines[0],
+            headline,
             [table("Ranges, the furthest off first", named, cells)],
-            [*headlines, *_said(self.findings, "note")],
+            [headline, *_said(self.findings, "note")],
             _said(self.findings, "warning"),
         )
 
     def _rows(self) -> list[dict[str, object]]:
         """Return one row per tensor; what is not known is None."""
         crests = self.ranges.crests
-        others = {} if self.other is None else self.other.tensors
-        ratios = {} if self.other is None else ratios_of(self.ranges, self.other)
-        rows: dict[str, dict[str, object]] = {
-            name: {
+        found = sorted(
+            self.ranges.tensors.items(), key=lambda item: -crests.get(item[0], 0.0)
+        )
+        return [
+            {
                 "tensor": name,
                 "low": low,
                 "high": high,
                 "rms": self.ranges.rms.get(name),
                 "crest": crests.get(name),
-                "other": reach_of(others[name]) if name in others else None,
-                "ratio": ratios.get(name),
             }
-            for name, (low, high) in self.ranges.tensors.items()
-        }
-        off = {name: factor(ratio) for name, ratio in ratios.items()} or crests
-        order = sorted(rows, key=lambda name: -off.get(name, 0.0))
-        return [rows[name] for name in order]
+            for name, (low, high) in found
+        ]
 
     def to_json(self) -> object:
         """Return what was found, and every tensor."""
@@ -302,28 +283,19 @@ def _cell(value: object) -> str:
     return number(value if isinstance(value, float) else None, ".4g")
 
 
-def ranges(path: str | Path, other: str | Path | None = None) -> RangesResult:
+def ranges(path: str | Path) -> RangesResult:
     """Say which saved ranges deserve a look, and what to record instead.
 
-    Either file is ranges that ``calibrate`` saved, a TensorRT calibration cache, or an
-    onnxruntime ``calibration.cache``. With ``other``, ranges are also held against its
-    own: another recording's of the same graph, or another tool's.
+    The file is ranges that ``calibrate`` saved, a TensorRT calibration cache, or an
+    onnxruntime ``calibration.cache``.
 
     Raises:
-        FramesError: A file does not exist, contradicts itself, or is of another graph.
+        FramesError: The file does not exist, or contradicts itself.
     """
-    mine = _read(Path(path))
-    if other is None:
-        return RangesResult(Path(path), mine, None, None, review(mine))
-    theirs = _read(Path(other))
-    found = (*review(mine), *review_beside(mine, theirs, str(other)))
-    return RangesResult(Path(path), mine, Path(other), theirs, found)
-
-
-def _read(path: Path) -> Ranges:
-    """Read ranges of ours, or another tool's cache."""
+    path = Path(path)
     if not path.is_file():
         raise FramesError(f"{path}: no such ranges file or calibration cache")
     with documents.reading(path, FramesError, "not ranges"):
         is_json = documents.content(path)[:64].lstrip().startswith(b"{")
-    return Ranges.load(path) if is_json else read_cache(path)
+    found = Ranges.load(path) if is_json else read_cache(path)
+    return RangesResult(path, found, review(found))

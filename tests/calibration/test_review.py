@@ -26,7 +26,7 @@ from me2e_compress.calibration.observers import (
     within,
 )
 from me2e_compress.calibration.ranges import IMPORTED, Activity, Ranges
-from me2e_compress.calibration.review import ratios_of, review, review_beside
+from me2e_compress.calibration.review import review
 from me2e_compress.calibration.statistics import BINS, Statistics
 from me2e_compress.errors import FramesError, RecipeError
 from me2e_compress.graph import infer_shapes
@@ -222,50 +222,6 @@ def test_the_root_mean_square_is_over_all_frames(tmp_path: Path) -> None:
     )
     assert whole.rms["image"] == pytest.approx(np.sqrt(np.mean(np.square(seen))), 1e-3)
     assert found.crests["a"] == max(map(abs, found.tensors["a"])) / found.rms["a"]
-
-
-def test_ranges_of_another_recording_are_compared_worst_first() -> None:
-    bounds = {"a": (-16.0, 0.0), "b": (0.0, 0.25), "c": (0.0, 1.0)}
-    other = Ranges(bounds, "max-min", 4, "graph", "others")
-
-    wider, lacks = review_beside(GOOD, other, "b.json")
-
-    assert ratios_of(GOOD, other) == {"a": 0.25, "b": 8.0}
-    assert (wider.severity, wider.names, wider.ratios) == (
-        *("warning", ("b", "a")),
-        (8.0, 0.25),
-    )
-    assert str(wider).startswith("2 tensors 4 times wider than in b.json or, below 1,")
-    assert str(lacks) == "1 tensor not in the first file: c"
-
-
-def test_a_tensor_that_one_recording_did_not_reach_is_named() -> None:
-    other = dataclasses.replace(GOOD, tensors={"a": (0.0, 0.0), "b": (0.0, 2.0)})
-
-    for pair, lacks in (((GOOD, other), "b.json"), ((other, GOOD), "the first file")):
-        (found,) = review_beside(*pair, "b.json")
-        assert str(found).startswith(f"1 tensor zero in {lacks} alone: a.")
-        assert found.severity == "warning"
-
-
-def test_ranges_that_differ_little_are_not_named() -> None:
-    other = dataclasses.replace(GOOD, tensors={"a": (-1.01, 1.01), "b": (0.0, 7.9)})
-    assert review_beside(GOOD, other) == ()
-
-
-@pytest.mark.parametrize(
-    ("change", "said"),
-    [
-        ({"model": "another graph"}, "b.json: of graph another grap, the first of gra"),
-        ({"model": "", "tensors": {"x": (0, 1)}}, "b.json: of another graph: .* such"),
-    ],
-)
-def test_ranges_of_another_graph_are_not_compared(
-    change: Mapping[str, object], said: str
-) -> None:
-    other = dataclasses.replace(GOOD, **change)  # type: ignore[arg-type]
-    with pytest.raises(FramesError, match=said):
-        review_beside(GOOD, other, "b.json")
 
 
 @pytest.mark.parametrize(

@@ -120,7 +120,6 @@ OTHERS = {
     "ranges in.onnx": r"in\.onnx: not a calibration cache",
     "ranges latin.json": r"latin\.json: not a calibration cache",
     "ranges loud.json": r"loud\.json: .*a has .*root mean square of 1e\+09; both",
-    "ranges good.json other-graph.json": r"other-graph\.json: of graph another, the f",
     "ranges map.toml": r"map\.toml: line 1 is not a name and a number",
     "list wheels": "no kind 'wheels'; there are passes, rules",
     f"{TIMED} --energy sun": "no energy counter 'sun'; there are nvml, recorded",
