@@ -23,6 +23,7 @@ from me2e_compress.passes.fuse_operators.fused_form import (
 )
 from me2e_compress.passes.fuse_operators.numeric_check import (
     Proofs,
+    draw_views,
     nodes_between,
     take_back,
 )
@@ -213,13 +214,14 @@ def _prove(call: FusedCall, result: ir.Value, views: Sequence[View]) -> None:
     assert fused is not None
     assert isinstance(body, ir.Graph)
     known, stops = set(body.initializers), list(filter(None, fused.inputs))
+    draw = functools.partial(draw_views, views)
     own = raw_own_form().inputs_to_own(call, tuple(fused.inputs), {})
     after = [each for each in own[3:] if each is not None]
     try:
         for old, new in zip(call.node.inputs[3:], after, strict=True):
             if old is None or any(view.value is old for view in views):
                 continue  # it is read as it is
-            error = _proofs(call.opset).error(old, new, views)
+            error = _proofs(call.opset).error(old, new, draw)
             if not error <= TOLERANCE:
                 raise PreconditionError(f"{old.name} would differ by {error:.1e}")
     finally:

@@ -2,6 +2,8 @@
 
 import contextlib
 import dataclasses
+import functools
+from collections.abc import Callable, Sequence
 from typing import ClassVar
 
 import onnx_ir as ir
@@ -18,9 +20,11 @@ from me2e_compress.graph.rewrite import (
 )
 from me2e_compress.operators import OWN_DOMAIN, FusedCall
 from me2e_compress.passes.base import Context, Pass, PassResult
-from me2e_compress.passes.fuse_operators import decomposed, fused_form
+from me2e_compress.passes.fuse_operators import decomposed, fused_form, gathered
 from me2e_compress.passes.fuse_operators.numeric_check import (
+    Draw,
     Proofs,
+    draw_views,
     nodes_between,
     piece_of,
     run_piece,
@@ -74,13 +78,17 @@ class FuseOperators(Pass):
 
     def run(self, model: ir.Model, context: Context) -> PassResult:
         """Try every GridSample that is read, in the graph and its bodies."""
-        if not any(map(_is_sampler, nodes_in(model.graph))):
+        samplers_of = (_is_sampler, gathered.is_sampler)
+        if not any(is_one(n) for n in nodes_in(model.graph) for is_one in samplers_of):
             return PassResult(model, 0)
         opset, unread = opset_of(model), remove_dead(model.graph)
         run = _Run(self, opset, value_names(model.graph), Proofs(opset, context.seed))
-        done = samplers = 0
+        done = samplers = sampled = 0
         left: list[str] = []
         for body in graphs_of(model.graph):
+            written, reasons = run.sample(body)
+            sampled += written
+            left += reasons
             for node in list(body):
                 if node.graph is not body or not _is_sampler(node):
                     continue
@@ -91,14 +99,16 @@ class FuseOperators(Pass):
                     left.append(f"left {node.name}: {error}")
         if done:
             model.opset_imports.setdefault(OWN_DOMAIN, 1)
+        if done or sampled:
             remove_dead(model.graph)
         fused = (
             f"fused: {done} deformable attentions of {samplers} GridSample,"
             f" {run.worst:.1g} apart at most",
         )
         swept = (f"removed: {unread} unread",) * bool(unread)
-        notes = (*(fused if done else ()), *left, *swept)
-        return PassResult(model, done + unread, notes)
+        by_gather = (f"written as GridSample: {sampled} samplings by Gather",)
+        notes = (*(fused if done else ()), *by_gather * bool(sampled), *left, *swept)
+        return PassResult(model, done + sampled + unread, notes)
 
 
 def _is_sampler(node: ir.Node) -> bool:
@@ -123,19 +133,73 @@ class _Run:
             with contextlib.suppress(PreconditionError):
                 plan = fused_form.plan(decomposed.with_images(match))
         plan = fused_form.plan(match) if plan is None else plan
-        old = plan.result.value
+        inputs = [view.value for view in plan.inputs]
+        write = functools.partial(fused_form.write, plan)
+        draw = functools.partial(draw_views, plan.inputs)
+        new, error, nodes = self._replace(body, plan.result.value, inputs, write, draw)
+        self.worst = max(self.worst, error)
+        self._fold(body, new, plan)
+        _remove_unread(nodes)
+        return len(match.levels)
+
+    def sample(self, body: ir.Graph) -> tuple[int, list[str]]:
+        """Write sampling by Gather as GridSample; return how often, and what stays."""
+        done, left = 0, dict[tuple[ir.Value, ...], str]()
+        for node in list(body):
+            if node.graph is not body or not gathered.is_sampler(node):
+                continue
+            floors, reason = gathered.floors_of(node), ""
+            if floors in left:
+                continue
+            try:
+                reason = self._sample(body, node)
+            except PreconditionError as error:
+                reason = str(error)
+            if reason:
+                left[floors] = f"left {node.name}: {reason}"
+            done += not reason
+        return done, list(left.values())
+
+    def _sample(self, body: ir.Graph, node: ir.Node) -> str:
+        """Write the sampling that a Gather is part of; return why it stays, or ""."""
+        reason = "it is not a sum of four corners"
+        for guess in gathered.guesses(node, self.opset):
+            try:
+                _, _, nodes = self._replace(
+                    *(body, guess.result.value, guess.inputs, guess.write, guess.draw),
+                    least=guess.draws,
+                )
+            except (PreconditionError, GraphError) as error:
+                reason = str(error)
+            else:
+                _remove_unread(nodes)
+                return ""
+        return reason
+
+    def _replace(
+        self,
+        body: ir.Graph,
+        old: ir.Value,
+        inputs: Sequence[ir.Value],
+        write: Callable[[FusedCall], ir.Value],
+        draw: Draw,
+        least: int = 1,
+    ) -> tuple[ir.Value, float, list[ir.Node]]:
+        """Write what may stand for a value, and put it there if that is proven.
+
+        Returns the new value, how far it is apart, and nodes that may be unread now.
+        """
         root, known = old.producer(), set(body.initializers)
         if root is None:
             raise PreconditionError(f"nothing makes {old.name}")
-        inputs = [view.value for view in plan.inputs]
         matched = nodes_between(old, inputs)
-        # Write the fused node next to the old nodes
+        # Write the new nodes next to the old ones
         call = FusedCall(root, opset=self.opset, by=self.current.name, names=self.names)
-        new = fused_form.write(plan, call)
+        new = write(call)
         made = nodes_between(new, inputs)
-        # Keep it only if both compute the same
+        # Keep them only if both compute the same
         try:
-            error = self.proofs.error(old, new, plan.inputs)
+            error = self.proofs.error(old, new, draw, least)
             if not error <= self.current.tolerance:
                 raise PreconditionError(
                     f"as one node it differs by {error:.1e} (allowed"
@@ -144,16 +208,11 @@ class _Run:
         except (PreconditionError, GraphError):
             take_back(body, made, known)
             raise
-        self.worst = max(self.worst, error)
-        # Replace the old result and clean up, readers first
         for each in made:
             inherit(each, [root, *matched], by=self.current.name)
         replace_value(old, new)
-        self._fold(body, new, plan)
-        for each in reversed([*matched, *made]):
-            if each.graph is not None and not any(map(is_read, each.outputs)):
-                each.graph.remove(each, safe=True)
-        return len(match.levels)
+        # Readers first
+        return new, error, [*made[::-1], *matched[::-1]]
 
     def _fold(self, body: ir.Graph, new: ir.Value, plan: fused_form.Plan) -> None:
         """Store operands that are computed of constants alone."""
@@ -172,3 +231,9 @@ class _Run:
             array = run_piece(piece_of(value, (), self.opset), ())
             name = f"{value.name}_constant"
             node.replace_input_with(index, add_constant(body, array, name, self.names))
+
+
+def _remove_unread(nodes: Sequence[ir.Node]) -> None:
+    for each in nodes:
+        if each.graph is not None and not any(map(is_read, each.outputs)):
+            each.graph.remove(each, safe=True)

@@ -1,0 +1,315 @@
+"""Find bilinear sampling that is written with Gather, and write it as GridSample.
+
+mmcv's ``bilinear_grid_sample`` and the like spare TensorRT's GridSample: the floor of
+each position, the indices of the four corners, and the sum of what is gathered, times
+its share. How corners are masked, weighted and added up is left to the proof.
+"""
+
+import dataclasses
+import itertools
+import math
+from collections.abc import Iterator
+
+import numpy as np
+import onnx_ir as ir
+
+from me2e_compress.errors import PreconditionError
+from me2e_compress.graph import array_of, is_standard, static_shape
+from me2e_compress.graph.nodes import (
+    ELEMENTWISE,
+    LAYOUT_OPERATORS,
+    Array,
+    Numbers,
+    maker,
+    producer_of,
+    sole_reader,
+)
+from me2e_compress.operators import FusedCall
+from me2e_compress.operators.bilinear import GRID_SAMPLE_OPSET
+from me2e_compress.operators.call import Attributes
+from me2e_compress.passes.digits import Digit, flat, regrouped, sizes, whole
+from me2e_compress.passes.fuse_operators.fused_form import laid_out
+from me2e_compress.passes.fuse_operators.numeric_check import nodes_between
+from me2e_compress.passes.fuse_operators.views import Selection, View, sources
+
+AT, PAIR, CHANNEL, ROW, COLUMN = "at", "pair", "channel", "row", "column"
+"""The axes: all positions of all images, x before y, and those of a feature map."""
+
+_INDEX = LAYOUT_OPERATORS | {*ELEMENTWISE, "Cast", "Clip", "Concat", "Expand", "Where"}
+_INDEX |= {"Gather", "Slice", "Split", "Tile"}
+_SUMS = ("Add", "ReduceSum", "Sum")
+_AFTER = LAYOUT_OPERATORS | {*_SUMS, "Concat", "Mul", "Where"}
+
+BEYOND = 3.0
+"""How many pixels beyond a feature map's edges positions are drawn."""
+
+LEAST_POSITIONS = 200
+"""Fewer are not of all kinds: more than one draw is compared."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Sampling:
+    """A guess at what a sum of gathered corners samples, to be proven.
+
+    Attributes:
+        result: the sum.
+        image: the feature map, of ``shape`` [batch, channels, rows, columns].
+        at: where: one value of both axes, or x and y.
+        scale: what takes that to pixels, for x and for y.
+        shift: what is then added; 0 is the middle of the first pixel.
+    """
+
+    result: View
+    image: View
+    shape: tuple[int, int, int, int]
+    at: tuple[View, ...]
+    scale: tuple[float, float]
+    shift: tuple[float, float]
+
+    @property
+    def inputs(self) -> tuple[ir.Value, ...]:
+        """What it reads."""
+        return (self.image.value, *(view.value for view in self.at))
+
+    @property
+    def draws(self) -> int:
+        """How many draws hold enough positions."""
+        return math.ceil(LEAST_POSITIONS / math.prod(sizes(self.at[0].layout)))
+
+    def draw(self, random: np.random.Generator) -> dict[ir.Value, Array]:
+        """Draw normal numbers for the image, and positions inside and around it."""
+        image = random.standard_normal(sizes(self.image.layout))
+        drawn: dict[ir.Value, Array] = {self.image.value: image.astype(np.float32)}
+        for place, view in enumerate(self.at):
+            axes = [any(digit.axis == PAIR for digit in each) for each in view.layout]
+            part = slice(None) if any(axes) else slice(place, place + 1)
+            size, scale, shift = (
+                np.reshape(each[part], [2 if is_pair else 1 for is_pair in axes])
+                for each in (self.shape[:1:-1], self.scale, self.shift)
+            )
+            # Half of them anywhere, half at the edges, a tenth in the middle of pixels
+            shape = sizes(view.layout)
+            pixels = random.uniform(-BEYOND, size + BEYOND - 1, shape)
+            low = random.uniform(-BEYOND, 1, shape)
+            edge = np.where(random.random(shape) < 0.5, low, size - 1 - low)
+            pixels = np.where(random.random(shape) < 0.5, pixels, edge)
+            pixels = np.where(random.random(shape) < 0.1, pixels.round(), pixels)
+            drawn[view.value] = ((pixels - shift) / scale).astype(np.float32)
+        return drawn
+
+    def write(self, call: FusedCall) -> ir.Value:
+        """Write the GridSample, and what brings its operands and result in shape."""
+        batch, channels, rows, columns = self.shape
+        layout = self.result.layout
+        places = tuple(each for each in layout if each and each[-1].axis == AT)
+        total = math.prod(sizes(places))
+        width = math.gcd(total // batch, sizes((places or ((),))[-1:])[0])
+        form = regrouped((whole(AT, total),), (batch, total // batch // width, width))
+        assert form is not None
+        first, second = form[0], whole(CHANNEL, channels)
+        maps = (first, second, whole(ROW, rows), whole(COLUMN, columns))
+        image = laid_out(call, self.image, maps)
+        pair = whole(PAIR, 2) if len(self.at) == 1 else ()
+        grid = call.concat([laid_out(call, v, (*form, pair)) for v in self.at], 3)
+        # Take the positions to -1..1
+        scale, shift, corners = self._normalized()
+        for op_type, each, nothing in (("Mul", scale, 1.0), ("Add", shift, 0.0)):
+            numbers = each.round(6) if np.allclose(each, each.round(6)) else each
+            if (numbers != nothing).any():
+                number = numbers if np.ptp(numbers) else numbers[:1]
+                grid = call.add(op_type, [grid, call.numbers(number, grid)])
+        mode = "bilinear" if call.opset < 20 else "linear"
+        options: Attributes = {"mode": mode, "align_corners": int(corners)}
+        made = call.add("GridSample", [image, grid], options)
+        return laid_out(call, View(made, (first, second, *form[1:])), layout)
+
+    def _normalized(self) -> tuple[Numbers, Numbers, bool]:
+        """Return scale and shift to -1..1, and if these are the outer pixels' middles.
+
+        They are where the positions then were in -1..1, or 0..1, at first.
+        """
+        size = np.array(self.shape[:1:-1], np.float64)
+        scale, shift = 2 * np.array(self.scale), 2 * np.array(self.shift)
+        if (size > 1).all():
+            aligned = scale / (size - 1), shift / (size - 1) - 1
+            for known in (((1.0,), (0.0,)), ((2.0,), (-1.0,))):
+                if np.allclose(aligned, known):
+                    return (*aligned, True)
+        return scale / size, (shift + 1) / size - 1, False
+
+
+def is_sampler(node: ir.Node) -> bool:
+    """Return whether a node gathers at indices that are made of floors."""
+    gathers = node.op_type in ("Gather", "GatherElements", "GatherND")
+    return gathers and is_standard(node) and bool(floors_of(node))
+
+
+def floors_of(node: ir.Node) -> tuple[ir.Value, ...]:
+    """Return the values whose floors a Gather's indices are made of."""
+    found = (n.inputs[0] for n in _behind(node.inputs[1]) if n.op_type == "Floor")
+    return tuple(dict.fromkeys(value for value in found if value is not None))
+
+
+def _behind(index: ir.Value | None) -> list[ir.Node]:
+    """List the nodes that make an index, back to the floors of positions."""
+    found: dict[ir.Node, None] = {}
+    waiting = [index]
+    while waiting:
+        node = producer_of(waiting.pop())
+        if node is None or node in found or not is_standard(node):
+            continue
+        if node.op_type == "Floor" or node.op_type in _INDEX:
+            found[node] = None
+            waiting.extend(() if node.op_type == "Floor" else node.inputs)
+    return list(found)
+
+
+def guesses(node: ir.Node, opset: int) -> Iterator[Sampling]:
+    """Guess what the sum of corners samples that a Gather takes part in, best first."""
+    if opset < GRID_SAMPLE_OPSET:
+        raise PreconditionError(f"GridSample needs opset {GRID_SAMPLE_OPSET}")
+    image, frames, widths = _image(node)
+    for at, scale, shift in _positions(floors_of(node)):
+        total = math.prod(sizes(at[0].layout)) // (3 - len(at))
+        inputs = {image, *(view.value for view in at)}
+        for result in _sums(node):
+            if not _is_closed(result, inputs):
+                continue
+            for shape, frame in itertools.product(
+                _shapes(image, result, widths, total), frames
+            ):
+                moved = shift[0] - frame, shift[1] - frame
+                for taken, made in _layouts(image, result, shape, total):
+                    yield Sampling(made, taken, shape, at, scale, moved)
+
+
+def _image(node: ir.Node) -> tuple[ir.Value, tuple[int, ...], list[int]]:
+    """Return the feature map of a Gather, borders it may have, and numbers of columns.
+
+    The border is a Pad. Without one, the columns are a factor of the index, or a
+    dimension.
+    """
+    data = value = node.inputs[0]
+    while (before := maker(value, *LAYOUT_OPERATORS, "Pad")) is not None:
+        value = before.inputs[0]
+        small, large = static_shape(value), static_shape(before.outputs[0])
+        if before.op_type != "Pad" or value is None or not (small and large):
+            continue
+        sides = [pair for pair in zip(small, large, strict=True) if pair[0] != pair[1]]
+        if sides:
+            inner, outer = sides[-1]
+            return value, (0, (outer - inner) // 2), [inner]
+    shape = static_shape(data)
+    if data is None or shape is None or data.dtype != ir.DataType.FLOAT:
+        raise PreconditionError("it gathers no float32 of a known shape")
+    products = [each for each in _behind(node.inputs[1]) if each.op_type == "Mul"]
+    arrays = [array_of(value) for each in products for value in each.inputs]
+    factors = [
+        int(each.item()) for each in arrays if each is not None and each.size == 1
+    ]
+    return data, (0,), [n for n in dict.fromkeys((*factors, *shape[1:])) if n > 0]
+
+
+_Shape = tuple[int, int, int, int]
+
+
+def _shapes(
+    image: ir.Value, result: ir.Value, widths: list[int], total: int
+) -> Iterator[_Shape]:
+    have, made = static_shape(image) or (0,), static_shape(result) or (0,)
+    channels, rest = divmod(math.prod(made), total)
+    for batch, columns in itertools.product(
+        dict.fromkeys((have[0], made[0], 1)), widths
+    ):
+        if rest or not channels or not batch or total % batch:
+            continue
+        rows, odd = divmod(math.prod(have), batch * channels * columns)
+        if not odd:
+            yield batch, channels, rows, columns
+
+
+def _layouts(
+    image: ir.Value, result: ir.Value, shape: _Shape, total: int
+) -> Iterator[tuple[View, View]]:
+    """Describe image and result with their channels before or behind all else."""
+    batch, channels, rows, columns = shape
+    outer = (Digit(AT, total // batch, batch),) if batch > 1 else ()
+    inner, channel = whole(AT, total // batch), whole(CHANNEL, channels)
+    pixels = (*whole(ROW, rows), *whole(COLUMN, columns))
+    orders = [
+        [(outer, channel, each), (outer, each, channel)] for each in (pixels, inner)
+    ]
+    for one, two in itertools.product(*orders):
+        have = regrouped(one, static_shape(image) or ())
+        made = regrouped(two, static_shape(result) or ())
+        if have is not None and made is not None:
+            yield View(image, have), View(result, made)
+
+
+_Positions = tuple[tuple[View, ...], tuple[float, float], tuple[float, float]]
+
+
+def _positions(floors: tuple[ir.Value, ...]) -> Iterator[_Positions]:
+    """Trace positions back to where their elements come from: to one value first."""
+    walks: dict[tuple[object, ...], list[View | Selection]] = {}
+    for value in floors:
+        walk = list(sources(_position(value, is_pair=len(floors) == 1)))
+        end = walk[-1]
+        if isinstance(end, Selection):
+            walks.setdefault((end.view.value, end.axis, end.start), walk)
+        else:
+            walks.setdefault((end.value,), walk)
+    ordered = sorted(walks.values(), key=lambda walk: getattr(walk[-1], "start", 0))
+    far = [[each for each in walk if isinstance(each, View)][-1] for walk in ordered]
+    if len(far) == 1 and any(digit.axis == PAIR for digit in flat(far[0].layout)):
+        yield _plain(far), (far[0].scale,) * 2, (far[0].shift,) * 2
+    if len(far) != 2:
+        return
+    parts = [walk[-1] for walk in ordered if isinstance(walk[-1], Selection)]
+    if [part.start for part in parts] == [0, 1]:
+        (x, y), axis = (part.view for part in parts), parts[0].axis
+        size = (static_shape(x.value) or ())[axis]
+        if x.value is y.value and x.layout == y.layout and size == 2:
+            layout = (*x.layout[:axis], whole(PAIR, 2), *x.layout[axis + 1 :])
+            yield (View(x.value, layout),), (x.scale, y.scale), (x.shift, y.shift)
+    for x, y in itertools.permutations(far):
+        yield _plain([x, y]), (x.scale, y.scale), (x.shift, y.shift)
+
+
+def _plain(views: list[View]) -> tuple[View, ...]:
+    return tuple(View(view.value, view.layout) for view in views)
+
+
+def _position(value: ir.Value, *, is_pair: bool) -> View:
+    """Describe what a floor is taken of, or what that was before it was clipped."""
+    while (clip := maker(value, "Clip")) is not None and clip.inputs[0] is not None:
+        value = clip.inputs[0]
+    shape = static_shape(value)
+    if shape is None:
+        raise PreconditionError("its shapes are not known: run fold-constants first")
+    is_pair = is_pair and shape[-1:] == (2,)
+    where = shape[:-1] if is_pair else shape
+    layout = regrouped((whole(AT, math.prod(where)),), where)
+    assert layout is not None
+    return View(value, (*layout, whole(PAIR, 2)) if is_pair else layout)
+
+
+def _sums(node: ir.Node) -> list[ir.Value]:
+    """Return the sums that follow a Gather, the last first."""
+    found: list[ir.Value] = []
+    value = node.outputs[0]
+    while (reader := sole_reader(value)) is not None and is_standard(reader):
+        if reader.op_type not in _AFTER:
+            break
+        value = reader.outputs[0]
+        if reader.op_type in _SUMS and static_shape(value) is not None:
+            found.append(value)
+    return found[::-1]
+
+
+def _is_closed(result: ir.Value, inputs: set[ir.Value]) -> bool:
+    """Return whether a value is made of these values and constants alone."""
+    between = nodes_between(result, list(inputs))
+    made = {value for node in between for value in node.outputs}
+    read = {value for node in between for value in node.inputs if value is not None}
+    return all(array_of(value) is not None for value in read - made - inputs)
