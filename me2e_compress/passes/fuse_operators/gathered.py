@@ -43,7 +43,7 @@ _AFTER = LAYOUT_OPERATORS | {*_SUMS, "Concat", "Mul", "Where"}
 BEYOND = 3.0
 """How many pixels beyond a feature map's edges positions are drawn."""
 
-LEAST_POSITIONS = 200
+LEAST_POSITIONS = 60
 """Fewer are not of all kinds: more than one draw is compared."""
 
 

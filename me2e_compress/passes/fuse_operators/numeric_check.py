@@ -89,6 +89,9 @@ DRAWS = 8
 feature map in a third of all draws."""
 
 
+HOPELESS = 0.1
+"""No further draws are compared once a difference is that large, relative."""
+
 Draw: TypeAlias = Callable[[np.random.Generator], Mapping[ir.Value, Array]]
 """Draws the inputs of two pieces."""
 
@@ -109,7 +112,7 @@ class Proofs:
     ) -> float:
         """Return max|a-b|/max|a| of two values that are computed from drawn inputs.
 
-        ``least`` draws are compared that are not all zeros.
+        At least ``least`` draws are compared, more while nothing but zeros comes out.
 
         Raises:
             PreconditionError: one of them reads another value too, or returns only
@@ -117,18 +120,18 @@ class Proofs:
             GraphError: onnxruntime cannot run it.
         """
         random = np.random.default_rng(self._seed)
-        drawn, errors = draw(random), list[float]()
+        drawn, apart, largest = draw(random), 0.0, 0.0
         pieces = [piece_of(value, [*drawn], self._opset) for value in (before, after)]
         key = (digest(pieces[0]), digest(pieces[1]))
         if key in self._known:
             return self._known[key]
-        for _ in range(DRAWS + least):
+        for count in range(1, DRAWS + least):
             feeds = list(drawn.values())
             a, b = (run_piece(piece, feeds).astype(np.float64) for piece in pieces)
-            if a.any():
-                errors.append(float(np.abs(a - b).max() / np.abs(a).max()))
-            if len(errors) == least:
-                self._known[key] = max(errors)
+            apart = max(apart, float(np.abs(a - b).max()))
+            largest = max(largest, float(np.abs(a).max()))
+            if largest and (count >= least or apart > HOPELESS * largest):
+                self._known[key] = apart / largest
                 return self._known[key]
             drawn = draw(random)
         raise PreconditionError("nothing but zeros comes out of random numbers")
