@@ -25,14 +25,26 @@ CORNER = {
 }
 
 
-def by_gather(op: str, *, pad: int, masked: bool) -> str:
+FLOOR = {
+    "apart": """g{n} = Gather<axis = 3>(grid, at{n}) h{n} = Add(g{n}, one)
+    s{n} = Mul(h{n}, half{n}) p{n} = Sub(s{n}, middle) f{n} = Floor(p{n})""",
+    "clipped": """g{n} = Gather<axis = 3>(grid, at{n}) h{n} = Add(g{n}, one)
+    s{n} = Mul(h{n}, half{n}) a{n} = Sub(s{n}, middle) p{n} = Clip(a{n}, before, behind)
+    f{n} = Floor(p{n})""",
+    "together": """p{n} = Gather<axis = 3>(both, at{n})
+    f{n} = Gather<axis = 3>(floors, at{n})""",
+}
+
+
+def by_gather(op: str, *, pad: int, masked: bool, floor: str) -> str:
     """Write out what samples ``image`` at ``grid``; return the lines."""
     lines = ["p = Pad(image, pads)" if pad else "p = Identity(image)", TAKEN[op]]
+    if floor == "together":
+        lines.append("""one_more = Add(grid, one) sized = Mul(one_more, halves)
+        both = Sub(sized, middle) floors = Floor(both)""")
     for n, c in itertools.product("xy", "01"):
         if c == "0":
-            lines.append(f"""g{n} = Gather<axis = 3>(grid, at{n}) h{n} = Add(g{n}, one)
-            s{n} = Mul(h{n}, half{n}) p{n} = Sub(s{n}, by) f{n} = Floor(p{n})
-            z{n} = Sub(p{n}, f{n})""")
+            lines.append(f"""{FLOOR[floor].format(n=n)} z{n} = Sub(p{n}, f{n})""")
         lines.append(f"""m{c}{n} = Add(f{n}, step{c})
         c{c}{n} = Clip(m{c}{n}, zero, end{n}) i{c}{n} = Cast<to = 7>(c{c}{n})
         v{c}{n} = {("Sub(one, z", "Identity(z")[int(c)]}{n})""")
@@ -54,11 +66,14 @@ def by_gather(op: str, *, pad: int, masked: bool) -> str:
     return text.replace("float y", "float[6,4,9] y")
 
 
-def model_of(op: str, pad: int = 1, masked: bool = False, corners: int = 0) -> ir.Model:
+def model_of(
+    op: str, pad: int = 1, masked: bool = False, corners: int = 0, floor: str = "apart"
+) -> ir.Model:
     rows, columns, image = 5 + 2 * pad, 7 + 2 * pad, np.arange(6).reshape(6, 1, 1)
     floats = {"one": 1, "zero": 0, "step0": pad, "step1": pad + 1, "endx": columns - 1}
-    floats |= {"endy": rows - 1, "by": 0.5}
+    floats |= {"endy": rows - 1, "middle": 0.5}
     floats |= {"halfx": (7 - corners) / 2, "halfy": (5 - corners) / 2}
+    floats |= {"halves": [3.5, 2.5], "before": -1.5, "behind": 7.5}
     whole = {"atx": 0, "aty": 1, "width": columns, "last": [-1], "first_axis": [1]}
     whole |= {"lines": [6, 4, -1], "table": [-1, 4], "line": [6, 1, 27]}
     whole |= {"wide": [6, 4, 27], "four": [6, 4, 9, 3], "first": image * rows * columns}
@@ -66,16 +81,24 @@ def model_of(op: str, pad: int = 1, masked: bool = False, corners: int = 0) -> i
     whole |= {"image_of": np.broadcast_to(image[..., None], (6, 9, 3, 1))}
     known = {name: np.array(each, np.int64) for name, each in whole.items()}
     known |= {name: np.float32(each) for name, each in floats.items()}
-    text = by_gather(op, pad=pad, masked=masked)
+    text = by_gather(op, pad=pad, masked=masked, floor=floor)
     for n in "xy" * corners:
-        text = text.replace(f"Sub(s{n}, by)", f"Identity(s{n})")
+        text = text.replace(f"Sub(s{n}, middle)", f"Identity(s{n})")
     return read(text, **known)
 
 
 @pytest.mark.parametrize("op", TAKEN)
-@pytest.mark.parametrize(("pad", "masked"), [(1, False), (0, True)])
-def test_corners_are_found(op: str, pad: int, masked: bool) -> None:
-    model = model_of(op, pad, masked)
+@pytest.mark.parametrize(
+    ("pad", "masked", "floor"),
+    [
+        (1, False, "apart"),
+        (0, True, "apart"),
+        (1, False, "clipped"),
+        (0, True, "together"),
+    ],
+)
+def test_corners_are_found(op: str, pad: int, masked: bool, floor: str) -> None:
+    model = model_of(op, pad, masked, floor=floor)
     result = fused(model)
     assert FUSED in ops(model)
     assert not {"Floor", op} & {*ops(model)}
@@ -89,6 +112,14 @@ def test_aligned_corners_stay_aligned(op: str) -> None:
     (node,) = (node for node in model.graph if node.op_type == "GridSample")
     assert node.attributes["align_corners"].value == 1
     assert node.inputs[1] is model.graph.inputs[1]
+
+
+def test_positions_may_have_y_first() -> None:
+    model = model_of("Gather")
+    for name, index in (("atx", 1), ("aty", 0)):
+        model.graph.initializers[name].const_value = ir.tensor(np.int64(index))
+    fused(model)
+    assert FUSED in ops(model)
 
 
 @pytest.mark.parametrize(

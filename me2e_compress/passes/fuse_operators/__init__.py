@@ -48,6 +48,9 @@ class FuseOperators(Pass):
     GridSample is reported silently wrong from TensorRT 10.14 to 11.1 (NVIDIA/TensorRT
     issue 4813). ``translate-plugins`` turns the fused node into the plugin's node.
 
+    Bilinear sampling that is written with Gather (floors, four corners, their shares,
+    zeros outside) is GridSample first, from opset 16 on, if that is proven likewise.
+
     Matches are found by what nodes compute, whatever the exporter and the names: from
     each GridSample (bilinear, zeros outside, corners not aligned) through operators
     that only move elements, with one level or several, with heads in the batch or

@@ -259,10 +259,11 @@ def _positions(floors: tuple[ir.Value, ...]) -> Iterator[_Positions]:
             walks.setdefault((end.view.value, end.axis, end.start), walk)
         else:
             walks.setdefault((end.value,), walk)
-    ordered = sorted(walks.values(), key=lambda walk: getattr(walk[-1], "start", 0))
+    ordered = sorted(walks.values(), key=_start)
     far = [[each for each in walk if isinstance(each, View)][-1] for walk in ordered]
     if len(far) == 1 and any(digit.axis == PAIR for digit in flat(far[0].layout)):
-        yield _plain(far), (far[0].scale,) * 2, (far[0].shift,) * 2
+        scale, shift = far[0].scale, far[0].shift
+        yield _plain(far), (scale, scale), (shift, shift)
     if len(far) != 2:
         return
     parts = [walk[-1] for walk in ordered if isinstance(walk[-1], Selection)]
@@ -274,6 +275,10 @@ def _positions(floors: tuple[ir.Value, ...]) -> Iterator[_Positions]:
             yield (View(x.value, layout),), (x.scale, y.scale), (x.shift, y.shift)
     for x, y in itertools.permutations(far):
         yield _plain([x, y]), (x.scale, y.scale), (x.shift, y.shift)
+
+
+def _start(walk: list[View | Selection]) -> int:
+    return walk[-1].start if isinstance(walk[-1], Selection) else 0
 
 
 def _plain(views: list[View]) -> tuple[View, ...]:
