@@ -3,7 +3,7 @@
 import contextlib
 import dataclasses
 import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import ClassVar
 
 import onnx_ir as ir
@@ -81,37 +81,27 @@ class FuseOperators(Pass):
 
     def run(self, model: ir.Model, context: Context) -> PassResult:
         """Try every GridSample that is read, in the graph and its bodies."""
-        samplers_of = (_is_sampler, gathered.is_sampler)
-        if not any(is_one(n) for n in nodes_in(model.graph) for is_one in samplers_of):
+        nodes = nodes_in(model.graph)
+        if not any(_is_sampler(node) or gathered.is_sampler(node) for node in nodes):
             return PassResult(model, 0)
         opset, unread = opset_of(model), remove_dead(model.graph)
         run = _Run(self, opset, value_names(model.graph), Proofs(opset, context.seed))
-        done = samplers = sampled = 0
         left: list[str] = []
         for body in graphs_of(model.graph):
-            written, reasons = run.sample(body)
-            sampled += written
-            left += reasons
-            for node in list(body):
-                if node.graph is not body or not _is_sampler(node):
-                    continue
-                try:
-                    samplers += run.fuse(body, node)
-                    done += 1
-                except (PreconditionError, GraphError) as error:
-                    left.append(f"left {node.name}: {error}")
-        if done:
+            left += run.tried(body, gathered.is_sampler, run.sample)
+            left += run.tried(body, _is_sampler, run.fuse)
+        if run.fused:
             model.opset_imports.setdefault(OWN_DOMAIN, 1)
-        if done or sampled:
+        if run.fused or run.sampled:
             remove_dead(model.graph)
         fused = (
-            f"fused: {done} deformable attentions of {samplers} GridSample,"
+            f"fused: {run.fused} deformable attentions of {run.samplers} GridSample,"
             f" {run.worst:.1g} apart at most",
         )
+        sampled = (f"written as GridSample: {run.sampled} samplings by Gather",)
         swept = (f"removed: {unread} unread",) * bool(unread)
-        by_gather = (f"written as GridSample: {sampled} samplings by Gather",)
-        notes = (*(fused if done else ()), *by_gather * bool(sampled), *left, *swept)
-        return PassResult(model, done + sampled + unread, notes)
+        notes = (*fused * bool(run.fused), *sampled * bool(run.sampled), *left, *swept)
+        return PassResult(model, run.fused + run.sampled + unread, notes)
 
 
 def _is_sampler(node: ir.Node) -> bool:
@@ -119,17 +109,34 @@ def _is_sampler(node: ir.Node) -> bool:
 
 
 class _Run:
-    """Fuses one match after another; ``worst`` is the largest error that was let by."""
+    """Writes one match after another, counts them, and keeps the worst error."""
 
     def __init__(
         self, current: FuseOperators, opset: int, names: set[str], proofs: Proofs
     ) -> None:
         self.current, self.opset, self.names = current, opset, names
         self.proofs = proofs
+        self.fused = self.samplers = self.sampled = 0
         self.worst = 0.0
+        self._failed: set[tuple[ir.Value, ...]] = set()
 
-    def fuse(self, body: ir.Graph, node: ir.Node) -> int:
-        """Fuse the attention of a GridSample; return how many GridSample it has."""
+    def tried(
+        self,
+        body: ir.Graph,
+        is_one: Callable[[ir.Node], bool],
+        rewrite: Callable[[ir.Graph, ir.Node], None],
+    ) -> Iterator[str]:
+        """Rewrite every node of a kind; say of each that stays why it does."""
+        for node in list(body):
+            if node.graph is not body or not is_one(node):
+                continue
+            try:
+                rewrite(body, node)
+            except (PreconditionError, GraphError) as error:
+                yield f"left {node.name}: {error}"
+
+    def fuse(self, body: ir.Graph, node: ir.Node) -> None:
+        """Fuse the attention of a GridSample."""
         match, plan = decomposed.find(node), None
         # With the following sum over images, if that can be included
         if self.current.merge_images:
@@ -139,45 +146,32 @@ class _Run:
         inputs = [view.value for view in plan.inputs]
         write = functools.partial(fused_form.write, plan)
         draw = functools.partial(draw_views, plan.inputs)
-        new, error, nodes = self._replace(body, plan.result.value, inputs, write, draw)
+        new, error, unread = self._replace(body, plan.result.value, inputs, write, draw)
         self.worst = max(self.worst, error)
         self._fold(body, new, plan)
-        _remove_unread(nodes)
-        return len(match.levels)
+        _remove_unread(unread)
+        self.fused += 1
+        self.samplers += len(match.levels)
 
-    def sample(self, body: ir.Graph) -> tuple[int, list[str]]:
-        """Write sampling by Gather as GridSample; return how often, and what stays."""
-        done, left = 0, dict[tuple[ir.Value, ...], str]()
-        for node in list(body):
-            if node.graph is not body or not gathered.is_sampler(node):
-                continue
-            floors, reason = gathered.floors_of(node), ""
-            if floors in left:
-                continue
-            try:
-                reason = self._sample(body, node)
-            except PreconditionError as error:
-                reason = str(error)
-            if reason:
-                left[floors] = f"left {node.name}: {reason}"
-            done += not reason
-        return done, list(left.values())
-
-    def _sample(self, body: ir.Graph, node: ir.Node) -> str:
-        """Write the sampling that a Gather is part of; return why it stays, or ""."""
-        reason = "it is not a sum of four corners"
+    def sample(self, body: ir.Graph, node: ir.Node) -> None:
+        """Write the sampling that a Gather is part of as GridSample."""
+        floors = gathered.floors_of(node)
+        if floors in self._failed:  # a corner of one that stays
+            return
+        self._failed.add(floors)
+        reason: Exception = PreconditionError("it is not a sum of four corners")
         for guess in gathered.guesses(node, self.opset):
+            found = guess.result.value, guess.inputs, guess.write, guess.draw
             try:
-                _, _, nodes = self._replace(
-                    *(body, guess.result.value, guess.inputs, guess.write, guess.draw),
-                    least=guess.draws,
-                )
+                _, _, unread = self._replace(body, *found, least=guess.draws)
             except (PreconditionError, GraphError) as error:
-                reason = str(error)
-            else:
-                _remove_unread(nodes)
-                return ""
-        return reason
+                reason = error
+                continue
+            _remove_unread(unread)
+            self._failed.remove(floors)
+            self.sampled += 1
+            return
+        raise reason
 
     def _replace(
         self,

@@ -8,7 +8,7 @@ its share. How corners are masked, weighted and added up is left to the proof.
 import dataclasses
 import itertools
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 import onnx_ir as ir
@@ -19,18 +19,15 @@ from me2e_compress.graph.nodes import (
     ELEMENTWISE,
     LAYOUT_OPERATORS,
     Array,
-    Numbers,
     maker,
     producer_of,
     sole_reader,
 )
 from me2e_compress.operators import FusedCall
 from me2e_compress.operators.bilinear import GRID_SAMPLE_OPSET
-from me2e_compress.operators.call import Attributes
 from me2e_compress.passes.digits import Digit, flat, regrouped, sizes, whole
 from me2e_compress.passes.fuse_operators.fused_form import laid_out
-from me2e_compress.passes.fuse_operators.numeric_check import nodes_between
-from me2e_compress.passes.fuse_operators.views import Selection, View, sources
+from me2e_compress.passes.fuse_operators.views import Selection, View, joined, sources
 
 AT, PAIR, CHANNEL, ROW, COLUMN = "at", "pair", "channel", "row", "column"
 """The axes: all positions of all images, x before y, and those of a feature map."""
@@ -111,31 +108,21 @@ class Sampling:
         image = laid_out(call, self.image, maps)
         pair = whole(PAIR, 2) if len(self.at) == 1 else ()
         grid = call.concat([laid_out(call, v, (*form, pair)) for v in self.at], 3)
-        # Take the positions to -1..1
-        scale, shift, corners = self._normalized()
-        for op_type, each, nothing in (("Mul", scale, 1.0), ("Add", shift, 0.0)):
+        # To -1..1, with corners aligned where positions are so already
+        size = np.array(self.shape[:1:-1], np.float64)
+        scale, shift = 2 * np.array(self.scale), 2 * np.array(self.shift)
+        corners = np.allclose((scale, shift), size - 1) and size.min() > 1
+        scale, shift = (
+            scale / (size - corners),
+            (shift + 1 - corners) / (size - corners),
+        )
+        for op_type, each, nothing in (("Mul", scale, 1.0), ("Add", shift - 1, 0.0)):
             numbers = each.round(6) if np.allclose(each, each.round(6)) else each
             if (numbers != nothing).any():
                 number = numbers if np.ptp(numbers) else numbers[:1]
                 grid = call.add(op_type, [grid, call.numbers(number, grid)])
-        mode = "bilinear" if call.opset < 20 else "linear"
-        options: Attributes = {"mode": mode, "align_corners": int(corners)}
-        made = call.add("GridSample", [image, grid], options)
+        made = call.add("GridSample", [image, grid], {"align_corners": int(corners)})
         return laid_out(call, View(made, (first, second, *form[1:])), layout)
-
-    def _normalized(self) -> tuple[Numbers, Numbers, bool]:
-        """Return scale and shift to -1..1, and if these are the outer pixels' middles.
-
-        They are where the positions then were in -1..1, or 0..1, at first.
-        """
-        size = np.array(self.shape[:1:-1], np.float64)
-        scale, shift = 2 * np.array(self.scale), 2 * np.array(self.shift)
-        if (size > 1).all():
-            aligned = scale / (size - 1), shift / (size - 1) - 1
-            for known in (((1.0,), (0.0,)), ((2.0,), (-1.0,))):
-                if np.allclose(aligned, known):
-                    return (*aligned, True)
-        return scale / size, (shift + 1) / size - 1, False
 
 
 def is_sampler(node: ir.Node) -> bool:
@@ -171,10 +158,7 @@ def guesses(node: ir.Node, opset: int) -> Iterator[Sampling]:
     image, frames, widths = _image(node)
     for at, scale, shift in _positions(floors_of(node)):
         total = math.prod(sizes(at[0].layout)) // (3 - len(at))
-        inputs = {image, *(view.value for view in at)}
         for result in _sums(node):
-            if not _is_closed(result, inputs):
-                continue
             for shape, frame in itertools.product(
                 _shapes(image, result, widths, total), frames
             ):
@@ -251,38 +235,29 @@ _Positions = tuple[tuple[View, ...], tuple[float, float], tuple[float, float]]
 
 def _positions(floors: tuple[ir.Value, ...]) -> Iterator[_Positions]:
     """Trace positions back to where their elements come from: to one value first."""
-    walks: dict[tuple[object, ...], list[View | Selection]] = {}
-    for value in floors:
-        walk = list(sources(_position(value, is_pair=len(floors) == 1)))
-        end = walk[-1]
-        if isinstance(end, Selection):
-            walks.setdefault((end.view.value, end.axis, end.start), walk)
-        else:
-            walks.setdefault((end.value,), walk)
-    ordered = sorted(walks.values(), key=_start)
-    far = [[each for each in walk if isinstance(each, View)][-1] for walk in ordered]
+    walks = [list(sources(_position(v, is_pair=len(floors) == 1))) for v in floors]
+    far = [[each for each in walk if isinstance(each, View)][-1] for walk in walks]
     if len(far) == 1 and any(digit.axis == PAIR for digit in flat(far[0].layout)):
-        scale, shift = far[0].scale, far[0].shift
-        yield _plain(far), (scale, scale), (shift, shift)
+        yield _unscaled(far, far * 2)
     if len(far) != 2:
         return
-    parts = [walk[-1] for walk in ordered if isinstance(walk[-1], Selection)]
-    if [part.start for part in parts] == [0, 1]:
-        (x, y), axis = (part.view for part in parts), parts[0].axis
-        size = (static_shape(x.value) or ())[axis]
-        if x.value is y.value and x.layout == y.layout and size == 2:
-            layout = (*x.layout[:axis], whole(PAIR, 2), *x.layout[axis + 1 :])
-            yield (View(x.value, layout),), (x.scale, y.scale), (x.shift, y.shift)
-    for x, y in itertools.permutations(far):
-        yield _plain([x, y]), (x.scale, y.scale), (x.shift, y.shift)
+    ends = [walk[-1] for walk in walks]
+    for parts in itertools.permutations(e for e in ends if isinstance(e, Selection)):
+        plain = [
+            dataclasses.replace(part, view=View(part.view.value, part.view.layout))
+            for part in parts
+        ]
+        together = joined(plain, whole(PAIR, 2)) if len(parts) == 2 else None
+        if together is not None:
+            yield _unscaled([together], [part.view for part in parts])
+    for both in itertools.permutations(far):
+        yield _unscaled(both, both)
 
 
-def _start(walk: list[View | Selection]) -> int:
-    return walk[-1].start if isinstance(walk[-1], Selection) else 0
-
-
-def _plain(views: list[View]) -> tuple[View, ...]:
-    return tuple(View(view.value, view.layout) for view in views)
+def _unscaled(at: Sequence[View], axes: Sequence[View]) -> _Positions:
+    x, y = axes
+    plain = tuple(View(view.value, view.layout) for view in at)
+    return plain, (x.scale, y.scale), (x.shift, y.shift)
 
 
 def _position(value: ir.Value, *, is_pair: bool) -> View:
@@ -310,11 +285,3 @@ def _sums(node: ir.Node) -> list[ir.Value]:
         if reader.op_type in _SUMS and static_shape(value) is not None:
             found.append(value)
     return found[::-1]
-
-
-def _is_closed(result: ir.Value, inputs: set[ir.Value]) -> bool:
-    """Return whether a value is made of these values and constants alone."""
-    between = nodes_between(result, list(inputs))
-    made = {value for node in between for value in node.outputs}
-    read = {value for node in between for value in node.inputs if value is not None}
-    return all(array_of(value) is not None for value in read - made - inputs)

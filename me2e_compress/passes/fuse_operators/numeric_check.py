@@ -89,9 +89,6 @@ DRAWS = 8
 feature map in a third of all draws."""
 
 
-HOPELESS = 0.1
-"""No further draws are compared once a difference is that large, relative."""
-
 Draw: TypeAlias = Callable[[np.random.Generator], Mapping[ir.Value, Array]]
 """Draws the inputs of two pieces."""
 
@@ -130,7 +127,7 @@ class Proofs:
             a, b = (run_piece(piece, feeds).astype(np.float64) for piece in pieces)
             apart = max(apart, float(np.abs(a - b).max()))
             largest = max(largest, float(np.abs(a).max()))
-            if largest and (count >= least or apart > HOPELESS * largest):
+            if largest and count >= least:
                 self._known[key] = apart / largest
                 return self._known[key]
             drawn = draw(random)
