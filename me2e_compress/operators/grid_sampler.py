@@ -1,6 +1,7 @@
 """Sample an image or a volume at a grid of positions (torch's ``grid_sample``)."""
 
 import dataclasses
+import functools
 import itertools
 from collections.abc import Sequence
 from typing import ClassVar
@@ -32,6 +33,9 @@ from me2e_compress.operators.dialect import (
 
 _BILINEAR, _NEAREST, _BICUBIC = range(3)
 _ZEROS, _BORDER, _REFLECTION = range(3)
+BILINEAR = {"interpolation_mode": _BILINEAR, "padding_mode": _ZEROS, "align_corners": 0}
+"""Attributes of zeros outside, where -1 and 1 are the outer edges."""
+
 _CUBIC = -0.75
 """The parameter of torch's and ONNX's cubic convolution (Keys 1981 has -0.5)."""
 
@@ -51,69 +55,73 @@ def grid_by_gather(
     batch, channels = call.size(image, 0), call.size(image, 1)
     rows = call.reshape(image, (batch, channels, -1))
     rows = call.reshape(call.transpose(rows, (0, 2, 1)), (-1, channels))
-    # Neighbours along each axis
-    axes = [
-        _neighbours(call, at, size, attributes)
-        for at, size in zip(
-            call.split_last(grid, len(sizes)), reversed(sizes), strict=True
-        )
-    ]  # x first
-    # Add all combinations of neighbours
-    step = call.value_of(call.product(*sizes))
-    first = call.add("Mul", [call.counting(batch), step])
-    first = call.unsqueeze(first, range(1, rank - 1))
-    total: ir.Value | None = None
-    for near in itertools.product(*axes):
-        index, share = _one(call, near, sizes)
-        taken = call.add("Gather", [rows, call.add("Add", [first, index])], {"axis": 0})
-        taken = call.add("Mul", [taken, call.unsqueeze(share, (-1,))])
-        total = taken if total is None else call.add("Add", [total, taken])
-    if total is None:
-        raise PreconditionError(f"node {call.node.name}: {image.name} has no dimension")
+    # Neighbours along each axis, x first
+    axes, step = [], 1
+    for at, size in zip(
+        call.split_last(grid, len(sizes)), reversed(sizes), strict=True
+    ):
+        count = call.cast(call.value_of(size), at.dtype or ir.DataType.FLOAT)
+        last = call.add("Sub", [count, call.numbers(1.0, at)])
+        pixel = _pixel(call, at, count, last, attributes)
+        pixel = _padded(call, pixel, last, attributes)
+        axes.append(neighbours(call, pixel, count, step, nearest=mode == _NEAREST))
+        step = call.product(step, size)
+    first = call.add("Mul", [call.counting(batch), call.value_of(step)])
+    total = gathered(call, rows, call.unsqueeze(first, range(1, rank - 1)), axes)
     return call.transpose(total, (0, rank - 1, *range(1, rank - 1)))
 
 
-def _one(
-    call: FusedCall, near: Sequence[tuple[ir.Value, ir.Value]], sizes: Sequence[Size]
-) -> tuple[ir.Value, ir.Value]:
-    """Write index and share of one neighbour from those along x, y, ..."""
-    (index, share), *others = near
-    step = call.value_of(sizes[-1])
-    for (along, part), size in zip(others, reversed(sizes[:-1]), strict=True):
-        index = call.add("Add", [index, call.add("Mul", [along, step])])
-        share = call.add("Mul", [share, part])
-        known = step.const_value
-        step_size = step if known is None else int(known.numpy().item())
-        step = call.value_of(call.product(step_size, size))
-    return index, share
+def gathered(
+    call: FusedCall,
+    rows: ir.Value,
+    first: ir.Value,
+    axes: Sequence[Sequence[tuple[ir.Value, ir.Value]]],
+) -> ir.Value:
+    """Write the weighted sum of rows [rows, C] over all combinations of neighbours.
+
+    ``first`` is the row of the first pixel; ``axes`` are :func:`neighbours` along each.
+    """
+    parts = []
+    for near in itertools.product(*axes):
+        index, share = first, None
+        for along, part in near:
+            index = call.add("Add", [index, along])
+            share = part if share is None else call.add("Mul", [share, part])
+        assert share is not None
+        taken = call.add("Gather", [rows, index], {"axis": 0})
+        parts.append(call.add("Mul", [taken, call.unsqueeze(share, (-1,))]))
+    return functools.reduce(lambda one, two: call.add("Add", [one, two]), parts)
 
 
-def _neighbours(
-    call: FusedCall, at: ir.Value, size: Size, attributes: Attributes
+def neighbours(
+    call: FusedCall,
+    pixel: ir.Value,
+    count: ir.Value,
+    step: Size,
+    *,
+    nearest: bool = False,
 ) -> list[tuple[ir.Value, ir.Value]]:
-    """Write index and share of the pixels around a position on one axis."""
-    kind = at.dtype or ir.DataType.FLOAT
-    count = call.cast(call.value_of(size), kind)
-    one = call.numbers(1.0, at)
-    last = call.add("Sub", [count, one])
-    # The pixel position, after padding
-    pixel = _padded(call, _pixel(call, at, count, last, attributes), last, attributes)
-    # The neighbours and their shares
-    if attributes["interpolation_mode"] == _NEAREST:
-        edges: list[tuple[ir.Value, ir.Value | None]]
-        edges = [(call.add("Round", [pixel]), None)]
+    """Write index, times ``step``, and share of the pixels around a position.
+
+    One axis; outside of its ``count`` pixels the share is zero.
+    """
+    zero, one = call.numbers(0.0, pixel), call.numbers(1.0, pixel)
+    if nearest:
+        edges = [(call.add("Round", [pixel]), one)]
     else:
         low = call.add("Floor", [pixel])
         part = call.add("Sub", [pixel, low])
-        rest = call.add("Sub", [one, part])
-        edges = [(low, rest), (call.add("Add", [low, one]), part)]
-    # Neighbours outside of the image have no share
-    zero, found = call.numbers(0.0, at), []
+        edges = [
+            (low, call.add("Sub", [one, part])),
+            (call.add("Add", [low, one]), part),
+        ]
+    found = []
     for edge, share in edges:
-        kept = call.add("Max", [call.add("Min", [edge, last]), zero])
-        inside = call.cast(call.add("Equal", [kept, edge]), kind)
-        share = inside if share is None else call.add("Mul", [share, inside])
-        found.append((call.cast(kept, ir.DataType.INT64), share))
+        above = call.add("GreaterOrEqual", [edge, zero])
+        inside = call.add("And", [above, call.add("Less", [edge, count])])
+        kept, share = (call.add("Where", [inside, v, zero]) for v in (edge, share))
+        index = call.cast(kept, ir.DataType.INT64)
+        found.append((call.add("Mul", [index, call.value_of(step)]), share))
     return found
 
 
