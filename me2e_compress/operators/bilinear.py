@@ -168,10 +168,10 @@ def sample_levels_array(
         if not height * columns:
             continue
         # One image per head
-        rows = value[:, start : start + height * columns].transpose(0, 2, 3, 1)
+        image = value[:, start : start + height * columns].transpose(0, 2, 3, 1)
         grid = 2 * locations[:, :, :, level].transpose(0, 2, 1, 3, 4) - 1
         grid = np.broadcast_to(grid, (batch, heads, *grid.shape[2:]))
-        image = rows.reshape(-1, width, height, columns)
+        image = image.reshape(-1, width, height, columns)
         taken = grid_sample_array((image, grid.reshape(-1, *grid.shape[2:])), BILINEAR)
         taken = taken.reshape(batch, heads, width, *grid.shape[2:4])
         total += np.einsum("nmdqp,nqmp->nqmd", taken, weights[:, :, :, level])

@@ -3,7 +3,7 @@
 import dataclasses
 import functools
 import itertools
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import ClassVar
 
 import numpy as np
@@ -56,14 +56,13 @@ def grid_by_gather(
     rows = call.reshape(image, (batch, channels, -1))
     rows = call.reshape(call.transpose(rows, (0, 2, 1)), (-1, channels))
     # Neighbours along each axis, x first
-    axes, step = [], 1
+    step: Size = 1
+    axes = []
     for at, size in zip(
         call.split_last(grid, len(sizes)), reversed(sizes), strict=True
     ):
         count = call.cast(call.value_of(size), at.dtype or ir.DataType.FLOAT)
-        last = call.add("Sub", [count, call.numbers(1.0, at)])
-        pixel = _pixel(call, at, count, last, attributes)
-        pixel = _padded(call, pixel, last, attributes)
+        pixel = _pixel(call, at, count, attributes)
         axes.append(neighbours(call, pixel, count, step, nearest=mode == _NEAREST))
         step = call.product(step, size)
     first = call.add("Mul", [call.counting(batch), call.value_of(step)])
@@ -81,16 +80,17 @@ def gathered(
 
     ``first`` is the row of the first pixel; ``axes`` are :func:`neighbours` along each.
     """
+
+    def chain(op_type: str, values: Iterable[ir.Value]) -> ir.Value:
+        return functools.reduce(lambda a, b: call.add(op_type, [a, b]), values)
+
     parts = []
     for near in itertools.product(*axes):
-        index, share = first, None
-        for along, part in near:
-            index = call.add("Add", [index, along])
-            share = part if share is None else call.add("Mul", [share, part])
-        assert share is not None
+        index = chain("Add", (first, *(along for along, _ in near)))
+        share = chain("Mul", (part for _, part in near))
         taken = call.add("Gather", [rows, index], {"axis": 0})
         parts.append(call.add("Mul", [taken, call.unsqueeze(share, (-1,))]))
-    return functools.reduce(lambda one, two: call.add("Add", [one, two]), parts)
+    return chain("Add", parts)
 
 
 def neighbours(
@@ -126,29 +126,19 @@ def neighbours(
 
 
 def _pixel(
-    call: FusedCall,
-    at: ir.Value,
-    count: ir.Value,
-    last: ir.Value,
-    attributes: Attributes,
+    call: FusedCall, at: ir.Value, count: ir.Value, attributes: Attributes
 ) -> ir.Value:
-    moved = call.add("Add", [at, call.numbers(1.0, at)])
-    half = call.numbers(0.5, at)
-    if attributes["align_corners"]:
-        return call.add("Mul", [call.add("Mul", [moved, half]), last])
-    scaled = call.add("Mul", [call.add("Mul", [moved, half]), count])
-    return call.add("Sub", [scaled, half])
-
-
-def _padded(
-    call: FusedCall, pixel: ir.Value, last: ir.Value, attributes: Attributes
-) -> ir.Value:
-    padding = number(attributes, "padding_mode")
+    """Write a position of -1..1 in pixels of one axis, as it is padded."""
+    zero, half, one = (call.numbers(number, at) for number in (0.0, 0.5, 1.0))
+    aligned, padding = bool(attributes["align_corners"]), attributes["padding_mode"]
+    last = call.add("Sub", [count, one])
+    share = call.add("Mul", [call.add("Add", [at, one]), half])
+    pixel = call.add("Mul", [share, last if aligned else count])
+    if not aligned:
+        pixel = call.add("Sub", [pixel, half])
     if padding == _ZEROS:
         return pixel
-    zero, one = call.numbers(0.0, pixel), call.numbers(1.0, pixel)
     if padding == _REFLECTION:
-        aligned = bool(attributes["align_corners"])
         low = call.numbers(0.0 if aligned else -0.5, pixel)
         span = last if aligned else call.add("Add", [last, one])
         span = call.add("Max", [span, one])  # one pixel alone has nothing to reflect

@@ -10,7 +10,7 @@ import onnx_ir as ir
 
 from me2e_compress.graph.shapes import Dims
 from me2e_compress.operators.base import Operator
-from me2e_compress.operators.bilinear import sample_levels, sample_levels_array
+from me2e_compress.operators.bilinear import sample_levels
 from me2e_compress.operators.call import Attributes, FusedCall
 from me2e_compress.operators.dialect import (
     FLOATS,
@@ -24,6 +24,7 @@ from me2e_compress.operators.dialect import (
     Values,
     present,
 )
+from me2e_compress.operators.grid_sampler import BILINEAR, grid_sample_array
 
 _INTERPOLATION = (Attribute("interpolation", 0, choices=(0, 1)),)
 
@@ -121,7 +122,7 @@ class Rotate(Operator):
     def reference(self, inputs: Arrays, attributes: Attributes) -> NdArray:
         """Compute it in numpy, [C, H, W] float64."""
         image, angle, center = (np.asarray(each, np.float64) for each in inputs)
-        channels, height, width = image.shape
+        height, width = image.shape[1:]
         # Rotate the pixel centres back
         turn = -np.deg2rad(angle.item())
         y, x = np.mgrid[:height, :width] + 0.5
@@ -137,14 +138,8 @@ class Rotate(Operator):
         if attributes["interpolation"] == 1:
             at = np.round(at - 0.5) + 0.5
         size = np.array([width, height], np.float64)
-        result = sample_levels_array(
-            image.reshape(channels, -1).T[None, :, None],
-            np.array([[height, width]]),
-            np.array([0]),
-            (at / size).reshape(1, -1, 1, 1, 1, 2),
-            np.ones((1, height * width, 1, 1, 1)),
-        )
-        return result.reshape(height, width, channels).transpose(2, 0, 1)
+        grid = 2 * at[None] / size - 1
+        return grid_sample_array((image[None], grid), BILINEAR).squeeze(0)
 
     def macs(self, shapes: Sequence[Dims | None], attributes: Attributes) -> int | None:
         """Count four neighbours for each element; none for the nearest."""

@@ -146,10 +146,9 @@ class _Run:
         inputs = [view.value for view in plan.inputs]
         write = functools.partial(fused_form.write, plan)
         draw = functools.partial(draw_views, plan.inputs)
-        new, error, unread = self._replace(body, plan.result.value, inputs, write, draw)
+        new, error = self._replace(body, plan.result.value, inputs, write, draw)
         self.worst = max(self.worst, error)
         self._fold(body, new, plan)
-        _remove_unread(unread)
         self.fused += 1
         self.samplers += len(match.levels)
 
@@ -161,13 +160,13 @@ class _Run:
         self._failed.add(floors)
         reason: Exception = PreconditionError("it is not a sum of four corners")
         for guess in gathered.guesses(node, self.opset):
-            found = guess.result.value, guess.inputs, guess.write, guess.draw
+            inputs = [view.value for view in (guess.image, *guess.at)]
+            found = guess.result.value, inputs, guess.write, guess.draw
             try:
-                _, _, unread = self._replace(body, *found, least=guess.draws)
+                self._replace(body, *found, least=guess.draws)
             except (PreconditionError, GraphError) as error:
                 reason = error
                 continue
-            _remove_unread(unread)
             self._failed.remove(floors)
             self.sampled += 1
             return
@@ -181,10 +180,10 @@ class _Run:
         write: Callable[[FusedCall], ir.Value],
         draw: Draw,
         least: int = 1,
-    ) -> tuple[ir.Value, float, list[ir.Node]]:
+    ) -> tuple[ir.Value, float]:
         """Write what may stand for a value, and put it there if that is proven.
 
-        Returns the new value, how far it is apart, and nodes that may be unread now.
+        Returns the new value, and how far it is apart.
         """
         root, known = old.producer(), set(body.initializers)
         if root is None:
@@ -208,8 +207,11 @@ class _Run:
         for each in made:
             inherit(each, [root, *matched], by=self.current.name)
         replace_value(old, new)
-        # Readers first
-        return new, error, [*made[::-1], *matched[::-1]]
+        # Remove what is unread now, readers first
+        for each in reversed(matched):
+            if each.graph is not None and not any(map(is_read, each.outputs)):
+                each.graph.remove(each, safe=True)
+        return new, error
 
     def _fold(self, body: ir.Graph, new: ir.Value, plan: fused_form.Plan) -> None:
         """Store operands that are computed of constants alone."""
@@ -228,9 +230,3 @@ class _Run:
             array = run_piece(piece_of(value, (), self.opset), ())
             name = f"{value.name}_constant"
             node.replace_input_with(index, add_constant(body, array, name, self.names))
-
-
-def _remove_unread(nodes: Sequence[ir.Node]) -> None:
-    for each in nodes:
-        if each.graph is not None and not any(map(is_read, each.outputs)):
-            each.graph.remove(each, safe=True)

@@ -15,7 +15,7 @@ from me2e_compress.graph import is_standard, static_shape
 from me2e_compress.graph.nodes import (
     LAYOUT_OPERATORS,
     integers_at,
-    producer_of,
+    maker,
     sole_reader,
 )
 from me2e_compress.passes.digits import Digit, Digits, flat, whole
@@ -189,10 +189,9 @@ def _levels(node: ir.Node) -> tuple[tuple[Level, ...], View]:
 
 
 def _sampler(value: ir.Value | None) -> ir.Node | None:
-    node = producer_of(value)
-    while node is not None and is_standard(node) and node.op_type in LAYOUT_OPERATORS:
-        node = producer_of(node.inputs[0])
-    return node if node is not None and node.op_type == "GridSample" else None
+    while (node := maker(value, *LAYOUT_OPERATORS)) is not None:
+        value = node.inputs[0]
+    return maker(value, "GridSample")
 
 
 def _weighted(samples: View) -> tuple[View, View]:

@@ -64,11 +64,6 @@ class Sampling:
     shift: tuple[float, float]
 
     @property
-    def inputs(self) -> tuple[ir.Value, ...]:
-        """What it reads."""
-        return (self.image.value, *(view.value for view in self.at))
-
-    @property
     def draws(self) -> int:
         """How many draws hold enough positions."""
         return math.ceil(LEAST_POSITIONS / math.prod(sizes(self.at[0].layout)))
@@ -78,20 +73,22 @@ class Sampling:
         image = random.standard_normal(sizes(self.image.layout))
         drawn: dict[ir.Value, Array] = {self.image.value: image.astype(np.float32)}
         for place, view in enumerate(self.at):
-            axes = [any(digit.axis == PAIR for digit in each) for each in view.layout]
-            part = slice(None) if any(axes) else slice(place, place + 1)
+            digits = flat(view.layout)
+            axes = [2 if digit.axis == PAIR else 1 for digit in digits]
+            part = slice(None) if 2 in axes else slice(place, place + 1)
             size, scale, shift = (
-                np.reshape(each[part], [2 if is_pair else 1 for is_pair in axes])
+                np.reshape(each[part], axes)
                 for each in (self.shape[:1:-1], self.scale, self.shift)
             )
             # Half of them anywhere, half at the edges, a tenth in the middle of pixels
-            shape = sizes(view.layout)
+            shape = [digit.size for digit in digits]
             pixels = random.uniform(-BEYOND, size + BEYOND - 1, shape)
             low = random.uniform(-BEYOND, 1, shape)
             edge = np.where(random.random(shape) < 0.5, low, size - 1 - low)
             pixels = np.where(random.random(shape) < 0.5, pixels, edge)
             pixels = np.where(random.random(shape) < 0.1, pixels.round(), pixels)
-            drawn[view.value] = ((pixels - shift) / scale).astype(np.float32)
+            places = ((pixels - shift) / scale).reshape(sizes(view.layout))
+            drawn[view.value] = places.astype(np.float32)
         return drawn
 
     def write(self, call: FusedCall) -> ir.Value:
@@ -111,17 +108,15 @@ class Sampling:
         # To -1..1, with corners aligned where positions are so already
         size = np.array(self.shape[:1:-1], np.float64)
         scale, shift = 2 * np.array(self.scale), 2 * np.array(self.shift)
-        corners = np.allclose((scale, shift), size - 1) and size.min() > 1
-        scale, shift = (
-            scale / (size - corners),
-            (shift + 1 - corners) / (size - corners),
-        )
-        for op_type, each, nothing in (("Mul", scale, 1.0), ("Add", shift - 1, 0.0)):
+        corners = int(np.allclose((scale, shift), size - 1) and size.min() > 1)
+        size -= corners
+        scale, shift = scale / size, (shift + 1 - corners) / size - 1
+        for op_type, each, nothing in (("Mul", scale, 1.0), ("Add", shift, 0.0)):
             numbers = each.round(6) if np.allclose(each, each.round(6)) else each
             if (numbers != nothing).any():
                 number = numbers if np.ptp(numbers) else numbers[:1]
                 grid = call.add(op_type, [grid, call.numbers(number, grid)])
-        made = call.add("GridSample", [image, grid], {"align_corners": int(corners)})
+        made = call.add("GridSample", [image, grid], {"align_corners": corners})
         return laid_out(call, View(made, (first, second, *form[1:])), layout)
 
 
@@ -159,12 +154,11 @@ def guesses(node: ir.Node, opset: int) -> Iterator[Sampling]:
     for at, scale, shift in _positions(floors_of(node)):
         total = math.prod(sizes(at[0].layout)) // (3 - len(at))
         for result in _sums(node):
-            for shape, frame in itertools.product(
-                _shapes(image, result, widths, total), frames
+            for (shape, taken, made), frame in itertools.product(
+                _maps(image, result, widths, total), frames
             ):
                 moved = shift[0] - frame, shift[1] - frame
-                for taken, made in _layouts(image, result, shape, total):
-                    yield Sampling(made, taken, shape, at, scale, moved)
+                yield Sampling(made, taken, shape, at, scale, moved)
 
 
 def _image(node: ir.Node) -> tuple[ir.Value, tuple[int, ...], list[int]]:
@@ -194,40 +188,29 @@ def _image(node: ir.Node) -> tuple[ir.Value, tuple[int, ...], list[int]]:
     return data, (0,), [n for n in dict.fromkeys((*factors, *shape[1:])) if n > 0]
 
 
-_Shape = tuple[int, int, int, int]
-
-
-def _shapes(
+def _maps(
     image: ir.Value, result: ir.Value, widths: list[int], total: int
-) -> Iterator[_Shape]:
+) -> Iterator[tuple[tuple[int, int, int, int], View, View]]:
+    """Describe image and result with their channels before or behind all else."""
     have, made = static_shape(image) or (0,), static_shape(result) or (0,)
-    channels, rest = divmod(math.prod(made), total)
+    channels = math.prod(made) // total
     for batch, columns in itertools.product(
         dict.fromkeys((have[0], made[0], 1)), widths
     ):
-        if rest or not channels or not batch or total % batch:
+        if not batch * channels:
             continue
-        rows, odd = divmod(math.prod(have), batch * channels * columns)
-        if not odd:
-            yield batch, channels, rows, columns
-
-
-def _layouts(
-    image: ir.Value, result: ir.Value, shape: _Shape, total: int
-) -> Iterator[tuple[View, View]]:
-    """Describe image and result with their channels before or behind all else."""
-    batch, channels, rows, columns = shape
-    outer = (Digit(AT, total // batch, batch),) if batch > 1 else ()
-    inner, channel = whole(AT, total // batch), whole(CHANNEL, channels)
-    pixels = (*whole(ROW, rows), *whole(COLUMN, columns))
-    orders = [
-        [(outer, channel, each), (outer, each, channel)] for each in (pixels, inner)
-    ]
-    for one, two in itertools.product(*orders):
-        have = regrouped(one, static_shape(image) or ())
-        made = regrouped(two, static_shape(result) or ())
-        if have is not None and made is not None:
-            yield View(image, have), View(result, made)
+        rows = math.prod(have) // (batch * channels * columns)
+        outer = (Digit(AT, total // batch, batch),) if batch > 1 else ()
+        inner, channel = whole(AT, total // batch), whole(CHANNEL, channels)
+        pixels = (*whole(ROW, rows), *whole(COLUMN, columns))
+        orders = [
+            [(outer, channel, each), (outer, each, channel)] for each in (pixels, inner)
+        ]
+        for one, two in itertools.product(*orders):
+            taken, summed = regrouped(one, have), regrouped(two, made)
+            if taken is not None and summed is not None:
+                shape = batch, channels, rows, columns
+                yield shape, View(image, taken), View(result, summed)
 
 
 _Positions = tuple[tuple[View, ...], tuple[float, float], tuple[float, float]]

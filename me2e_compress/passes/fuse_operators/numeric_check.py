@@ -101,11 +101,7 @@ class Proofs:
         self._known: dict[tuple[str, str], float] = {}
 
     def error(
-        self,
-        before: ir.Value,
-        after: ir.Value,
-        draw: Draw,
-        least: int = 1,
+        self, before: ir.Value, after: ir.Value, draw: Draw, least: int = 1
     ) -> float:
         """Return max|a-b|/max|a| of two values that are computed from drawn inputs.
 
