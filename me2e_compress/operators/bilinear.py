@@ -6,6 +6,7 @@ where the sizes of the maps are constants, with Gather for any opset, as a compi
 kernel, and in numpy.
 """
 
+import functools
 from collections.abc import Sequence
 
 import numpy as np
@@ -14,12 +15,7 @@ import onnx_ir as ir
 
 from me2e_compress.graph import array_of
 from me2e_compress.operators.call import FusedCall
-from me2e_compress.operators.grid_sampler import (
-    BILINEAR,
-    gathered,
-    grid_sample_array,
-    neighbours,
-)
+from me2e_compress.operators.grid_sampler import BILINEAR, grid_sample_array
 from me2e_compress.operators.kernels.kernel import DOMAIN
 
 GRID_SAMPLE_OPSET = 16
@@ -126,32 +122,73 @@ def _by_gather(
     locations: ir.Value,
     weights: ir.Value,
 ) -> ir.Value:
-    """Gather the four rows around each position, of all levels at once."""
+    """Gather the four rows around each position; a row of zeros stands for outside."""
+    # Pixels around each position, along both axes
     heads, width = call.size(value, 2), call.size(value, 3)
     sizes = call.cast(sizes, ir.DataType.INT64)
-    axes, step = [], heads  # the heads of a pixel are rows side by side
-    for place, at in enumerate(call.split_last(locations, 2)):
-        axis = call.integers(1 - place)
-        count = call.unsqueeze(call.add("Gather", [sizes, axis], {"axis": 1}), (1,))
-        size = call.cast(count, at.dtype or ir.DataType.FLOAT)
-        scaled = call.add("Mul", [at, size])
-        pixel = call.add("Sub", [scaled, call.numbers(0.5, at)])
-        axes.append(neighbours(call, pixel, size, step))
-        step = call.product(count, heads)
-    # Empty maps at the end read a row of zeros
-    padded = call.add("Pad", [value, call.integers([0, 0, 0, 0, 0, 1, 0, 0])])
-    rows, first = call.reshape(padded, (-1, width)), _first_rows(call, padded, starts)
-    taken = gathered(call, rows, first, axes)
-    weighted = call.add("Mul", [taken, call.unsqueeze(weights, (5,))])
-    return call.sum(weighted, (3, 4))
+    height, columns = (
+        call.unsqueeze(
+            call.add("Gather", [sizes, call.integers(axis)], {"axis": 1}), (1,)
+        )
+        for axis in (0, 1)
+    )
+    x, y = call.split_last(locations, 2)
+    axes = [_neighbours(call, at, count) for at, count in ((x, columns), (y, height))]
+    # Row 0 is the row of zeros
+    padded = call.add("Pad", [value, call.integers([0, 1, 0, 0, 0, 0, 0, 0])])
+    rows = call.reshape(padded, (-1, width))
+    base = _first_rows(call, padded, starts)
+    many = call.value_of(heads)
+    nothing, zero = call.integers(0), call.numbers(0.0, weights)
+    parts = []
+    # Add the four corners
+    for row, row_inside, row_part in axes[1]:
+        for column, inside, part in axes[0]:
+            where = call.add("And", [inside, row_inside])
+            at = call.add("Add", [call.add("Mul", [row, columns]), column])
+            index = call.add("Add", [base, call.add("Mul", [at, many])])
+            index = call.add("Where", [where, index, nothing])
+            share = call.add("Mul", [call.add("Mul", [part, row_part]), weights])
+            share = call.add("Where", [where, share, zero])
+            taken = call.add("Gather", [rows, index], {"axis": 0})
+            taken = call.add("Mul", [taken, call.unsqueeze(share, (5,))])
+            parts.append(call.sum(taken, (3, 4)))
+    return functools.reduce(lambda one, two: call.add("Add", [one, two]), parts)
+
+
+def _neighbours(
+    call: FusedCall, position: ir.Value, count: ir.Value
+) -> list[tuple[ir.Value, ir.Value, ir.Value]]:
+    """Write index, inside and share of the two pixels around a position on one axis."""
+    size = call.cast(count, position.dtype or ir.DataType.FLOAT)
+    # The pixel below the position, and the distance to it
+    scaled = call.add("Mul", [position, size])
+    pixel = call.add("Sub", [scaled, call.numbers(0.5, position)])
+    low = call.add("Floor", [pixel])
+    part = call.add("Sub", [pixel, low])
+    one = call.numbers(1.0, pixel)
+    found = []
+    for edge, share in (
+        (low, call.add("Sub", [one, part])),
+        (call.add("Add", [low, one]), part),
+    ):
+        # A neighbour outside of the map counts as zero
+        above = call.add("GreaterOrEqual", [edge, call.numbers(0.0, pixel)])
+        inside = call.add("And", [above, call.add("Less", [edge, size])])
+        found.append((call.cast(edge, ir.DataType.INT64), inside, share))
+    return found
 
 
 def _first_rows(call: FusedCall, padded: ir.Value, starts: ir.Value) -> ir.Value:
     batch, length, heads = (call.size(padded, axis) for axis in (0, 1, 2))
-    level = call.cast(starts, ir.DataType.INT64)
-    level = call.add("Mul", [level, call.value_of(heads)])
+    many = call.value_of(heads)
+    starts = call.cast(starts, ir.DataType.INT64)
+    level = call.add("Mul", [call.add("Add", [starts, call.integers([1])]), many])
+    level = call.unsqueeze(level, (1,))
     head = call.unsqueeze(call.counting(heads), (1, 2))
-    first = call.add("Add", [head, call.unsqueeze(level, (1,))])  # [M, L, 1]
+    first = call.add("Add", [head, level])  # [M, L, 1]
+    if batch == 1:
+        return first
     step = call.value_of(call.product(length, heads))
     image = call.add("Mul", [call.counting(batch), step])
     return call.add("Add", [call.unsqueeze(image, (1, 2, 3, 4)), first])

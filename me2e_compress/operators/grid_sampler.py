@@ -1,9 +1,8 @@
 """Sample an image or a volume at a grid of positions (torch's ``grid_sample``)."""
 
 import dataclasses
-import functools
 import itertools
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from typing import ClassVar
 
 import numpy as np
@@ -55,90 +54,96 @@ def grid_by_gather(
     batch, channels = call.size(image, 0), call.size(image, 1)
     rows = call.reshape(image, (batch, channels, -1))
     rows = call.reshape(call.transpose(rows, (0, 2, 1)), (-1, channels))
-    # Neighbours along each axis, x first
-    step: Size = 1
-    axes = []
-    for at, size in zip(
-        call.split_last(grid, len(sizes)), reversed(sizes), strict=True
-    ):
-        count = call.cast(call.value_of(size), at.dtype or ir.DataType.FLOAT)
-        pixel = _pixel(call, at, count, attributes)
-        axes.append(neighbours(call, pixel, count, step, nearest=mode == _NEAREST))
-        step = call.product(step, size)
-    first = call.add("Mul", [call.counting(batch), call.value_of(step)])
-    total = gathered(call, rows, call.unsqueeze(first, range(1, rank - 1)), axes)
+    # Neighbours along each axis
+    axes = [
+        _neighbours(call, at, size, attributes)
+        for at, size in zip(
+            call.split_last(grid, len(sizes)), reversed(sizes), strict=True
+        )
+    ]  # x first
+    # Add all combinations of neighbours
+    step = call.value_of(call.product(*sizes))
+    first = call.add("Mul", [call.counting(batch), step])
+    first = call.unsqueeze(first, range(1, rank - 1))
+    total: ir.Value | None = None
+    for near in itertools.product(*axes):
+        index, share = _one(call, near, sizes)
+        taken = call.add("Gather", [rows, call.add("Add", [first, index])], {"axis": 0})
+        taken = call.add("Mul", [taken, call.unsqueeze(share, (-1,))])
+        total = taken if total is None else call.add("Add", [total, taken])
+    if total is None:
+        raise PreconditionError(f"node {call.node.name}: {image.name} has no dimension")
     return call.transpose(total, (0, rank - 1, *range(1, rank - 1)))
 
 
-def gathered(
-    call: FusedCall,
-    rows: ir.Value,
-    first: ir.Value,
-    axes: Sequence[Sequence[tuple[ir.Value, ir.Value]]],
-) -> ir.Value:
-    """Write the weighted sum of rows [rows, C] over all combinations of neighbours.
-
-    ``first`` is the row of the first pixel; ``axes`` are :func:`neighbours` along each.
-    """
-
-    def chain(op_type: str, values: Iterable[ir.Value]) -> ir.Value:
-        return functools.reduce(lambda a, b: call.add(op_type, [a, b]), values)
-
-    parts = []
-    for near in itertools.product(*axes):
-        index = chain("Add", (first, *(along for along, _ in near)))
-        share = chain("Mul", (part for _, part in near))
-        taken = call.add("Gather", [rows, index], {"axis": 0})
-        parts.append(call.add("Mul", [taken, call.unsqueeze(share, (-1,))]))
-    return chain("Add", parts)
+def _one(
+    call: FusedCall, near: Sequence[tuple[ir.Value, ir.Value]], sizes: Sequence[Size]
+) -> tuple[ir.Value, ir.Value]:
+    """Write index and share of one neighbour from those along x, y, ..."""
+    (index, share), *others = near
+    step = call.value_of(sizes[-1])
+    for (along, part), size in zip(others, reversed(sizes[:-1]), strict=True):
+        index = call.add("Add", [index, call.add("Mul", [along, step])])
+        share = call.add("Mul", [share, part])
+        known = step.const_value
+        step_size = step if known is None else int(known.numpy().item())
+        step = call.value_of(call.product(step_size, size))
+    return index, share
 
 
-def neighbours(
-    call: FusedCall,
-    pixel: ir.Value,
-    count: ir.Value,
-    step: Size,
-    *,
-    nearest: bool = False,
+def _neighbours(
+    call: FusedCall, at: ir.Value, size: Size, attributes: Attributes
 ) -> list[tuple[ir.Value, ir.Value]]:
-    """Write index, times ``step``, and share of the pixels around a position.
-
-    One axis; outside of its ``count`` pixels the share is zero.
-    """
-    zero, one = call.numbers(0.0, pixel), call.numbers(1.0, pixel)
-    if nearest:
-        edges = [(call.add("Round", [pixel]), one)]
+    """Write index and share of the pixels around a position on one axis."""
+    kind = at.dtype or ir.DataType.FLOAT
+    count = call.cast(call.value_of(size), kind)
+    one = call.numbers(1.0, at)
+    last = call.add("Sub", [count, one])
+    # The pixel position, after padding
+    pixel = _padded(call, _pixel(call, at, count, last, attributes), last, attributes)
+    # The neighbours and their shares
+    if attributes["interpolation_mode"] == _NEAREST:
+        edges: list[tuple[ir.Value, ir.Value | None]]
+        edges = [(call.add("Round", [pixel]), None)]
     else:
         low = call.add("Floor", [pixel])
         part = call.add("Sub", [pixel, low])
-        edges = [
-            (low, call.add("Sub", [one, part])),
-            (call.add("Add", [low, one]), part),
-        ]
-    found = []
+        rest = call.add("Sub", [one, part])
+        edges = [(low, rest), (call.add("Add", [low, one]), part)]
+    # Neighbours outside of the image have no share
+    zero, found = call.numbers(0.0, at), []
     for edge, share in edges:
-        above = call.add("GreaterOrEqual", [edge, zero])
-        inside = call.add("And", [above, call.add("Less", [edge, count])])
-        kept, share = (call.add("Where", [inside, v, zero]) for v in (edge, share))
-        index = call.cast(kept, ir.DataType.INT64)
-        found.append((call.add("Mul", [index, call.value_of(step)]), share))
+        kept = call.add("Max", [call.add("Min", [edge, last]), zero])
+        inside = call.cast(call.add("Equal", [kept, edge]), kind)
+        share = inside if share is None else call.add("Mul", [share, inside])
+        found.append((call.cast(kept, ir.DataType.INT64), share))
     return found
 
 
 def _pixel(
-    call: FusedCall, at: ir.Value, count: ir.Value, attributes: Attributes
+    call: FusedCall,
+    at: ir.Value,
+    count: ir.Value,
+    last: ir.Value,
+    attributes: Attributes,
 ) -> ir.Value:
-    """Write a position of -1..1 in pixels of one axis, as it is padded."""
-    zero, half, one = (call.numbers(number, at) for number in (0.0, 0.5, 1.0))
-    aligned, padding = bool(attributes["align_corners"]), attributes["padding_mode"]
-    last = call.add("Sub", [count, one])
-    share = call.add("Mul", [call.add("Add", [at, one]), half])
-    pixel = call.add("Mul", [share, last if aligned else count])
-    if not aligned:
-        pixel = call.add("Sub", [pixel, half])
+    moved = call.add("Add", [at, call.numbers(1.0, at)])
+    half = call.numbers(0.5, at)
+    if attributes["align_corners"]:
+        return call.add("Mul", [call.add("Mul", [moved, half]), last])
+    scaled = call.add("Mul", [call.add("Mul", [moved, half]), count])
+    return call.add("Sub", [scaled, half])
+
+
+def _padded(
+    call: FusedCall, pixel: ir.Value, last: ir.Value, attributes: Attributes
+) -> ir.Value:
+    padding = number(attributes, "padding_mode")
     if padding == _ZEROS:
         return pixel
+    zero, one = call.numbers(0.0, pixel), call.numbers(1.0, pixel)
     if padding == _REFLECTION:
+        aligned = bool(attributes["align_corners"])
         low = call.numbers(0.0 if aligned else -0.5, pixel)
         span = last if aligned else call.add("Add", [last, one])
         span = call.add("Max", [span, one])  # one pixel alone has nothing to reflect
