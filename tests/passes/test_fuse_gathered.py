@@ -1,6 +1,7 @@
 """Bilinear sampling that is written with Gather is GridSample, and then attention."""
 
 import itertools
+from typing import Any
 
 import numpy as np
 import onnx_ir as ir
@@ -70,15 +71,23 @@ def model_of(
     op: str, pad: int = 1, masked: bool = False, corners: int = 0, floor: str = "apart"
 ) -> ir.Model:
     rows, columns, image = 5 + 2 * pad, 7 + 2 * pad, np.arange(6).reshape(6, 1, 1)
+    floats: dict[str, float | list[float]]
     floats = {"one": 1, "zero": 0, "step0": pad, "step1": pad + 1, "endx": columns - 1}
     floats |= {"endy": rows - 1, "middle": 0.5}
     floats |= {"halfx": (7 - corners) / 2, "halfy": (5 - corners) / 2}
     floats |= {"halves": [3.5, 2.5], "before": -1.5, "behind": 7.5}
-    whole = {"atx": 0, "aty": 1, "width": columns, "last": [-1], "first_axis": [1]}
+    whole: dict[str, Any] = {
+        "atx": 0,
+        "aty": 1,
+        "width": columns,
+        "last": [-1],
+        "first_axis": [1],
+    }
     whole |= {"lines": [6, 4, -1], "table": [-1, 4], "line": [6, 1, 27]}
     whole |= {"wide": [6, 4, 27], "four": [6, 4, 9, 3], "first": image * rows * columns}
     whole |= {"pads": [0, 0, pad, pad] * 2}
     whole |= {"image_of": np.broadcast_to(image[..., None], (6, 9, 3, 1))}
+    known: dict[str, Any]
     known = {name: np.array(each, np.int64) for name, each in whole.items()}
     known |= {name: np.float32(each) for name, each in floats.items()}
     text = by_gather(op, pad=pad, masked=masked, floor=floor)
