@@ -232,6 +232,8 @@ class FoldConstants(Pass):
         before, fresh = -1, set[ir.Value]()
         while tally.changes > before:
             before = tally.changes
+            if model.functions:  # through which a sweep learns no shapes
+                graphs.infer_shapes(model)
             tally.dead += remove_dead(model.graph)
             tally.kept = 0
             self._fold(model.graph, opset, tally, fresh, trust=True)
