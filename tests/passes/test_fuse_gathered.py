@@ -71,7 +71,7 @@ def model_of(
     op: str, pad: int = 1, masked: bool = False, corners: int = 0, floor: str = "apart"
 ) -> ir.Model:
     rows, columns, image = 5 + 2 * pad, 7 + 2 * pad, np.arange(6).reshape(6, 1, 1)
-    floats: dict[str, float | list[float]]
+    floats: dict[str, Any]
     floats = {"one": 1, "zero": 0, "step0": pad, "step1": pad + 1, "endx": columns - 1}
     floats |= {"endy": rows - 1, "middle": 0.5}
     floats |= {"halfx": (7 - corners) / 2, "halfy": (5 - corners) / 2}
