@@ -175,7 +175,7 @@ def driver_named(
         driver = POLICIES.build(PYTHON, {"factory": text})
     else:
         driver = POLICIES.build(MODEL, {"path": text})
-    given = {"adapter": adapter, "module_map": module_map}
+    given = {"adapter": adapter, "module_map": module_map and str(module_map)}
     fields = type(driver).__dataclass_fields__
     options = {k: v for k, v in given.items() if v is not None and k in fields}
     return POLICIES.with_options(driver, options) if options else driver
