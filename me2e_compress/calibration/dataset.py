@@ -255,7 +255,7 @@ class CalibrationSet:
         self.pixels = entry.inputs
 
     def part(self, places: Iterable[int]) -> Self:
-        """Return the frames of some places in the whole; the first starts a scene."""
+        """Return the frames of some places in the whole; after a gap a scene starts."""
         part = copy.copy(self)
         part.places = tuple(places)
         return part
@@ -266,7 +266,8 @@ class CalibrationSet:
         return tuple(at for at in range(len(self)) if self._begins(at))
 
     def _begins(self, index: int) -> bool:
-        return not index or self.places[index] in self._starts
+        place = self.places[index]
+        return not index or place in self._starts or place - 1 != self.places[index - 1]
 
     def __len__(self) -> int:
         return len(self.places)

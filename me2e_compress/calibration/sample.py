@@ -1,5 +1,6 @@
 """Parts of a recording: random samples and held-out frames."""
 
+import bisect
 import itertools
 
 import numpy as np
@@ -23,20 +24,28 @@ def draw(whole: CalibrationSet, count: int, seed: int) -> CalibrationSet:
     return whole.part(sorted(drawn[:count]))
 
 
-def hold_out(whole: CalibrationSet, most: int) -> tuple[CalibrationSet, CalibrationSet]:
+def hold_out(
+    whole: CalibrationSet, most: int, run: int = 1
+) -> tuple[CalibrationSet, CalibrationSet]:
     """Split a recording: frames to calibrate on, and frames to measure on.
 
-    A quarter of the frames is for measuring, at least one and at most ``most``. They
-    are the last ones; where scenes are short enough, none of their scene is calibrated
-    on, since neighbours in a scene look alike. A recording of one frame is both.
+    A third of the frames is for measuring, at least one and at most ``most``. They
+    stand at equal distances, so that every part of the recording is measured; in runs
+    of so many frames of one scene where a state grows along them. A recording of one
+    frame is both.
     """
     frames = len(whole)
     if frames == 1:
         return whole, whole
-    count = max(1, min(most, frames // 4))
-    cut = frames - count
-    # Move the cut to the start of a scene if that leaves enough.
-    scene = max(start for start in whole.scenes if start <= cut)
-    if scene >= frames / 2:
-        cut = scene
-    return whole.part(range(cut)), whole.part(range(cut, cut + count))
+    count = max(1, min(most, -(-frames // 3)))
+    ends = [*whole.scenes, frames]
+    measured = set[int]()
+    for part in range(parts := max(1, count // run)):
+        # a run in the middle of its part, and within a scene that is long enough
+        length = count // parts + (part < count % parts)
+        start = ((2 * part + 1) * frames // parts - length + 1) // 2
+        at = bisect.bisect_right(ends, start)
+        start = max(ends[at - 1], min(start, ends[at] - length))
+        measured.update(range(start, start + length))
+    others = [place for place in range(frames) if place not in measured]
+    return whole.part(others), whole.part(sorted(measured))

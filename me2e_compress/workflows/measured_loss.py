@@ -14,6 +14,7 @@ from me2e_compress.errors import EvaluationError, FramesError, GraphError
 from me2e_compress.fidelity.compare import Fidelity, SetFidelity, SetTally
 from me2e_compress.fidelity.floor import Floor, Shortfall, shown
 from me2e_compress.fidelity.liveness import Liveness
+from me2e_compress.graph.recurrence import recurrent_inputs
 from me2e_compress.manager import Report
 from me2e_compress.passes import Pass
 from me2e_compress.passes.lower_int8 import LowerInt8
@@ -114,7 +115,7 @@ class MeasuredLoss:
         if self.fidelity is not None and self.fidelity.frames < FEW:
             yield (
                 f"this verdict rests on {counted(self.fidelity.frames, 'frame')}:"
-                f" record {4 * FEW} or more, a quarter of which is measured on"
+                f" record {3 * FEW} or more, a third of which is measured on"
             )
         if self.fidelity is not None:
             yield from self.fidelity.strays
@@ -158,6 +159,9 @@ class MeasuredLoss:
         names = (each.name for each in dataclasses.fields(self))
         return {name: getattr(self, name) for name in names if name != "seconds"}
 
+
+RUN = 4
+"""Frames measured in a row of a model that has a state."""
 
 KEPT_OUT = "kept out of calibration"
 SHARED = "calibrated on as well: there is no other"
@@ -204,7 +208,9 @@ def split_frames(
     if recording is None:
         reason = "no recorded frames" if samples is None else SHIPPED_FRAMES
         return SplitFrames(None, samples, reason, samples)
-    calibration, measured = hold_out(recording, most)
+    # a state needs frames to grow
+    run = RUN if recurrent_inputs(model) else 1
+    calibration, measured = hold_out(recording, most, run)
     if any(each.reads_ranges and not each.needs_frames for each in passes):
         return SplitFrames(recording, measured, PERHAPS_SHARED)
     kind = SHARED if len(recording) == 1 else KEPT_OUT

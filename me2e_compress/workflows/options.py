@@ -264,7 +264,7 @@ class CompressOptions(WriteOptions, GraphOptions, Int8Options):
     """seed of everything random"""
     verify_frames: int = 2
     """frames to check exact passes on; 0 asks for no proof"""
-    measure_frames: int = 8
+    measure_frames: int = 16
     """most frames kept out of calibration to measure on; 0 measures nothing"""
     floor: float = SQNR_FLOOR_DB
     """warn of an output below this SQNR, in dB"""

@@ -194,34 +194,28 @@ def recording(folder: Path, count: int, scenes: tuple[int, ...]) -> CalibrationS
 
 
 @pytest.mark.parametrize(
-    ("count", "scenes", "calibrated", "measured"),
+    ("count", "run", "measured", "begin"),
     [
-        (2, (0,), [0], [1]),
-        (6, (0,), [0, 1, 2, 3, 4], [5]),
-        (32, (0,), list(range(28)), [28, 29, 30, 31]),
-        # Whole scenes, where that leaves half of the frames.
-        (12, (0, 4, 8), list(range(8)), [8, 9, 10]),
-        (8, (0, 2, 4, 6), [0, 1, 2, 3, 4, 5], [6, 7]),
-        # The scene is longer than half of the recording.
-        (8, (0, 2), [0, 1, 2, 3, 4, 5], [6, 7]),
-        # One frame is all there is.
-        (1, (0,), [0], [0]),
+        (2, 1, [1], [1]),
+        (16, 1, [1, 4, 6, 9, 12, 14], [1, 4, 6, 9, 12, 14]),
+        (48, 1, [*range(1, 48, 3)], [*range(1, 48, 3)]),
+        (96, 1, [*range(3, 96, 6)], [*range(3, 96, 6)]),
+        # a state grows along runs, each within a scene
+        (16, 3, [1, 2, 3, 9, 10, 11], [1, 9]),
+        (12, 4, [4, 5, 6, 7], [4]),
+        # one frame is all there is
+        (1, 1, [0], [0]),
     ],
 )
-def test_the_last_frames_are_held_out(
-    tmp_path: Path,
-    count: int,
-    scenes: tuple[int, ...],
-    calibrated: list[int],
-    measured: list[int],
+def test_held_out_frames_are_spread(
+    tmp_path: Path, count: int, run: int, measured: list[int], begin: list[int]
 ) -> None:
-    seen, kept = hold_out(recording(tmp_path, count, scenes), 4)
+    seen, kept = hold_out(recording(tmp_path, count, range(0, count, 4)), 16, run)
 
-    assert [frame.index for frame in seen] == calibrated
     assert [frame.index for frame in kept] == measured
-    # state begins anew where a scene is cut
-    begin = [frame.index for frame in kept if frame.starts_scene]
-    assert begin == [at for at in measured if at == measured[0] or at in scenes]
+    assert [frame.index for frame in kept if frame.starts_scene] == begin
+    others = [place for place in range(count) if place not in measured] or [0]
+    assert [frame.index for frame in seen] == others
 
 
 def test_frames_are_drawn_by_seed_in_whole_scenes(tmp_path: Path) -> None:
