@@ -2,17 +2,16 @@
 
     python -m benchmarks.real_files OUT [--only PART] [--tools ours,...] [--rounds 3]
 
-Five pinned packages are installed into OUT/packages, onnxsim and onnxslim into OUT/peers;
-nothing of them is kept anywhere else. Of files that are one network with other weights
-the first is taken, of trees none: they have no layer. Each network is compressed with
-16 frames drawn by one seed and judged on 16 of another, against its source run without
-any optimization. A line of JSON for a network and a tool is added to OUT/records.jsonl;
-what stands there is not measured again, so a run that ended goes on, and a file that is
-deleted is measured anew.
+Five pinned packages are installed into OUT/packages, onnxsim and onnxslim into
+OUT/peers; nothing of them is kept anywhere else. Of files that are one network with
+other weights the first is taken, of trees none: they have no layer. Each network is
+compressed with 16 frames drawn by one seed and judged on 16 of another, against its
+source run without any optimization. A line of JSON for a network and a tool is added to
+OUT/records.jsonl; what stands there is not measured again, so a run that ended goes on.
 
-Columns: nodes; MB; dB of the worst output on fresh frames; what the report of `compress`
-says of that output, and by how much it says too much of any; CPU time as a share of the
-source's, both in onnxruntime on one thread, a process each, in turn.
+Columns: nodes; MB; dB of the worst output on fresh frames; what the report of
+`compress` says of that output, and by how much it says too much of any; CPU time as a
+share of the source's, both in onnxruntime on one thread, a process each, in turn.
 """
 
 import argparse
@@ -124,7 +123,7 @@ def save(frames: Iterable[Frame], folder: Path) -> None:
     """Write a recording with four frames a scene."""
     folder.mkdir(parents=True, exist_ok=True)
     for place, frame in enumerate(frames):
-        np.savez(folder / f"{place:06d}.npz", **frame)  # pyright: ignore[reportArgumentType]
+        np.savez(folder / f"{place:06d}.npz", **frame)  # type: ignore[arg-type]
     scenes = {"scenes": list(range(0, FRAMES, 4))}
     (folder / "scenes.json").write_text(json.dumps(scenes))
 
@@ -264,6 +263,7 @@ def timed(files: dict[str, Path], frames: Path, rounds: int) -> dict[str, float]
     taken = dict[str, float]()
     for _ in range(rounds):
         for name, path in files.items():
+            command: list[str | Path]
             command = [sys.executable, "-m", "benchmarks.real_files", frames]
             seconds = answer([*command, "--child", "time", "--file", path])
             if isinstance(seconds, dict):
@@ -321,7 +321,7 @@ def slim(model: Path, made: Path) -> None:
     sys.path.insert(0, str(made.parents[2] / "peers"))
     import onnxslim
 
-    onnx.save(onnxslim.slim(onnx.load(model)), made)  # type: ignore[arg-type]
+    onnx.save(onnxslim.slim(onnx.load(model)), made)
 
 
 PEER_WORK = {"quantize_static": quantize_static, "onnxsim": simplify, "onnxslim": slim}
@@ -379,8 +379,9 @@ def table(rows: list[dict[str, Any]]) -> Iterator[str]:
     yield f"refused: {len(refused)}"
     yield f"reported within 3 dB above: {sum(gap <= 3 for gap in gaps)} of {len(gaps)}"
     yield f"reported more than 6 dB above: {sum(gap > 6 for gap in gaps)}"
-    yield f"slower than their source: {sum(row.get('ratio', 1) > 1.05 for row in int8)}"
-    yield f"larger than their source: {sum(row['mb'][1] > row['mb'][0] for row in ours)}"
+    slower = sum(row.get("ratio", 1) > 1.05 for row in int8)
+    larger = sum(row["mb"][1] > row["mb"][0] for row in ours)
+    yield f"slower than their source: {slower}; larger: {larger}"
     yield f"worst output behind quantize_static's: {', '.join(behind) or 'none'}"
 
 

@@ -24,7 +24,7 @@ Maker: TypeAlias = Callable[[Path, np.random.Generator], Iterator[Frame]]
 RATE = 16_000
 """Samples of audio a second."""
 
-WORDS = "road lane merge yield signal ahead stop north exit 42 km via Rue Oslo".split()
+WORDS = ("road", "merge", "yield", "signal", "stop", "north", "exit", "42 km", "Oslo")
 
 
 def page(rng: np.random.Generator, height: int, width: int, lines: int) -> Array:
@@ -89,17 +89,15 @@ def speech(rng: np.random.Generator, samples: int) -> Array:
     knots = rng.choice([0.0, 0.3, 1.0], samples // 2400 + 2, p=(0.35, 0.25, 0.4))
     voice *= np.interp(np.arange(samples), np.arange(len(knots)) * 2400, knots)
     voice *= rng.uniform(0.05, 0.7) / (np.abs(voice).max() + 1e-9)
-    noise = np.fft.rfft(rng.normal(size=samples)) / (1 + hertz / 800) ** rng.uniform(
-        0, 1
-    )
-    noise = np.fft.irfft(noise, samples)
+    tilt = (1 + hertz / 800) ** rng.uniform(0, 1)
+    noise = np.fft.irfft(np.fft.rfft(rng.normal(size=samples)) / tilt, samples)
     noise *= 10 ** rng.uniform(-4, -1) / noise.std()
     return np.clip(voice + noise, -1, 1).astype(np.float32)
 
 
 def powers(audio: Array, size: int, hop: int) -> Array:
     """Return powers of a spectrum: float64 [frames, size // 2 + 1]."""
-    padded = np.pad(audio.astype(np.float64), (size // 2, size // 2))
+    padded: Array = np.pad(audio.astype(np.float64), (size // 2, size // 2))
     windows = np.lib.stride_tricks.sliding_window_view(padded, size)[::hop]
     power: Array = np.abs(np.fft.rfft(windows * np.hanning(size))) ** 2
     return power
@@ -119,7 +117,8 @@ def in_decibels(power: Array) -> Array:
     """Return powers below the loudest, 40 dB to 1: float32."""
     decibels = 10 * np.log10(np.maximum(power, 1e-10))
     below = np.maximum(decibels - decibels.max(), -80)
-    return ((below + 40) / 40).astype(np.float32)
+    scaled: Array = ((below + 40) / 40).astype(np.float32)
+    return scaled
 
 
 def voice_activity(model: Path, rng: np.random.Generator) -> Iterator[Frame]:

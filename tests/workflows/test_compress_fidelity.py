@@ -135,7 +135,7 @@ def test_the_report_holds_the_measurement_and_the_command(
     assert told["fidelity"]["floor"] == floor
     assert told["verdict"] == [*found.lines()[:-2], *found.alerts()]
     (note,) = [n for n in told["steps"][-1]["notes"] if "calibrated" in n]
-    assert note.endswith("calibrated on 6 frames")
+    assert note.endswith("calibrated on 5 frames")
 
     options = dataclasses.replace(options, measure_frames=0)
     found = me2e.compress("in.onnx", "out.onnx", frames="frames", options=options)

@@ -37,8 +37,6 @@ class CpuSeconds:
         float_sampled_mac: a multiply-accumulate of a fused operator that samples
             feature maps too large for the cache.
         int8_cached_mac: what uint8 adds to one on maps in the cache.
-        int8_pooled: an element of a window of a MaxPool of uint8 that no QLinearConv
-            writes, which is not vectorised.
     """
 
     machine: str
@@ -59,7 +57,6 @@ class CpuSeconds:
     int8_cached_mac: float
     quantize: float
     dequantize: float
-    int8_pooled: float
 
     def seconds(self, counts: Counts) -> float:
         """Return the time of some work."""
@@ -85,7 +82,6 @@ ZEN5 = CpuSeconds(
     int8_cached_mac=0.003,
     quantize=0.1,
     dequantize=0.17,
-    int8_pooled=2.5,
 )
 """Fitted to single layers and chains on an AMD EPYC (Zen 5), onnxruntime 1.31, by
 ``python -m benchmarks.fit_cpu_costs``; sampling by hand, to the results of
@@ -175,22 +171,6 @@ _BLOCKED = frozenset(
 """Operators that onnxruntime computes on blocks of channels, as convolutions."""
 
 
-def _pooled(value: ir.Value) -> int:
-    """Count what MaxPools read, by windows, if a tensor in front of them is quantized.
-
-    onnxruntime moves a QuantizeLinear behind a MaxPool in front of it.
-    """
-    pools = [node for node in value.consumers() if node.op_type == "MaxPool"]
-    made_by = value.producer()
-    if made_by is not None and made_by.op_type == "MaxPool":
-        pools.append(made_by)
-    return sum(
-        math.prod(static_shape(pool.outputs[0]) or ())
-        * math.prod(pool.attributes.get_ints("kernel_shape", []))
-        for pool in pools
-    )
-
-
 class _Surroundings:
     """Follows the uint8 tensors of a region to the layers before and after them."""
 
@@ -210,7 +190,7 @@ class _Surroundings:
         # A product that is sampled is a convolution, whose rounding costs no more than
         # the float32 that it would write.
         rounded = 0 if self._is_product(value) else elements
-        quantize = {"kernel": 1, "quantize": rounded, "int8_pooled": _pooled(value)}
+        quantize = {"kernel": 1, "quantize": rounded}
         return Border(
             machine.seconds(quantize),
             machine.seconds({"kernel": 1, "dequantize": elements}),

@@ -31,6 +31,7 @@ from me2e_compress.targets.onnxruntime.region import (
     find_region,
     has_average_kernel,
     is_average,
+    is_move,
 )
 from me2e_compress.targets.quantized import QUANTIZE, is_dequantized
 from me2e_compress.targets.weights import QuantizedWeight
@@ -276,13 +277,14 @@ def _screen_products(writer: Writer) -> None:
 
 
 def _screen_others(writer: Writer, model: ir.Model) -> None:
-    """Keep averages and float weights between pairs from what int8 would make of them.
+    """Keep pools and float weights between pairs from what int8 would make of them.
 
     Given:   y = QuantizeLinear(AveragePool(DequantizeLinear(x)))
     Result:  y = QuantizeLinear(Max(AveragePool(DequantizeLinear(x))))
 
     onnxruntime (1.31) fuses the three whatever the pool's attributes are, and moves a
-    QuantizeLinear through Reshape, Identity and Clip for it.
+    QuantizeLinear through Reshape, Identity and Clip for it. It moves one in front of a
+    MaxPool, too, which then takes ten times as long if no QLinearConv wrote its uint8.
 
     Given:   q = QuantizeLinear(Relu(ConvTranspose(DequantizeLinear(x), w)))
     Result:  q = QuantizeLinear(Sum(Relu(ConvTranspose(DequantizeLinear(x), w))))
@@ -291,9 +293,11 @@ def _screen_others(writer: Writer, model: ir.Model) -> None:
     all, though it may have no int8 kernel for the layer.
     """
     for node in list(writer.graph):
-        if not is_average(node) or not is_dequantized(node.inputs[0]):
-            continue
-        if not has_average_kernel(node):
+        if is_dequantized(graph.input_at(node, 0)):
+            hidden = is_average(node) and not has_average_kernel(node)
+        else:
+            hidden = node.op_type == "MaxPool" and _is_quantized(node.outputs[0])
+        if hidden:
             _screen(writer, "Max", node)
     for layer, quantizer in list(rounded_layers(model)):
         value = quantizer.inputs[0]
@@ -302,6 +306,14 @@ def _screen_others(writer: Writer, model: ir.Model) -> None:
         writer.graph.insert_before(quantizer, node)
         node.outputs[0].shape, node.outputs[0].type = value.shape, value.type
         quantizer.replace_input_with(0, node.outputs[0])
+
+
+def _is_quantized(value: ir.Value) -> bool:
+    """Return whether a QuantizeLinear reads a value, itself or moved."""
+    readers = list(value.consumers())
+    return any(node.op_type == QUANTIZE for node in readers) or any(
+        _is_quantized(node.outputs[0]) for node in readers if is_move(node)
+    )
 
 
 def _screen(writer: Writer, op: str, layer: ir.Node, *more: ir.Value) -> None:
