@@ -205,12 +205,15 @@ MODES_RANK = 4
 """Rank of a plan with modes: [1, modes, n, 2]."""
 
 
-SMALLER = 30.0
-"""Channels so many times smaller than others are judged apart: where both share the
-127 steps of int8's scale, four are left to them."""
+SMALLER, GAP = 30.0, 4.0
+"""Channels so many times smaller than the largest, and than the next larger ones, are
+judged apart: where all share the 127 steps of int8's scale, four are left to them."""
 
 _CHANNELS = 128
 """An axis of at most so many is one of channels."""
+
+_OF_PICTURES = 4
+"""Sides of a picture differ at most so many times."""
 
 
 class Tally:
@@ -222,8 +225,8 @@ class Tally:
         self.frames_db = list[float]()
         self.discrete = False
         self.count = self.strays = 0
-        self._axis: int | None = None
-        self._channels = np.zeros((3, 0))  # signal, noise and largest value of each
+        # by axis: signal, noise and largest value of each channel
+        self._channels = dict[int, Float64]()
 
     def add(self, a: Array, b: Array, frame: int) -> None:
         """Add a frame; EvaluationError if shapes differ."""
@@ -255,16 +258,15 @@ class Tally:
         self._add_channels(x, gap)
 
     def _add_channels(self, x: Float64, gap: Float64) -> None:
-        axis = channel_axis(x.shape)
-        if axis is None or self.discrete:
-            return
-        others = tuple(each for each in range(x.ndim) if each != axis)
-        if axis != self._axis or x.shape[axis] != self._channels.shape[1]:
-            self._axis, self._channels = axis, np.zeros((3, x.shape[axis]))
-        self._channels[0] += np.square(x).sum(axis=others)
-        self._channels[1] += np.square(gap).sum(axis=others)
-        largest = np.abs(x).max(axis=others)
-        self._channels[2] = np.maximum(self._channels[2], largest)
+        axes = () if self.discrete else channel_axes(x.shape)
+        for axis in axes:
+            others = tuple(each for each in range(x.ndim) if each != axis)
+            sums = self._channels.get(axis)
+            if sums is None or x.shape[axis] != sums.shape[1]:
+                sums = self._channels[axis] = np.zeros((3, x.shape[axis]))
+            sums[0] += np.square(x).sum(axis=others)
+            sums[1] += np.square(gap).sum(axis=others)
+            sums[2] = np.maximum(sums[2], np.abs(x).max(axis=others))
 
     @property
     def sqnr_db(self) -> float:
@@ -285,32 +287,37 @@ class Tally:
 
     def _small(self) -> tuple[str, float | None]:
         """Return the channels below the first gap of sizes, and their SQNR."""
-        signal, noise, largest = self._channels
-        order = np.argsort(-largest)
-        sizes = largest[order]
-        (gaps,) = np.nonzero(sizes[:-1] > SMALLER * sizes[1:])
-        if not gaps.size or not sizes[gaps[0] + 1]:
-            return "", None
-        small = np.sort(order[gaps[0] + 1 :])
-        places = _ranges(small.tolist())
-        lead = ":, " * (self._axis or 0)
-        return f"[{lead}{places}]", decibels(signal[small].sum(), noise[small].sum())
+        apart = list[tuple[float, str]]()
+        for axis, (signal, noise, largest) in self._channels.items():
+            order = np.argsort(-largest)
+            sizes = largest[order]
+            lower = GAP * sizes[1:] < sizes[:-1]
+            (gaps,) = np.nonzero(lower & (SMALLER * sizes[1:] < sizes[0]))
+            if gaps.size and sizes[gaps[0] + 1]:
+                small = np.sort(order[gaps[0] + 1 :])
+                name = f"[{':, ' * axis}{_ranges(small.tolist())}]"
+                apart.append((decibels(signal[small].sum(), noise[small].sum()), name))
+        value, name = min(apart, default=(None, ""))
+        return name, value
 
 
-def channel_axis(shape: tuple[int, ...]) -> int | None:
-    """Return the axis of an output's channels; None of one, or of pictures.
+def channel_axes(shape: tuple[int, ...]) -> tuple[int, ...]:
+    """Return the axes that may be those of an output's channels.
 
     The last of ``[batch, n]`` and of ``[layers, 1, n, channels]``, the shorter of the
-    last two of ``[batch, n, channels]``, which some heads transpose.
+    last two of ``[batch, n, channels]``, which some heads transpose, the second of
+    pictures; the second or the last of ``[batch, layers, n, channels]``.
     """
     rank = len(shape)
     if rank == 3:
-        axis = 1 if shape[1] < shape[2] else 2
+        axes = (1 if shape[1] < shape[2] else 2,)
     elif rank == 2 or (rank > 3 and 1 in shape[1:-1]):
-        axis = rank - 1
+        axes = (rank - 1,)
+    elif rank == 4 and max(shape[2:]) <= _OF_PICTURES * min(shape[2:]):
+        axes = (1,)
     else:
-        return None
-    return axis if 1 < shape[axis] <= _CHANNELS else None
+        axes = (1, rank - 1) if rank > 3 else ()
+    return tuple(axis for axis in axes if 1 < shape[axis] <= _CHANNELS)
 
 
 def _ranges(places: list[int]) -> str:

@@ -110,14 +110,24 @@ def _concats(
     return groups
 
 
+APART = 4.0
+"""Ranges that differ more share no scale: it would cost the smaller 2 of its 8 bits."""
+
+
 def share_scales(plan: QuantPlan, ranges: Ranges) -> Ranges:
-    """Widen ranges so that the tensors of a concat group have one."""
+    """Widen ranges so that the tensors of a concat group have one.
+
+    Scores beside pixels keep their own: what is `APART` times smaller than the largest.
+    """
     widened = dict(ranges.tensors)
     for group in plan.groups:
         if group.kind == CONCAT and all(name in widened for name in group.tensors):
-            bounds = [widened[name] for name in group.tensors]
+            reach = {name: max(map(abs, widened[name])) for name in group.tensors}
+            near = max(reach.values()) / APART
+            names = [name for name, size in reach.items() if size >= near or not size]
+            bounds = [widened[name] for name in names]
             whole = min(low for low, _ in bounds), max(high for _, high in bounds)
-            widened.update(dict.fromkeys(group.tensors, whole))
+            widened.update(dict.fromkeys(names, whole))
     return dataclasses.replace(ranges, tensors=widened)
 
 

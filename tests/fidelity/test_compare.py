@@ -16,7 +16,7 @@ from me2e_compress.fidelity.compare import (
     SetOutputs,
     SetTally,
     Tally,
-    channel_axis,
+    channel_axes,
     compare,
 )
 from me2e_compress.fidelity.floor import Floor
@@ -179,19 +179,34 @@ def test_small_channels_beside_large_ones_are_judged_apart() -> None:
     assert of_one_output(boxes, boxes + 0.5).small == ""
 
 
+@pytest.mark.parametrize("values", [(600, 600, 1), (600, 90, 11, 1), (50, 6, 1)])
+@pytest.mark.parametrize("layers", [(2, 1), (1, 6), (1, 3, 5, 5), ()])
+def test_what_is_30_times_smaller_is_apart_wherever_its_channels_stand(
+    values: tuple[float, ...], layers: tuple[int, ...]
+) -> None:
+    sizes = np.array([*values, 1.0])
+    truth = np.random.default_rng(0).uniform(-1, 1, (*layers, 30, len(sizes))) * sizes
+    small = of_one_output(truth, truth + 0.1).small
+
+    apart = np.flatnonzero(sizes * 30 < sizes[0]).tolist()
+    ranges = {1: f"{apart[0]}", 2: f"{apart[0]}:{len(sizes)}"}[min(2, len(apart))]
+    assert small == f"[{':, ' * (len(layers) + 1)}{ranges}]"
+
+
 @pytest.mark.parametrize(
-    ("axis", "shapes"),
+    ("axes", "shapes"),
     [
-        (1, [(9, 2), (1, 8, 50)]),
-        (2, [(1, 50, 8), (1, 8, 8)]),
-        (3, [(6, 1, 50, 8), (6, 50, 1, 8)]),
-        (None, [(8,), (9, 1), (9, 129), (2, 3, 64, 64)]),
+        ((1,), [(9, 2), (1, 8, 50), (1, 8, 40, 30)]),
+        ((2,), [(1, 50, 8), (1, 8, 8)]),
+        ((3,), [(6, 1, 50, 8), (6, 50, 1, 8)]),
+        ((1, 3), [(1, 6, 900, 10), (1, 20, 20, 85)]),
+        ((), [(8,), (9, 1), (9, 129), (2, 300, 64, 64)]),
     ],
 )
-def test_channels_are_the_last_axis_or_the_shorter_and_pictures_have_none(
-    axis: int | None, shapes: list[tuple[int, ...]]
+def test_channels_are_the_last_axis_the_shorter_or_those_of_pictures(
+    axes: tuple[int, ...], shapes: list[tuple[int, ...]]
 ) -> None:
-    assert {channel_axis(shape) for shape in shapes} == {axis}
+    assert {channel_axes(shape) for shape in shapes} == {axes}
 
 
 def test_models_with_nothing_in_common_and_no_frames_are_not_compared() -> None:
