@@ -217,8 +217,13 @@ def unshaped_plugins(model: ir.Model) -> list[ir.Node]:
 
 
 def refined(declared: ir.Shape | None, found: ir.Shape | None) -> ir.Shape | None:
-    """Return a declared shape, its open dimensions numbers where those are found."""
-    if declared is None or found is None or len(declared) != len(found):
+    """Return a declared shape, its open dimensions numbers where those are found.
+
+    Nothing declared leaves what is found.
+    """
+    if declared is None:
+        return found
+    if found is None or len(declared) != len(found):
         return declared
     pairs = list(zip(declared, found, strict=True))
     if not any(isinstance(new, int) and not isinstance(old, int) for old, new in pairs):

@@ -65,9 +65,13 @@ class FixShapes(Pass):
             )
         # Blame the sizes only if the graph was sound before
         sound = _refusal(model) is None
-        for node in model.graph.all_nodes():
-            for value in node.outputs:
-                value.shape = _sized(value.shape, wanted, "")
+        stated = {
+            value: value.shape
+            for node in model.graph.all_nodes()
+            for value in node.outputs
+        }
+        for value, shape in stated.items():
+            value.shape = _sized(shape, wanted, "")
         for body in model.graph.subgraphs():
             for value in body.inputs:
                 value.shape = _sized(value.shape, wanted, "")
@@ -78,10 +82,19 @@ class FixShapes(Pass):
                 _sized(value.shape, wanted, f"{value.name}"),
             )
             count += value.shape is not before
-        if sound and (reason := _refusal(model)) is not None:
+        if (reason := _refusal(model)) is not None:
+            # what a file says of an output may be wrong, and runtimes take it
+            for value, shape in stated.items():
+                if value.shape is not shape:
+                    value.shape = None
+            reason = _refusal(model)
+        if sound and reason is not None:
             sizes = ", ".join(f"{name}={size}" for name, size in wanted.items())
             raise PreconditionError(f"{self.name}: the graph refuses {sizes}: {reason}")
         graph.infer_shapes(model)  # of a graph that ONNX never inferred strictly
+        for value, shape in stated.items():
+            if value.is_graph_output() and value.shape is None and shape is not None:
+                value.shape = ir.Shape([None] * len(shape))
         model.metadata_props[FIXED] = json.dumps({**known, **wanted}, sort_keys=True)
         return PassResult(model, count)
 

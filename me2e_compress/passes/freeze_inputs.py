@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import math
 from typing import ClassVar
 
 import numpy as np
@@ -9,8 +10,15 @@ import onnx_ir as ir
 
 from me2e_compress.calibration import dataset
 from me2e_compress.errors import FramesError, PreconditionError, RecipeError
+from me2e_compress.graph.nodes import nodes_of, producer_of
+from me2e_compress.graph.recurrence import recurrent_inputs
+from me2e_compress.graph.shapes import static_shape
 from me2e_compress.passes.base import Context, Pass, PassResult
+from me2e_compress.quantization.geometry import MATRICES, MOST_MATRICES
 from me2e_compress.runtime.frames import Array, Frames
+
+FLAGS = 16
+"""Most numbers of an input that a branch hangs on: flags, a sample rate."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -80,3 +88,53 @@ class FreezeInputs(Pass):
         if not values:
             raise FramesError(f"{self.name} needs recorded frames (--frames)")
         return values
+
+
+def advice(model: ir.Model) -> str:
+    """Say which inputs may become constants; empty where none decides anything."""
+    names = ",".join(deciding_inputs(model))
+    return names and (
+        f"branches or projections hang on {names}: where all frames have one value,"
+        " compress with --passes"
+        f" import-normalize,freeze-inputs{{inputs=[{names}]}},fold-constants"
+        " first: what is written has it as a constant"
+    )
+
+
+def deciding_inputs(model: ir.Model) -> tuple[str, ...]:
+    """Name the inputs that alone decide a branch, or are matrices of a projection."""
+    names, states = dict[str, None](), recurrent_inputs(model)
+    for node in nodes_of(model):
+        if node.op_type == "If":
+            roots = _roots(model, node.inputs[0])
+            least = FLAGS
+        elif node.op_type == "MatMul":
+            near = (_roots(model, value) for value in node.inputs)
+            roots = {root for some in near for root in some if _has_matrices(root)}
+            least = 16 * MOST_MATRICES
+        else:
+            continue
+        sizes = [static_shape(root) for root in roots]
+        if all(size is not None and math.prod(size) <= least for size in sizes):
+            names |= dict.fromkeys(str(root.name) for root in roots)
+    return tuple(name for name in names if name not in states)
+
+
+def _has_matrices(value: ir.Value) -> bool:
+    return (static_shape(value) or ())[-2:] in MATRICES
+
+
+def _roots(model: ir.Model, value: ir.Value | None) -> set[ir.Value]:
+    """Return the inputs that a value is computed of, but those of known size alone."""
+    roots, seen, pending = set[ir.Value](), set[ir.Value](), [value]
+    while pending:
+        value = pending.pop()
+        if value is None or value in seen:
+            continue
+        seen.add(value)
+        made = producer_of(value)
+        if made is None:
+            roots.update({value} & set(model.graph.inputs))
+        elif made.op_type not in ("Shape", "Size"):
+            pending += made.inputs
+    return roots

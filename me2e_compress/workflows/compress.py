@@ -18,6 +18,7 @@ from me2e_compress.manager.pass_manager import collector_paused
 from me2e_compress.manager.verification_inputs import first_seeded
 from me2e_compress.passes import Context, Pass
 from me2e_compress.passes.fix_shapes import with_sizes
+from me2e_compress.passes.freeze_inputs import advice
 from me2e_compress.passes.import_normalize import with_own_domains
 from me2e_compress.passes.quantize_int8 import QuantizeInt8
 from me2e_compress.quantization.decision import plan_of, save_plan
@@ -302,9 +303,8 @@ def _refuse(
     if int8 is None or not int8.empty:
         return
     if not options.allow_empty:
-        raise PreconditionError(
-            f"{int8.empty}; nothing is written; -r exact writes a graph without int8"
-        )
+        way = advice(report.model) or "-r exact writes a graph without int8"
+        raise PreconditionError(f"{int8.empty}; nothing is written; {way}")
     listener.on_warning(int8.empty)
 
 

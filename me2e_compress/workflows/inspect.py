@@ -28,6 +28,7 @@ from me2e_compress.graph.summary import (
 from me2e_compress.manager import PassManager, recipe
 from me2e_compress.passes import Context
 from me2e_compress.passes.fix_shapes import FixShapes, open_dimensions
+from me2e_compress.passes.freeze_inputs import advice
 from me2e_compress.registry.documents import MalformedError, from_json
 from me2e_compress.runtime.latency_trace import LatencyTrace, shares
 from me2e_compress.shipped.drivers import SHIPPED
@@ -272,6 +273,7 @@ def inspect(model: str | Path, options: InspectOptions | None = None) -> Inspect
     idle = f"nothing reads input {', '.join(unread)}" if unread else ""
     total = sum(item.macs or 0 for item in costs.values())
     unknown = sum(item.unknown_macs_nodes or 0 for item in costs.values())
+    hints = lacking_shapes(loaded), wrong, idle, "" if wrong else advice(loaded)
     return InspectResult(
         path.name,
         graph.file_bytes(path),
@@ -287,7 +289,7 @@ def inspect(model: str | Path, options: InspectOptions | None = None) -> Inspect
         dict(Counter(map(why_uncounted, uncounted)).most_common()),
         tuple(open_dimensions(loaded)),
         lowered(loaded),
-        "; ".join(filter(None, (lacking_shapes(loaded), wrong, idle))),
+        "; ".join(filter(None, hints)),
         fed_back,
         weights=named_weights(loaded.metadata_props),
         latency_of="" if taken is None else taken.headline,

@@ -15,6 +15,7 @@ from me2e_compress.errors import PreconditionError, RecipeError
 from me2e_compress.graph.modules.module_map import ModuleMap
 from me2e_compress.manager import PassManager, recipe
 from me2e_compress.passes import Context, Pass
+from me2e_compress.passes.freeze_inputs import advice
 from me2e_compress.passes.lower_int8 import LowerInt8
 from me2e_compress.passes.quantize_int8 import QuantizeInt8
 from me2e_compress.quantization.decision import (
@@ -222,8 +223,10 @@ def plan(
         if written is not None:
             save_plan(made, written)
         if len(files) == 1:
-            hint = "" if isinstance(read[0], QuantPlan) else lacking_shapes(read[0])
-            return PlanResult(made, hint=hint)
+            if isinstance(read[0], QuantPlan):
+                return PlanResult(made)
+            hints = filter(None, (lacking_shapes(read[0]), advice(read[0])))
+            return PlanResult(made, hint="; ".join(hints))
         other = _made(files[1], read[1], plain, options)
         return PlanResult(made, tuple(differences(other, made)))
 

@@ -69,6 +69,16 @@ def test_a_place_stands_for_the_name_that_is_written_there() -> None:
         fixed({"image:2": 4, "image:3": 5})
 
 
+def test_sizes_belong_to_inputs_and_a_wrong_output_follows() -> None:
+    """Runtimes take an output of another size, or rank, with a warning."""
+    for stated in ("n", "n,2"):
+        text = f"""<ir_version: 9, opset_import: ["" : 17]>
+            g (float[n,6] x) => (float[{stated}] y) <int64[1] minus = {{-1}}>
+            {{ s = Sigmoid(x) y = Reshape(s, minus) }}"""
+        model = fixed({"n": 1}, text).model
+        assert [str(value.shape) for value in model.graph.outputs] == ["[6]"]
+
+
 REFUSES = """<ir_version: 9, opset_import: ["" : 17]>
 m (float[n,3] x, float[4,5] w) => (float[3,5] y) { t = Transpose(x) y = MatMul(t, w) }
 """

@@ -13,7 +13,7 @@ from me2e_compress.manager import PassManager
 from me2e_compress.manager.report import Report
 from me2e_compress.passes import Context
 from me2e_compress.passes.fold_constants import FoldConstants
-from me2e_compress.passes.freeze_inputs import FreezeInputs
+from me2e_compress.passes.freeze_inputs import FreezeInputs, advice
 from tests.frames import record
 from tests.passes.small import compute, ops, read
 
@@ -86,3 +86,43 @@ def test_neither_frames_nor_inputs(tmp_path: Path) -> None:
     assert FreezeInputs().needs_frames
     with pytest.raises(RecipeError, match="needs inputs"):
         FreezeInputs(inputs=())
+
+
+@pytest.mark.parametrize(
+    ("read", "names"),
+    [
+        # of a rate, moved and compared; of two flags; of what is too large to be one
+        ("r = Squeeze(rate) c = Equal(r, two)", ("rate",)),
+        ("r = And(flag, other) c = Identity(r)", ("flag", "other")),
+        ("s = ReduceMax<keepdims=0>(x) c = Greater(s, one)", ()),
+        # the size of an input is no value, nor is a state a constant
+        ("n = Size(rate) c = Equal(n, two)", ()),
+        ("s = ReduceMax<keepdims=0>(prev_y) c = Greater(s, one)", ()),
+    ],
+)
+def test_inputs_that_decide_a_branch_are_named(
+    read: str, names: tuple[str, ...]
+) -> None:
+    text = f"""g (int64[1] rate, bool flag, bool other, float[4,9] x, float[4] prev_y)
+        => (float[4] next_y) <int64 two = {{2}}, float one = {{1}}> {{
+        {read}
+        next_y = If(c) <then_branch = a () => (float[4] t) {{ t = Neg(prev_y) }},
+                   else_branch = b () => (float[4] e) {{ e = Abs(prev_y) }}>
+    }}"""
+    model = ir.from_onnx_text(f'<ir_version: 9, opset_import: ["" : 17]>{text}')
+
+    advised = advice(model)
+
+    assert (f"freeze-inputs{{inputs=[{','.join(names)}]}}" in advised) == bool(names)
+    assert bool(advised) == bool(names)
+
+
+def test_matrices_of_a_projection_are_named() -> None:
+    model = ir.from_onnx_text("""<ir_version: 9, opset_import: ["" : 17]>
+        g (float[6,4,4] rig, float[900,4] points, float[4,4] w) => (float[6,900,4] y)
+        { t = Transpose<perm=[0,2,1]>(rig) p = MatMul(points, w) y = MatMul(p, t) }""")
+    weight = model.graph.inputs.pop()
+    weight.const_value = ir.tensor(np.ones((4, 4), np.float32), name="w")
+    model.graph.register_initializer(weight)
+
+    assert "inputs=[rig]" in advice(model)
