@@ -16,10 +16,11 @@ from collections.abc import Iterable, Iterator
 import onnx_ir as ir
 
 from me2e_compress.errors import GraphError
-from me2e_compress.graph.nodes import nodes_in
+from me2e_compress.graph.nodes import nodes_in, nodes_of
 from me2e_compress.registry.documents import MalformedError
 
 MODULE, ORIGINS, PASSES = "me2e.module", "me2e.origins", "me2e.passes"
+_TRACE = "stack_trace"
 _LARGEST = 1 << 28
 """Most bytes of a text that was compressed."""
 
@@ -90,6 +91,14 @@ def inherit(node: ir.Node, sources: Iterable[ir.Node], *, by: str) -> None:
     passes = dict.fromkeys(name for past in pasts for name in past.passes)
     passes[by] = None
     stamp(node, Provenance(pasts[0].module, tuple(origins), tuple(passes)))
+
+
+def drop_traces(model: ir.Model) -> None:
+    """Drop an exporter's stack traces: paths of its machine, often half of a file."""
+    for node in nodes_of(model):
+        node.doc_string = None
+        for key in [key for key in node.metadata_props if key.endswith(_TRACE)]:
+            del node.metadata_props[key]
 
 
 def missing(model: ir.Model) -> list[str]:

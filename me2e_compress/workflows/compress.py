@@ -12,6 +12,7 @@ from me2e_compress.display import megabytes
 from me2e_compress.errors import PreconditionError, RecipeError
 from me2e_compress.fidelity.floor import Floor
 from me2e_compress.graph.files import data_names
+from me2e_compress.graph.provenance import drop_traces
 from me2e_compress.manager import PassManager, Report
 from me2e_compress.manager import recipe as recipes
 from me2e_compress.manager.pass_manager import collector_paused
@@ -26,6 +27,7 @@ from me2e_compress.registry import drafts
 from me2e_compress.runtime.atomic import write_document
 from me2e_compress.runtime.frames import Frames
 from me2e_compress.runtime.latency_trace import cpu_seconds
+from me2e_compress.runtime.providers import CPU
 from me2e_compress.workflows.checks import (
     load_map,
     model_path,
@@ -44,6 +46,7 @@ from me2e_compress.workflows.measured_loss import (
 )
 from me2e_compress.workflows.options import CompressOptions
 from me2e_compress.workflows.result import SILENT, Listener, Result, Shown, plain
+from me2e_compress.workflows.written import larger, slower
 
 Recipe: TypeAlias = str | Path | Sequence[Pass]
 """A shipped recipe's name, a TOML file, or passes."""
@@ -61,6 +64,9 @@ class CompressResult(Result):
         int8: what became int8 and what did not; None where no pass quantizes.
         loss: how true the graph stayed; None where every pass is exact.
         seconds: CPU time of everything but the writing.
+        larger: of what the file is larger than its source; empty if it is not.
+        slower: that int8 for this CPU takes longer than its source, measured on one
+            frame; empty if it does not.
         lint: what the target's rules say of the graph; None where nothing is int8.
     """
 
@@ -74,6 +80,8 @@ class CompressResult(Result):
     loss: MeasuredLoss | None = None
     seconds: float = 0.0
     lint: LintResult | None = None
+    larger: str = ""
+    slower: str = ""
 
     @property
     def report_path(self) -> Path:
@@ -110,7 +118,7 @@ class CompressResult(Result):
         return Shown(
             headline,
             (*self.report.tables(), *filter(None, [measured])),
-            filter(None, (*self.verdict(), time, headline, self.weights)),
+            filter(None, (*self.verdict(), self.slower, time, headline, self.weights)),
             (
                 *(() if self.loss is None else self.loss.alerts()),
                 *filter(None, ["" if self.int8 is None else self.int8.empty]),
@@ -149,6 +157,7 @@ class CompressResult(Result):
             yield from self.loss.lines()
         if self.lint is not None:
             yield f"lint: {self.lint.headline}"
+        yield from filter(None, [self.larger])
 
     def findings(self) -> dict[str, Any]:
         """Return weights, int8, fidelity and verdict for the report, without times.
@@ -261,6 +270,7 @@ def compress(
     outputs = (output, *data_names(output), *reported)
     with writing(outputs, inputs, force=options.force), collector_paused():
         loaded = read_graph(source, listener, options.adapter, options.module_map)
+        drop_traces(loaded)
         modules = load_map(options.module_map, loaded)
         seen = split_frames(source, loaded, frames, passes, options.measure_frames)
         start, provider = cpu_seconds(), options.runs_on
@@ -282,7 +292,11 @@ def compress(
         loss = measure_loss(report, provider, seen, Floor(options.floor), listener)
         linted = lint_written(report.model, passes, output, options.target)
         seconds = cpu_seconds() - start
-        return _written(report, source, output, int8, loss, seconds, linted)
+        made = _written(report, source, output, int8, loss, seconds, linted)
+        placed = () if int8 is None or int8.slow_here else report.lossy
+        if shown is None or provider.native != CPU.native or not placed:
+            return made
+        return dataclasses.replace(made, slower=slower(source, output, shown, provider))
 
 
 def _refuse(
@@ -329,8 +343,9 @@ def _written(
         if plan is not None:
             save_plan(plan, beside(output, "plan"))
         sizes = graph.file_bytes(source), graph.file_bytes(output)
+        grown = larger(source, output)
         made = CompressResult(
-            source, output, report, {}, *sizes, int8, loss, seconds, linted
+            source, output, report, {}, *sizes, int8, loss, seconds, linted, grown
         )
         record = report.record(source, output) | made.findings()
         write_document(beside(output, "report"), record, indent=2)

@@ -1,0 +1,83 @@
+"""What was written beside its source: whether it is larger, or no faster here."""
+
+import time
+from collections import Counter
+from pathlib import Path
+
+import onnx
+
+from me2e_compress.display import counted
+from me2e_compress.errors import FramesError, GraphError
+from me2e_compress.graph import file_bytes
+from me2e_compress.runtime.frames import Frames
+from me2e_compress.runtime.providers import Provider
+from me2e_compress.runtime.session import Session, replay
+
+ROUNDS = 5
+"""Runs of each file, the least of which counts."""
+
+ENOUGH_S = 3.0
+"""So long is measured at most, but for the first round."""
+
+
+def larger(source: Path, output: Path) -> str:
+    """Say of what a file is larger than its source; empty if it is not."""
+    more = file_bytes(output) - file_bytes(source)
+    if more <= 0:
+        return ""
+    parts = _bytes_by_kind(output)
+    parts.subtract(_bytes_by_kind(source))
+    grown = [f"{kind} {count:+,}" for kind, count in parts.most_common() if count > 0]
+    return (
+        f"{output.name} is {counted(more, 'byte')} larger than {source.name}:"
+        f" {', '.join(grown)}"
+    )
+
+
+def _bytes_by_kind(path: Path) -> Counter[str]:
+    model = onnx.load(path, load_external_data=False)
+    graph, kinds = model.graph, Counter[str]()
+    for node in graph.node:
+        notes = sum(entry.ByteSize() for entry in node.metadata_props)
+        tensors = sum(each.t.ByteSize() for each in node.attribute)
+        kinds["origins and plan"] += notes
+        kinds["weights"] += tensors
+        kinds["nodes"] += node.ByteSize() - notes - tensors
+    kinds["origins and plan"] += sum(each.ByteSize() for each in model.metadata_props)
+    kinds["weights"] += sum(each.ByteSize() for each in graph.initializer)
+    kinds["shapes"] += sum(each.ByteSize() for each in graph.value_info)
+    return kinds
+
+
+def slower(source: Path, output: Path, frames: Frames, provider: Provider) -> str:
+    """Say how much longer than its source a file takes here; empty if it is faster.
+
+    CPU time of one frame on one thread, in turn, as anybody opens the files. Empty,
+    too, where one of them does not run.
+    """
+    frame = next(iter(frames), None)
+    if frame is None:
+        return ""
+    least, begun = dict[Path, float](), time.perf_counter()
+    try:
+        sessions = {
+            path: Session(path, threads=1, stock=True, provider=provider)
+            for path in (source, output)
+        }
+        for _ in range(1 + ROUNDS):
+            for path, session in sessions.items():
+                start = time.process_time()
+                next(replay(session, [frame]))
+                took = time.process_time() - start
+                least[path] = min(took, least.get(path, took))
+            if time.perf_counter() - begun > ENOUGH_S:
+                break
+    except (FramesError, GraphError):
+        return ""
+    ratio = least[output] / least[source]
+    if ratio < 1:
+        return ""
+    return (
+        f"{output.name} takes {ratio:.2f} times as long as {source.name} here (CPU time"
+        " of one frame, one thread)"
+    )
