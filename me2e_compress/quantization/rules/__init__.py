@@ -130,6 +130,17 @@ class RuleFacts:
         return constant_values(self.model)
 
     @functools.cached_property
+    def priced(self) -> bool:
+        """Whether the target estimates what int8 saves and costs."""
+        return self.costs is not None and self.costs(self.model, ()) is not None
+
+    @functools.cached_property
+    def weight_elements(self) -> int:
+        """How many numbers the graph's weights hold."""
+        shapes = map(static_shape, self.model.graph.initializers.values())
+        return sum(math.prod(shape) for shape in shapes if shape is not None)
+
+    @functools.cached_property
     def attention(self) -> Mapping[ir.Node, Attention]:
         """The nodes that take part in an attention, each with that attention."""
         return find_attention(self.model, self.constants)
