@@ -75,7 +75,7 @@ class Table:
     def markdown(self) -> str:
         """Write it as GitHub shows it, intervals in brackets, every name escaped."""
         rule = "|---|" + "---:|" * (len(self.columns) - 1)
-        rows = [[in_markdown(_text(cell)) for cell in row] for row in self.rows]
+        rows = [[in_markdown(in_words(cell)) for cell in row] for row in self.rows]
         lines = [_line(self.columns), rule, *map(_line, rows)]
         title = f"**{in_markdown(self.title)}**"
         parts = [title, "\n".join(lines), *filter(None, [in_markdown(self.note)])]
@@ -180,5 +180,6 @@ def _line(cells: Iterable[str]) -> str:
     return "| " + " | ".join(cells) + " |"
 
 
-def _text(cell: Cell) -> str:
+def in_words(cell: Cell) -> str:
+    """Write a cell on one line, its interval in brackets."""
     return f"{cell.text} ({cell.detail})" if cell.detail else cell.text

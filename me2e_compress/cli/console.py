@@ -19,7 +19,7 @@ from rich.progress import (
 from rich.table import Table as Shown
 from rich.text import Text
 
-from me2e_compress.display import Cell, Table, duration, printable
+from me2e_compress.display import Cell, Table, counted, duration, printable
 from me2e_compress.workflows.result import SILENT, Listener, Result
 
 console = Console(record=True, emoji=False)
@@ -179,8 +179,10 @@ def print_table(content: Table) -> None:
         console.print(Text(content.note, "dim"))
     if not intervals and any(cell.detail for row in content.rows for cell in row):
         console.print(Text(f"Intervals: in a terminal of {WIDE} columns.", "dim"))
-    if content.details and is_verbose():
-        console.print(Text(content.details, "dim"), soft_wrap=True)
+    if content.details:
+        lines = counted(content.details.count("\n") + 1, "note")
+        shown = content.details if is_verbose() else f"{lines} more: -v"
+        console.print(Text(shown, "dim"), soft_wrap=True)
 
 
 def _frame(content: Table) -> int:

@@ -9,7 +9,7 @@ from pathlib import Path
 import onnx_ir as ir
 
 from me2e_compress import graph
-from me2e_compress.display import AT_LEAST, Table, counted, giga, megabytes, table
+from me2e_compress.display import AT_LEAST, Table, giga, megabytes, table
 from me2e_compress.graph.summary import Size
 from me2e_compress.passes.base import Pass
 
@@ -196,9 +196,7 @@ def versions() -> dict[str, str]:
 def _steps_table(steps: Sequence[Step]) -> Table:
     """Show pass by pass what changed and what it cost, and what the passes say."""
     said = [f"{step.name}: {note}" for step in steps for note in step.notes]
-    notes = [f"{counted(len(said), 'note')} from the passes: -v"] if said else []
-    if any(step.after.unknown_macs_nodes for step in steps):
-        notes.append(AT_LEAST)
+    partly = any(step.after.unknown_macs_nodes for step in steps)
     return table(
         "Pass by pass",
         ("pass", "changes", "nodes", "weights MB", "GMACs", "CPU s"),
@@ -214,7 +212,7 @@ def _steps_table(steps: Sequence[Step]) -> Table:
             )
             for step in steps
         ],
-        "\n".join(notes),
+        AT_LEAST if partly else "",
         details="\n".join(said),
     )
 

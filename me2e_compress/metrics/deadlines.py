@@ -120,12 +120,6 @@ def _mean(latencies_us: Sequence[int], why: str) -> Measure:
     return Measure(fmean(latencies_us) / 1e3, "ms")
 
 
-def _percentile(latencies_us: Sequence[int], percent: float, samples: int) -> Measure:
-    if why := too_few(percent, samples):
-        return Measure(None, "ms", why)
-    return Measure(percentile(latencies_us, percent) / 1e3, "ms")
-
-
 def deadlines_table(title: str, found: Deadlines) -> Table:
     """Return percentiles, and how many decisions took longer than the budget."""
     rows = [(n, number(each.value, ".2f"), each.unit) for n, each in _each(found)]

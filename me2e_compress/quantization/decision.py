@@ -153,20 +153,17 @@ class QuantPlan:
         )
 
     def tables(self) -> tuple[Table, ...]:
-        """Return how many nodes of a module each rule decided; nodes as in `counts`."""
-        found = Counter(
-            (each.module, each.dtype, each.rule)
-            for each in self.decisions
-            if each.could_be_int8
-        )
-        order = dict.fromkeys(module for module, _, _ in found)
-        rows = [
-            (*key, str(found[key]))
-            for module in order
-            for key in sorted(key for key in found if key[0] == module)
-        ]
-        columns = ("module", "", "rule", "nodes")
-        return (table("Decisions by module and rule", columns, rows, words=3),)
+        """Return how many nodes of a module are int8 or float; nodes as in `counts`."""
+        could = [each for each in self.decisions if each.could_be_int8]
+        rows = list[tuple[str, ...]]()
+        for module in dict.fromkeys(each.module for each in could):
+            theirs = [each for each in could if each.module == module]
+            left = Counter(each.rule for each in theirs if each.dtype != INT8)
+            rules = ", ".join(f"{rule} {left[rule]}" for rule in sorted(left))
+            counts = len(theirs) - left.total(), left.total()
+            rows.append((module, rules, *map(str, counts)))
+        columns = ("module", "float by rule", "int8", "float")
+        return (table("Decisions by module and rule", columns, rows, words=2),)
 
     def counts(self) -> dict[str, int]:
         """Count the decisions by rule, over the nodes that could be int8 at all."""

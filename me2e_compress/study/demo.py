@@ -6,15 +6,17 @@ from pathlib import Path
 
 from me2e_compress.display import Cell, Table
 from me2e_compress.evaluators.highway.engine import LocalEngine
-from me2e_compress.metrics.measure import Estimate
-from me2e_compress.metrics.route_summary import shown_by
-from me2e_compress.metrics.scores import Scores
 from me2e_compress.quantization.decision import plan_of
 from me2e_compress.simulator.routes import load_routes, pick_routes
-from me2e_compress.study.cells import MISSING, measure_cell, number
+from me2e_compress.study.cells import MISSING, estimate_cell, measure_cell
 from me2e_compress.study.condition import Condition
 from me2e_compress.study.definition import Study, Timing, Variant
-from me2e_compress.study.report.page import Section, write_study
+from me2e_compress.study.report.page import (
+    Section,
+    findings,
+    limits,
+    write_study,
+)
 from me2e_compress.study.run import run_study
 from me2e_compress.study.study_result import StudyResult
 from me2e_compress.study.workspace import HTML, JSON, MARKDOWN
@@ -35,69 +37,26 @@ ROUTES = "5"
 """What both drive: a number of routes, or their names."""
 
 
-def before_and_after(outcome: StudyResult, name: str) -> Table:
-    """Compare the baseline and a variant of a study with one condition."""
-    before, after = outcome.variant(outcome.study.baseline), outcome.variant(name)
-    drives = {each.variant: each for each in outcome.drives}
-    driven = [drives[each.name] for each in (before, after)]
-    # size, latency and plan
-    most = after.fidelity.max_m.value
-    both = before.latency_ms[50], after.latency_ms[50]
-    costs = (
-        ("size, MB", before.size_mb, after.size_mb, ".2f"),
-        ("time of a decision, ms", *both, ".1f"),
-    )
+def before_and_after(outcome: StudyResult) -> Table:
+    """Show size, time, plan and driving score, a row a drive."""
     rows = list[tuple[Cell, ...]]()
-    for what, old, new, form in costs:
-        share = ""
-        if old.value and new.value is not None:
-            share = f"{new.value / old.value:.0%}"
-        both_cells = measure_cell(old, form), measure_cell(new, form)
-        rows.append((Cell(what), *both_cells, Cell(share)))
-    moved = measure_cell(after.fidelity.mean_m, ".3f")
-    words = "" if most is None else f"{most:.2f} m at most"
-    rows.append((Cell("the plan moves by, m"), Cell(MISSING), moved, Cell(words)))
-    # the drives, and their paired difference in points with its 95 % interval
-    gap = driven[1].difference
-    picks: dict[str, Callable[[Scores], Estimate]] = {
-        "driving score": lambda scores: scores.driving_score,
-        "room kept, %": lambda scores: scores.safety.room_kept,
-    }
-    for what, pick in picks.items():
-        cells = [
-            Cell(MISSING, reason=each.reason)
-            if each.scores is None
-            else measure_cell(pick(each.scores).measure, ".1f")
-            for each in driven
-        ]
-        words = ""
-        if gap is not None:
-            points = gap.room_kept if "room" in what else gap.driving_score
-            if points.value is not None:
-                words = number(points.value, "+.1f")
-            if words and points.low is not None and points.high is not None:
-                low, high = number(points.low, "+.1f"), number(points.high, "+.1f")
-                words = f"{words} ({low} to {high})"
-        rows.append((Cell(what), *cells, Cell(words)))
-    return Table("Before and after", ("", before.name, after.name, ""), tuple(rows))
-
-
-def road_verdict(outcome: StudyResult, name: str) -> str:
-    """Say how a variant drives, and what so many routes can show."""
-    (drive,) = (each for each in outcome.drives if each.variant == name)
-    gap = drive.difference
-    if gap is None:
-        return f"on the road: not measured ({drive.reason})"
-    routes, whole = gap.driving_score.n, outcome.coverage[1]
-    verdict = f"on the road: {gap.verdict}"
-    if not gap.differ:
-        most = f"{gap.unseen_percent:.0f} %"
-        verdict += f"; 0 of {routes} routes differ, with 95 % at most {most} of all do"
-    limit = f"{routes} route{'s' * (routes > 1)} cannot show a difference below"
-    verdict += f"; {limit} {gap.smallest_shown:.0f} points"
-    if routes < whole:
-        verdict += f", all {whole} none below {shown_by(whole):.1f}"
-    return verdict
+    for drive in outcome.drives:
+        variant, gap = outcome.variant(drive.variant), drive.difference
+        score, moved = drive.scores, Cell(MISSING, reason="the baseline itself")
+        rows.append(
+            (
+                Cell(outcome.label(drive)),
+                measure_cell(variant.size_mb, ".2f"),
+                measure_cell(variant.latency_ms[50], ".1f"),
+                measure_cell(variant.fidelity.mean_m, ".3f"),
+                measure_cell(variant.fidelity.max_m, ".2f"),
+                Cell(MISSING) if score is None else estimate_cell(score.driving_score),
+                estimate_cell(gap.driving_score, signed=True) if gap else moved,
+            )
+        )
+    columns = ("", "MB", "ms", "plan m", "at most", "driving score", "difference")
+    note = "ms: median of a decision; plan: metres that waypoints move."
+    return Table("Before and after", columns, tuple(rows), note)
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
@@ -105,7 +64,6 @@ class DriveResult(Result):
     """How the driver drives before and after compression."""
 
     study: StudyResult
-    variant: str
     ending: tuple[str, ...]
 
     def shown(self) -> Shown:
@@ -113,8 +71,8 @@ class DriveResult(Result):
         driven, whole = self.study.coverage
         return Shown(
             f"{driven} of {whole} routes, before and after",
-            [before_and_after(self.study, self.variant)],
-            (road_verdict(self.study, self.variant), *self.ending),
+            [before_and_after(self.study)],
+            (*map(": ".join, findings(self.study)), limits(self.study), *self.ending),
             self.study.alerts(),
         )
 
@@ -252,4 +210,4 @@ class DriverDemo:
             f"  me2e-compress compress {DRIVER} -r {RECIPE} --target"
             f" tensorrt --frames {self._frames} -o {DRIVER}.trt.onnx",
         )
-        return DriveResult(result, RECIPE, ending)
+        return DriveResult(result, ending)

@@ -73,6 +73,12 @@ class StudyResult(Result):
             return drive.variant
         return f"{drive.variant}, {drive.condition}"
 
+    def described(self, condition: Condition) -> str:
+        """Describe a condition, and whose latencies it charges."""
+        scale = self.device_scale
+        slower = f"a device {scale:.3g} times slower"
+        return condition.described("this machine" if scale == 1.0 else slower)
+
     def under(self, condition: Condition) -> tuple[DriveRecord, ...]:
         """Return the drives under one condition."""
         return tuple(each for each in self.drives if each.condition == condition.name)
@@ -122,12 +128,12 @@ class StudyResult(Result):
     def tables_by_section(self) -> Mapping[str, tuple[Table, ...]]:
         """Every table, in reading order; a preview is marked as such."""
         sections = {
-            "Scoreboard": scoreboards(self),
-            "Paired differences": (differences(self),) * (len(self.variants) > 1),
+            "On the road": (scoreboard(self),),
+            "Differences": (difference_table(self),) * (len(self.variants) > 1),
             "One change at a time": change_tables(self),
             "Route by route": route_tables(self),
             "Near misses": (near_misses(self),),
-            "Abilities": abilities(self),
+            "Abilities": (abilities(self),),
         }
         preview = self.study.preview
         return {
@@ -164,20 +170,17 @@ class StudyResult(Result):
         }
 
 
-def scoreboards(result: StudyResult) -> tuple[Table, ...]:
-    """Show driving scores, size and latency of all variants, by condition."""
-    baseline, (driven, whole) = result.study.baseline, result.coverage
+def scoreboard(result: StudyResult) -> Table:
+    """Show the scores of every drive, and size and latency of its variant."""
+    study, (driven, whole) = result.study, result.coverage
     of = "" if driven == whole else f"{driven} of "
     note = (
-        f"{of}{counted(whole, 'route')}. DS driving score, room kept to others, SR "
+        f"{'; '.join(map(result.described, study.conditions))}."
+        f" {of}{counted(whole, 'route')}. DS driving score, room kept to others, SR "
         "success rate, DE efficiency, DC comfort, both also in the arithmetic of "
         "Bench2Drive's tools (b2d), each with its 95 % interval over these scenario "
         f"types. {MISSING} means not measured."
     )
-    if len(result.variants) == 1:
-        rows = tuple((Cell(each.condition), *_scores(each)) for each in result.drives)
-        title = f"Scoreboard of {baseline}"
-        return (Table(title, ("condition", *SCORES), rows, note),)
     # what the columns of costs are
     if result.timed:
         scale = result.device_scale
@@ -185,8 +188,8 @@ def scoreboards(result: StudyResult) -> tuple[Table, ...]:
         kind = "on this machine" if scale == 1.0 else kind
         note += f" Latency: models in turn, warm, {kind}."
     note += (
-        f" Plan and SQNR: how far waypoints move from {baseline}'s on held-out frames, "
-        "and the noise on them."
+        f" Plan and SQNR: how far waypoints move from {study.baseline}'s on held-out"
+        " frames, and the noise on them."
     )
     costs = {
         each.name: (
@@ -198,25 +201,12 @@ def scoreboards(result: StudyResult) -> tuple[Table, ...]:
         )
         for each in result.variants
     }
-    return tuple(
-        Table(
-            f"Scoreboard, {_condition(result, condition)}",
-            ("variant", *SCORES, *COSTS),
-            tuple(
-                (Cell(each.variant), *_scores(each), *costs[each.variant])
-                for each in result.under(condition)
-            ),
-            note,
-            baseline,
-        )
-        for condition in result.study.conditions
+    rows = tuple(
+        (Cell(result.label(each)), *_scores(each), *costs[each.variant])
+        for each in result.drives
     )
-
-
-def _condition(result: StudyResult, condition: Condition) -> str:
-    scale = result.device_scale
-    device = "this machine" if scale == 1.0 else f"a device {scale:.3g} times slower"
-    return condition.described(device)
+    columns = ("variant", *SCORES, *COSTS)
+    return Table("Scoreboard", columns, rows, note, study.baseline)
 
 
 def _scores(drive: DriveRecord) -> tuple[Cell, ...]:
@@ -230,7 +220,7 @@ def _scores(drive: DriveRecord) -> tuple[Cell, ...]:
     return tuple(map(estimate_cell, shown))
 
 
-def differences(result: StudyResult) -> Table:
+def difference_table(result: StudyResult) -> Table:
     """Show every variant minus the baseline, paired by route."""
     labels = [each for each in result.drives if each.difference is not None]
     gaps = [each.difference for each in labels if each.difference is not None]
@@ -284,39 +274,22 @@ def _gaps(of: Change | PairedDifference) -> tuple[Cell, ...]:
     return score, anew_cell(of.driving_score), room, rate
 
 
-def abilities(result: StudyResult) -> tuple[Table, ...]:
-    """Show the success rate by ability, in tables like the scoreboards."""
-    # scores by the heading of their column, and who is printed in bold
-    heading, strong = "variant", result.study.baseline
-    scores = {
-        f"Success by ability in %, {_condition(result, each)}": {
-            drive.variant: drive.scores for drive in result.under(each)
-        }
-        for each in result.study.conditions
-    }
-    if len(result.variants) == 1:
-        by_condition = {drive.condition: drive.scores for drive in result.drives}
-        scores = {f"Success of {strong} by ability in %": by_condition}
-        heading, strong = "condition", ""
-    columns = (heading, *(name.replace("_", " ") for name in ABILITIES), "mean")
-    note = "A route may test two abilities. Intervals are exact, the mean's by "
-    return tuple(
-        Table(
-            title,
-            columns,
-            tuple(
-                (
-                    Cell(name),
-                    *map(estimate_cell, (*e.each_ability.values(), e.abilities)),
-                )
-                for name, e in of.items()
-                if e is not None
-            ),
-            f"{note}bootstrap.",
-            strong,
+def abilities(result: StudyResult) -> Table:
+    """Show the success rate by ability of every drive."""
+    columns = ("variant", *(name.replace("_", " ") for name in ABILITIES), "mean")
+    rows = tuple(
+        (
+            Cell(result.label(each)),
+            *map(estimate_cell, (*of.each_ability.values(), of.abilities)),
         )
-        for title, of in scores.items()
+        for each in result.drives
+        if (of := each.scores) is not None
     )
+    note = (
+        "A route may test two abilities. Intervals are exact, the mean's by bootstrap."
+    )
+    title, strong = "Success by ability in %", result.study.baseline
+    return Table(title, columns, rows, note, strong)
 
 
 def change_tables(result: StudyResult) -> tuple[Table, ...]:

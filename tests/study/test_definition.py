@@ -175,7 +175,7 @@ def test_every_option_reaches_the_drive(make: Make, tmp_path: Path) -> None:
     assert made_by["dt_us"] == 25_000
     assert made_by["weather"]["noise"] == 9.0
     [table, *_] = found.tables()
-    assert table.title.startswith("Scoreboard of blind")
+    assert table.title.startswith("Scoreboard")
     assert found.to_json()["conditions"] == [condition.to_json()]
 
 

@@ -5,16 +5,13 @@ from pathlib import Path
 
 import matplotlib.pyplot as plt
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 from markupsafe import Markup
 
 from me2e_compress.display import Cell, Table
 from me2e_compress.errors import StudyError
-from me2e_compress.metrics.measure import Estimate, Measure
 from me2e_compress.registry.drafts import IN_JSON, IN_MARKDOWN, is_marked
 from me2e_compress.runtime.latency_trace import Load
-from me2e_compress.study import Condition, StudyResult
+from me2e_compress.study import StudyResult
 from me2e_compress.study.cells import (
     INFINITE,
     MINUS,
@@ -23,7 +20,14 @@ from me2e_compress.study.cells import (
     measure_cell,
     number,
 )
-from me2e_compress.study.report.figures import Point, curves, forest, front, pareto, svg
+from me2e_compress.study.report.figures import (
+    ACCENT,
+    MOST_DRIVES,
+    answer,
+    differences,
+    road,
+    svg,
+)
 from me2e_compress.study.report.page import (
     TIMES,
     Drawing,
@@ -36,38 +40,14 @@ from me2e_compress.study.report.page import (
 from me2e_compress.study.study_result import (
     MOST_ROUTES,
     abilities,
-    differences,
+    difference_table,
     near_misses,
     route_tables,
-    scoreboards,
+    scoreboard,
 )
-from tests.study.conftest import IDEAL, ROUTES, SLOW
+from tests.study.conftest import IDEAL, ROUTES
 
 pytestmark = pytest.mark.xdist_group("study")
-
-
-def point(cost: float, score: float) -> Point:
-    return Point("p", cost, Estimate(Measure(score, "%"), None, None, 1), False)
-
-
-POINTS = st.lists(
-    st.builds(point, st.floats(0, 10), st.floats(0, 100)), min_size=1, max_size=12
-)
-
-
-def beats(one: Point, other: Point) -> bool:
-    no_worse = one.cost <= other.cost and one.height >= other.height
-    return no_worse and (one.cost < other.cost or one.height > other.height)
-
-
-@given(POINTS)
-def test_a_front_is_what_no_other_beats(points: list[Point]) -> None:
-    kept = front(points)
-
-    assert kept
-    assert not any(beats(other, one) for one in kept for other in points)
-    for dropped in (each for each in points if each not in kept):
-        assert any(beats(one, dropped) for one in kept)
 
 
 @pytest.fixture(scope="module")
@@ -90,14 +70,12 @@ def test_the_page_needs_nothing_beside_it_and_is_the_same_again(
 
 
 def test_a_preview_is_named_so_in_every_title_and_the_headline(page: str) -> None:
-    titles = re.findall(
-        r"<(?:h1|title)>(.*?)<|class=\"table\">\n<figcaption>(.*?)<", page
-    )
+    titles = re.findall(r"<(?:h1|title)>(.*?)<|<summary>((?!How it).*?)<", page)
 
     assert len(titles) >= 6
     assert all("(preview: 2 of 220 routes)" in f"{a}{b}" for a, b in titles)
-    (lede,) = re.findall(r'<p class="lede">(.*?)</p>', page)
-    assert "2 routes cannot show a difference below " in lede
+    assert "2 routes cannot show a difference below 77.6 points of driving" in page
+    assert ", all 220 none below 3.4." in page
     assert "Decisions cost no time under ideal: no latency shows there." in page
 
 
@@ -133,31 +111,59 @@ def test_each_route_has_its_end_unless_there_are_many(found: StudyResult) -> Non
     assert route_tables(replace(found, drives=tuple(many))) == ()
 
 
-def test_figures_name_every_variant(found: StudyResult) -> None:
-    costs, gaps = pareto(found, IDEAL), forest(found)
+def test_the_answer_has_a_row_a_variant_and_a_mark_a_drive(found: StudyResult) -> None:
+    drawn = str(answer(found))
 
-    assert costs is not None
-    assert gaps is not None
-    assert all(f">{name}</text>" in costs for name in ("slow", "again", "fast"))
-    assert ">blind</text>" not in costs
-    assert ">fast, slow</text>" in gaps
-
-
-def test_a_curve_needs_three_conditions(found: StudyResult) -> None:
-    middle = Condition("middle", "fps:5")
-    drives = [replace(each, condition="middle") for each in found.drives[:4]]
-    study = replace(found.study, conditions=(IDEAL, middle, SLOW))
-    three = replace(
-        found, study=study, drives=(*found.drives[:4], *drives, *found.drives[4:])
+    # names, costs as shares, the plan, and every drive with its interval
+    for words, count in (
+        ("again", 1),
+        ("0.00 (129 %)", 1),
+        ("200.0", 1),
+        ("7.00 (at most 12.00)", 1),
+        ("the reference", 1),
+        ("ideal: 17.1 (16.1 to 18.1)", 1),
+        (MISSING, 3),
+    ):
+        assert drawn.count(f">{words}</text>") == count, words
+    # a drive that was not made, and one condition alone
+    row = tuple(replace(each, scores=None) for each in found.under(IDEAL))
+    study = replace(found.study, conditions=(IDEAL,))
+    assert (
+        str(answer(replace(found, study=study, drives=row))).count(">not driven<") == 4
     )
 
-    drawn = curves(three)
 
-    assert curves(found) is None
-    assert drawn is not None
-    assert all(drawn.count(f">{name}</text>") == 3 for name in ("middle", "fast"))
-    fast = tuple(each for each in three.drives if each.variant == "fast")
-    assert ">again<" not in str(curves(replace(three, drives=fast)))
+def test_of_many_drives_the_answer_has_one_condition(found: StudyResult) -> None:
+    drives = found.drives * (1 + MOST_DRIVES // len(found.drives))
+    many = replace(found, drives=drives)
+
+    assert ">slow: " not in answer(many)
+    assert ">Driving score, 0 to 100</text>" in road(many)
+    assert ">Driving score, 0 to 100</text>" not in road(found)
+    assert "Driving scores are those under ideal." in study_page(many).html()
+
+
+def test_what_is_sure_is_filled(found: StudyResult) -> None:
+    drawn = str(differences(found))
+
+    assert f">{MINUS}25.4 ({MINUS}83.3 to +72.0)</text>" in drawn
+    assert ">fast, slow</text>" in drawn
+    assert f"fill: {ACCENT}" not in drawn
+    (sure,) = (e for e in found.drives if (e.variant, e.condition) == ("fast", "slow"))
+    assert sure.difference is not None
+    gap = replace(sure.difference.driving_score, low=-50.0, high=-20.0)
+    sure = replace(sure, difference=replace(sure.difference, driving_score=gap))
+    assert f"fill: {ACCENT}" in str(differences(replace(found, drives=(sure,))))
+    assert differences(replace(found, drives=found.drives[1:2])) is None
+
+
+def test_a_page_of_a_comparison_is_folded_but_for_its_pictures(page: str) -> None:
+    head, *rest = page.split("<details>")
+
+    assert head.count("<svg") == 2
+    assert "<table" not in head
+    assert sum(each.count("<table") for each in rest) == page.count("<table") >= 6
+    assert head.index("<svg") < head.index('<ul class="findings">')
 
 
 def test_findings_give_costs_and_what_is_sure(found: StudyResult) -> None:
@@ -165,7 +171,7 @@ def test_findings_give_costs_and_what_is_sure(found: StudyResult) -> None:
 
     assert list(told) == ["blind", "again", "fast"]
     assert told["again"].startswith(f"1.00 {TIMES} the size, ")
-    alike = f"ideal: driving score +0.0 points ({MINUS}77.6 to +77.6), too few"
+    alike = f"ideal: driving score +0.0 points ({MINUS}77.6 to +77.6), too few routes"
     assert alike in told["again"]
     assert "size" not in told["blind"]
 
@@ -178,7 +184,7 @@ def test_files_are_written_beside_each_other(
     assert json.loads(written.record.read_text()) == IN_JSON | found.to_json()
     assert written.tables.read_text().startswith(
         f"{IN_MARKDOWN}# Slow &amp; &lt;fast&gt; (preview: 2 of 220 routes)\n\n"
-        "**Scoreboard, "
+        "**Scoreboard (preview"
     )
     assert written.report.read_text().startswith("<!doctype html>")
     assert all(map(is_marked, (tmp_path / "new" / "study").iterdir()))
@@ -188,19 +194,40 @@ def test_files_are_written_beside_each_other(
         write_study(found, written.tables / "study")
 
 
-def test_a_scoreboard_a_condition_and_a_row_a_variant(found: StudyResult) -> None:
-    ideal, slow = scoreboards(found)
+def test_the_line_of_the_docs_reads_a_folder_of_records(
+    found: StudyResult, folder: Path
+) -> None:
+    pandas = pytest.importorskip("pandas")
+    text = Path("docs/study.md").read_text("utf-8")
+    (line,) = re.findall(r"^pd\.concat.*$", text, re.MULTILINE)
 
-    assert ideal.title == "Scoreboard, ideal: decisions cost no time"
-    assert slow.title == "Scoreboard, slow: 2 decisions a second"
-    assert [row[0].text for row in ideal.rows] == ["blind", "slow", "again", "fast"]
-    assert all(len(row) == len(ideal.columns) for row in ideal.rows)
-    assert ideal.strong == "slow"
-    assert "2 of 220 routes" in ideal.note
+    rows = eval(line.replace("out/", f"{folder}/"), {"pd": pandas, "Path": Path})
+
+    means = rows.groupby(level=0).driving_score.mean().to_dict()
+    assert means == {
+        each.name: pytest.approx(each.scores.driving_score.value)
+        for each in found.drives
+        if each.scores is not None
+    }
+
+
+def test_a_scoreboard_has_a_row_a_drive(found: StudyResult) -> None:
+    board = scoreboard(found)
+
+    assert [row[0].text for row in board.rows] == [
+        f"{variant}, {condition}"
+        for condition in ("ideal", "slow")
+        for variant in ("blind", "slow", "again", "fast")
+    ]
+    assert all(len(row) == len(board.columns) for row in board.rows)
+    assert board.strong == "slow"
+    assert board.note.startswith(
+        "ideal: decisions cost no time; slow: 2 decisions a second. 2 of 220 routes."
+    )
     # its numbers are those of the drives
     scores = found.under(IDEAL)[3].scores
     assert scores is not None
-    blind, _, again, row = ideal.rows
+    blind, _, again, row, *_ = board.rows
     assert row[1] == estimate_cell(scores.driving_score)
     assert row[2] == estimate_cell(scores.safety.room_kept)
     assert row[4] == estimate_cell(scores.efficiency)
@@ -214,7 +241,7 @@ def test_a_scoreboard_a_condition_and_a_row_a_variant(found: StudyResult) -> Non
 
 
 def test_the_baseline_is_not_compared_with_itself(found: StudyResult) -> None:
-    table = differences(found)
+    table = difference_table(found)
 
     assert table.title == "Difference to slow on the same routes"
     assert [row[0].text for row in table.rows] == [
@@ -235,7 +262,7 @@ def test_the_baseline_is_not_compared_with_itself(found: StudyResult) -> None:
 def test_abilities_have_their_mean_last_and_every_drive_has_near_misses(
     found: StudyResult,
 ) -> None:
-    table = abilities(found)[0]
+    table = abilities(found)
 
     assert table.columns[1:] == (
         *("Overtaking", "Merging", "Emergency Brake", "Give Way", "Traffic Signs"),
@@ -249,19 +276,17 @@ def test_abilities_have_their_mean_last_and_every_drive_has_near_misses(
     assert slow[4].detail
 
 
-def test_one_variant_has_one_scoreboard_of_its_conditions(found: StudyResult) -> None:
+def test_one_variant_is_not_compared(found: StudyResult) -> None:
     study = replace(found.study, variants=found.study.variants[1:2], baseline="slow")
     drives = tuple(each for each in found.drives if each.variant == "slow")
     alone = replace(found, study=study, variants=found.variants[1:2], drives=drives)
 
-    [table] = scoreboards(alone)
-    [mastered] = abilities(alone)
-
-    assert table.columns[1:6] == ("DS", "room %", "SR %", "DE %", "DE b2d %")
-    assert table.columns[6:] == ("DC", "DC b2d")
-    assert [row[0].text for row in mastered.rows] == ["ideal", "slow"]
-    assert [row[0].text for row in table.rows] == ["ideal", "slow"]
+    assert [row[0].text for row in scoreboard(alone).rows] == [
+        "slow, ideal",
+        "slow, slow",
+    ]
     assert "Difference" not in "".join(each.title for each in alone.tables())
+    assert "<h2>Differences</h2>" not in study_page(alone).html()
 
 
 def test_markdown() -> None:
@@ -304,13 +329,17 @@ MARKUP = "<script>alert(1)</script>"
 def test_everything_in_a_page_is_escaped() -> None:
     row, rows = (MARKUP, MARKUP), [(MARKUP, MARKUP, MARKUP)]
     table = Table(MARKUP, row, ((Cell(MARKUP, MARKUP), Cell("", "", MARKUP)),), MARKUP)
-    drawing = Drawing(Markup("<svg>"), MARKUP, MARKUP)
-    section = Section(MARKUP, (table,), (row,), (drawing,), MARKUP)
+    drawing = Drawing(Markup("<svg>"), MARKUP)
+    sections = [
+        Section(MARKUP, (table,), drawings=(drawing,)),
+        Section(MARKUP, (table,), (row,)),
+    ]
+    made = [row], rows, [row], MARKUP, [MARKUP]
 
-    page = Page(MARKUP, MARKUP, [section], [row], rows, [row], MARKUP, [MARKUP]).html()
+    page = Page(MARKUP, MARKUP, sections, *made, drawing).html()
 
     assert "<script" not in page
-    assert page.count("&lt;script&gt;") > 20
+    assert page.count("&lt;script&gt;") > 25
 
 
 def test_words_in_a_drawing_are_text() -> None:

@@ -1,19 +1,24 @@
-"""The figures of a report, as SVG."""
+"""The figures of a page, as SVG: a row a variant or a drive, a panel a number."""
 
 import io
-from collections.abc import Callable, Sequence
+import itertools
+import textwrap
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Self
 
 from markupsafe import Markup
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.style import context
 
-from me2e_compress.metrics.measure import Estimate
-from me2e_compress.metrics.scores import Scores
-from me2e_compress.study.condition import Condition
+from me2e_compress.display import in_words
+from me2e_compress.metrics.measure import Estimate, Measure
+from me2e_compress.study.cells import estimate_cell, measure_cell, number
+from me2e_compress.study.drive_record import DriveRecord
+from me2e_compress.study.outcome import VariantOutcome
 from me2e_compress.study.study_result import StudyResult
 
 INK, MUTED, RULE = "#1d2127", "#6b7480", "#d9dde3"
@@ -21,6 +26,14 @@ ACCENT, BASELINE = "#2a6fb0", "#1d2127"
 STYLE = Path(__file__).with_name("report.mplstyle")
 PAGE_FONT = "Inter, 'Segoe UI', 'Helvetica Neue', Arial, sans-serif"
 """Text stays text: matplotlib measures one font, the page shows its own."""
+WIDTH_IN = 9.2
+"""Width of the page's column."""
+ROW_IN, FRAME_IN = 0.42, 0.72
+"""Height of a row, and of titles and axes."""
+MOST_DRIVES = 14
+"""With more drives than this, the first figure has those of one condition alone."""
+LONGEST_NAME = 20
+"""Characters of a name on one line."""
 
 
 def styled() -> AbstractContextManager[None]:
@@ -36,257 +49,234 @@ def svg(figure: Figure) -> Markup:
     return Markup(text[text.index("<svg") :].replace("'DejaVu Sans'", PAGE_FONT))
 
 
-def bare(axes: Axes) -> None:
-    """Leave only a light grid along x."""
-    axes.grid(visible=True, axis="x")
-    axes.spines["left"].set_visible(False)
+@dataclass(frozen=True)
+class Mark:
+    """A number, the words above it, and a line from its low to its high end.
 
+    ``filled`` is whether the dot is; a difference that may be chance has an empty one.
+    """
 
-CROWD = 6
-"""With more variants than this, only the front and the baseline bear names and bars."""
-WIDTH_IN = 9.2
-"""Width of the page's column."""
-LINE_PT = 10.5
-"""Height of a line of labels, points."""
-CHARACTER_PT = 4.9
-"""Mean width of a character, points: an estimate is enough here."""
-GAP_PT = 7.0
-POINTS_AN_INCH = 72.0
+    place: float
+    colour: str
+    words: str
+    value: float | None
+    low: float | None = None
+    high: float | None = None
+    filled: bool = True
+
+    @classmethod
+    def of(cls, place: float, colour: str, estimate: Estimate, name: str = "") -> Self:
+        """Mark a mean with its interval; ``name`` stands before the number."""
+        words = in_words(estimate_cell(estimate))
+        words = f"{name}: {words}" if name else words
+        ends = estimate.low, estimate.high
+        return cls(place, colour, words, estimate.value, *ends)
 
 
 @dataclass(frozen=True)
-class Point:
-    """A variant in the plane of cost (megabytes or milliseconds) and driving score."""
+class Panel:
+    """The marks of one number on an axis that begins at zero.
 
-    name: str
-    cost: float
-    score: Estimate
-    baseline: bool
+    Attributes:
+        bars: Whether values are bars, not dots.
+        most: The largest value there can be; None if there is no such.
+        signed: Whether values are differences around zero.
+    """
 
-    @property
-    def height(self) -> float:
-        """The driving score itself."""
-        return self.score.value or 0.0
-
-
-def front(points: Sequence[Point]) -> list[Point]:
-    """Return the points that no other beats in both respects, cheapest first."""
-    best, kept = float("-inf"), list[Point]()
-    for point in sorted(points, key=lambda p: (p.cost, -p.height)):
-        if point.height > best:
-            kept.append(point)
-            best = point.height
-    return kept
+    title: str
+    marks: Sequence[Mark]
+    bars: bool = False
+    most: float | None = None
+    signed: bool = False
 
 
-def pareto(outcome: StudyResult, condition: Condition) -> Markup | None:
-    """Draw driving score against latency and against size; None below two points."""
-    # panels with at least two points
-    baseline, panels = outcome.study.baseline, list[tuple[list[Point], str]]()
-    costs = {
-        "median latency, ms": {e.name: e.latency_ms[50] for e in outcome.variants},
-        "size, MB": {each.name: each.size_mb for each in outcome.variants},
-    }
-    for words, by_name in costs.items():
-        points = [
-            Point(name, cost, drive.scores.driving_score, name == baseline)
-            for drive in outcome.under(condition)
-            if drive.scores is not None
-            if (cost := by_name[name := drive.variant].value) is not None
+def answer(outcome: StudyResult) -> Markup:
+    """Draw size, time, plan and driving score of every variant.
+
+    A row a variant, with a line for every condition in the panel of the driving score;
+    of too many drives those under the first condition alone.
+    """
+    conditions = outcome.study.conditions
+    names = {each.name for each in conditions}
+    if len(outcome.drives) > MOST_DRIVES:
+        names = {conditions[0].name}
+    # a variant is as high as its drives, and stands in their middle
+    places, drives, top = dict[str, float](), list[tuple[float, DriveRecord]](), 0
+    for variant in outcome.variants:
+        theirs = [e for e in outcome.drives if e.variant == variant.name]
+        shown = [each for each in theirs if each.condition in names]
+        height = max(1, len(shown))
+        places[variant.name] = top + (height - 1) / 2
+        drives += [(top + line, each) for line, each in enumerate(shown)]
+        top += height
+    # the words of a cost say which share of the baseline's it is
+    panels = [*_costs(outcome, places), _road(outcome, drives, len(names) > 1)]
+    return _drawn(places, top, panels)
+
+
+def road(outcome: StudyResult) -> Markup:
+    """Draw the scores of every drive."""
+    rows = list(enumerate(outcome.drives))
+    panels = [_road(outcome, rows)] * (len(outcome.drives) > MOST_DRIVES)
+    titles = "Success rate, %", "Room kept to others, %", "Efficiency, %"
+    for title in titles:
+        marks = [
+            Mark.of(place, _colour(outcome, drive.variant), estimate)
+            for place, drive in rows
+            if (estimate := _score(drive, title)) is not None
         ]
-        if len(points) > 1:
-            panels.append((points, words))
-    if not panels:
-        return None
-    with styled():
-        figure = Figure(figsize=(WIDTH_IN, 3.4), layout="constrained")
-        axes = figure.subplots(1, len(panels), sharey=True, squeeze=False)[0]
-        for each, (points, words) in zip(axes, panels, strict=True):
-            _scatter(each, points, words)
-        axes[0].set_ylabel("driving score")
-        # names are placed last, when the limits are final
-        figure.canvas.draw_idle()
-        for each, (points, _) in zip(axes, panels, strict=True):
-            _place_names(figure, each, _named(points))
-        return svg(figure)
+        most = None if title == "Efficiency, %" else 100.0
+        panels.append(Panel(title, marks, most=most))
+    return _drawn({outcome.label(e): i for i, e in rows}, len(rows), panels)
 
 
-def forest(outcome: StudyResult) -> Markup | None:
+def differences(outcome: StudyResult) -> Markup | None:
     """Draw every difference to the baseline with its interval; None without one."""
-    # drives that have a difference to the baseline
-    rows = [each for each in outcome.drives if each.difference is not None]
+    rows = [(each, gap) for each in outcome.drives if (gap := each.difference)]
     if not rows:
         return None
-    names = [outcome.label(each) for each in rows]
-    with styled():
-        height = 0.9 + 0.26 * len(rows)
-        figure = Figure(figsize=(WIDTH_IN, height), layout="constrained")
-        panels = figure.subplots(1, 3, sharey=True)
-        # one panel per score, sharing the rows
-        gaps = [each.difference for each in rows if each.difference]
-        scores = {
-            "driving score, points": [each.driving_score for each in gaps],
-            "room kept, points": [each.room_kept for each in gaps],
-            "success rate, points": [each.success_rate for each in gaps],
-        }
-        for axes, (title, found) in zip(panels, scores.items(), strict=True):
-            bare(axes)
-            axes.axvline(0.0, color=INK, linewidth=0.8)
-            for row, estimate in enumerate(found):
-                low, high = estimate.low, estimate.high
-                colour = ACCENT if estimate.sign else MUTED
-                if low is not None and high is not None:
-                    axes.plot([low, high], [row, row], color=colour, linewidth=1.6)
-                if estimate.value is not None:
-                    axes.plot(estimate.value, row, "o", color=colour, markersize=5)
-            axes.margins(y=0.08 if len(found) > 3 else 0.3)
-            left, right = axes.get_xlim()
-            axes.set_xlim(min(left, -1.0), max(right, 1.0))
-            axes.set_title(title, color=MUTED)
-        panels[0].set_yticks(range(len(rows)), names, color=INK)
-        panels[0].invert_yaxis()
-        return svg(figure)
-
-
-def _named(points: Sequence[Point]) -> Sequence[Point]:
-    if len(points) <= CROWD:
-        return points
-    best = front(points)
-    return [point for point in points if point.baseline or point in best]
-
-
-def _scatter(axes: Axes, points: Sequence[Point], words: str) -> None:
-    bare(axes)
-    axes.grid(visible=True, axis="y")
-    # the Pareto front as a step
-    best = front(points)
-    axes.step(
-        [p.cost for p in best],
-        [p.height for p in best],
-        where="post",
-        color=ACCENT,
-        alpha=0.35,
-        linewidth=1.2,
-        zorder=1,
+    gaps = [gap for _, gap in rows]
+    panels = {
+        "Driving score, points": [each.driving_score for each in gaps],
+        "Success rate, points": [each.success_rate for each in gaps],
+        "Room kept to others, points": [each.room_kept for each in gaps],
+    }
+    names = {outcome.label(each): place for place, (each, _) in enumerate(rows)}
+    return _drawn(
+        names,
+        len(rows),
+        [
+            Panel(title, [_difference(*each) for each in enumerate(of)], signed=True)
+            for title, of in panels.items()
+        ],
     )
-    # intervals only for points that are named
-    named = _named(points)
-    for point in points:
-        colour = BASELINE if point.baseline else ACCENT
-        low, high = point.score.low, point.score.high
-        if point in named and low is not None and high is not None:
-            axes.plot(
-                [point.cost] * 2,
-                [low, high],
-                color=colour,
-                alpha=0.3,
-                linewidth=1.2,
-                zorder=2,
-            )
-        shade = 1.0 if point in named else 0.35
-        axes.plot(
-            *(point.cost, point.height, "o"),
-            color=colour,
-            alpha=shade,
-            markersize=5,
-            zorder=3,
-        )
-    # the cost axis starts at zero, with room for names
-    axes.set_xlabel(words)
-    axes.margins(x=0.12)
-    axes.set_xlim(left=0.0)
 
 
-def _place_names(figure: Figure, axes: Axes, points: Sequence[Point]) -> None:
-    """Write names right of their points, shifted where they would overlap."""
-    # positions in points, independent of the axes
-    scale = POINTS_AN_INCH / figure.dpi
-    ends = list[tuple[float, float, float]]()
-    spots = [
-        (each, axes.transData.transform((each.cost, each.height)) * scale)
-        for each in points
-    ]
-    for point, (left, up) in sorted(spots, key=lambda spot: -spot[1][1]):
-        # from the top down, move below the names already placed
-        start = left + GAP_PT
-        end = start + CHARACTER_PT * len(point.name)
-        height = up
-        for other_start, other_end, other_height in ends:
-            meets = start < other_end and other_start < end
-            if meets and other_height - height < LINE_PT:
-                height = other_height - LINE_PT
-        ends.append((start, end, height))
-        # a line connects a moved name with its point
-        moved = abs(height - up) > 1.0
-        axes.annotate(
-            point.name,
-            (point.cost, point.height),
-            xytext=(GAP_PT, height - up),
-            textcoords="offset points",
-            va="center",
-            fontsize=8.5,
-            color=INK,
-            arrowprops={"arrowstyle": "-", "color": RULE} if moved else None,
-            annotation_clip=False,
-            bbox={"facecolor": "white", "alpha": 0.8, "linewidth": 0, "pad": 0.5},
-        )
-
-
-ENOUGH = 3
-"""Fewest conditions that make a curve; fewer are read off the tables."""
-
-Score = Callable[[Scores], Estimate]
-
-
-def curves(outcome: StudyResult) -> Markup | None:
-    """Draw driving score, room and success as SVG; None below three conditions."""
-    if len(outcome.study.conditions) < ENOUGH:
+def _score(drive: DriveRecord, title: str) -> Estimate | None:
+    if drive.scores is None:
         return None
-    # panels over the same conditions
-    panels: tuple[tuple[str, Score], ...] = (
-        ("driving score", lambda scores: scores.driving_score),
-        ("room kept, %", lambda scores: scores.safety.room_kept),
-        ("success rate, %", lambda scores: scores.success_rate),
-    )
-    names = [condition.name for condition in outcome.study.conditions]
+    scores = drive.scores
+    return {
+        "Success rate, %": scores.success_rate,
+        "Room kept to others, %": scores.safety.room_kept,
+        "Efficiency, %": scores.efficiency,
+    }[title]
+
+
+def _difference(place: int, gap: Estimate) -> Mark:
+    words = in_words(estimate_cell(gap, signed=True))
+    colour = ACCENT if gap.sign else MUTED
+    ends = gap.low, gap.high
+    return Mark(place, colour, words, gap.value, *ends, filled=bool(gap.sign))
+
+
+def _colour(outcome: StudyResult, variant: str) -> str:
+    return BASELINE if variant == outcome.study.baseline else ACCENT
+
+
+def _costs(outcome: StudyResult, places: Mapping[str, float]) -> Iterator[Panel]:
+    """Yield the panels of what is known without a drive; none of what nobody has."""
+    baseline = outcome.variant(outcome.study.baseline)
+
+    def bar(of: VariantOutcome, measure: Measure, its: Measure, form: str) -> Mark:
+        words = measure_cell(measure, form).text
+        if of is not baseline and measure.value is not None and its.value:
+            words += f" ({100.0 * measure.value / its.value:.0f} %)"
+        colour = _colour(outcome, of.name)
+        return Mark(places[of.name], colour, words, measure.value)
+
+    def plan(of: VariantOutcome) -> Mark:
+        mean, most = of.fidelity.mean_m, of.fidelity.max_m.value
+        words = measure_cell(mean, ".2f").text
+        if most is not None:
+            words += f" (at most {number(most, '.2f')})"
+        words = "the reference" if of is baseline else words
+        colour = _colour(outcome, of.name)
+        return Mark(places[of.name], colour, words, mean.value, mean.value, most)
+
+    variants, p50 = outcome.variants, baseline.latency_ms[50]
+    sizes = [bar(each, each.size_mb, baseline.size_mb, ".2f") for each in variants]
+    times = [bar(each, each.latency_ms[50], p50, ".1f") for each in variants]
+    yield Panel("File, MB", sizes, bars=True)
+    yield Panel("Time of a decision, ms", times, bars=True)
+    yield Panel("Plan moves by, m", [plan(each) for each in variants])
+
+
+def _road(
+    outcome: StudyResult, rows: Iterable[tuple[float, DriveRecord]], named: bool = False
+) -> Panel:
+    """Return the panel of driving scores, with the condition's name if asked for."""
+    marks = list[Mark]()
+    for place, drive in rows:
+        name, colour = drive.condition * named, _colour(outcome, drive.variant)
+        if drive.scores is None:
+            words = f"{name}: not driven" if name else "not driven"
+            marks.append(Mark(place, colour, words, None))
+            continue
+        marks.append(Mark.of(place, colour, drive.scores.driving_score, name))
+    return Panel("Driving score, 0 to 100", marks, most=100.0)
+
+
+def _drawn(names: Mapping[str, float], rows: int, panels: Sequence[Panel]) -> Markup:
+    """Draw panels side by side; names stand at their places of so many rows."""
     with styled():
-        figure = Figure(figsize=(WIDTH_IN, 3.0), layout="constrained")
-        # one curve per variant
-        for axes, (title, pick) in zip(figure.subplots(1, 3), panels, strict=True):
-            for variant in outcome.variants:
-                _curve(axes, variant.name, pick, outcome)
-            axes.set_title(title, color=MUTED)
-            axes.set_xticks(range(len(names)), names)
-            axes.set_ylim(0.0, 102.0)
-            axes.grid(visible=True, axis="y")
-            axes.spines["left"].set_visible(False)
+        height = FRAME_IN + ROW_IN * rows
+        figure = Figure(figsize=(WIDTH_IN, height))
+        figure.set_layout_engine("constrained", wspace=0.07)
+        axes = figure.subplots(1, len(panels), sharey=True, squeeze=False)[0]
+        for each, panel in zip(axes, panels, strict=True):
+            _draw(each, panel)
+        lines = [textwrap.fill(name, LONGEST_NAME) for name in names]
+        axes[0].set_yticks(list(names.values()), lines, color=INK)
+        axes[0].set_ylim(rows - 0.4, -0.75)
+        # a rule between names
+        for each in axes:
+            for one, other in itertools.pairwise(names.values()):
+                each.axhline((one + other) / 2 - 0.17, color=RULE, linewidth=0.6)
         return svg(figure)
 
 
-def _curve(axes: Axes, name: str, pick: Score, outcome: StudyResult) -> None:
-    # conditions under which the variant was driven
-    colour = BASELINE if name == outcome.study.baseline else ACCENT
-    drives = [each for each in outcome.drives if each.variant == name]
-    driven = [
-        (place, each.value, each.low, each.high)
-        for place, drive in enumerate(drives)
-        if drive.scores is not None and (each := pick(drive.scores)).value is not None
-    ]
-    # intervals are drawn under the curve
-    for place, _, low, high in driven:
-        if low is not None and high is not None:
-            axes.plot([place] * 2, [low, high], color=colour, alpha=0.3, linewidth=1.6)
-    axes.plot(
-        [place for place, *_ in driven],
-        [value for _, value, *_ in driven],
-        "o-",
-        color=colour,
-        linewidth=1.2,
-        markersize=5,
-    )
-    # the name at the end of the curve
-    if driven and len(outcome.variants) > 1:
-        place, value, *_ = driven[-1]
+def _draw(axes: Axes, panel: Panel) -> None:
+    """Draw the marks of a panel, each below its words."""
+    axes.grid(visible=True, axis="x")
+    axes.spines["left"].set_visible(False)
+    axes.locator_params(axis="x", nbins=4)
+    axes.set_title(panel.title, color=INK, fontweight="bold")
+    for mark in panel.marks:
+        # words are above, where no other mark is
         axes.annotate(
-            name, (place, value), xytext=(7, 0), textcoords="offset points", va="center"
+            mark.words,
+            (0.0, mark.place),
+            xycoords=axes.get_yaxis_transform(),
+            xytext=(0.0, 6.0),
+            textcoords="offset points",
+            color=INK if mark.value is not None else MUTED,
+            fontsize=8.5,
+            bbox={"facecolor": "white", "alpha": 0.85, "linewidth": 0, "pad": 0.3},
         )
+        if mark.value is None:
+            continue
+        row, fill = [mark.place] * 2, mark.colour if mark.filled else "white"
+        if panel.bars:
+            axes.plot(
+                [0.0, mark.value], row, color=mark.colour, linewidth=6.0,
+                solid_capstyle="butt",
+            )  # fmt: skip
+            continue
+        if mark.low is not None and mark.high is not None:
+            ends = [mark.low, mark.high]
+            axes.plot(ends, row, color=mark.colour, alpha=0.55, linewidth=2.0)
+        axes.plot(
+            [mark.value], row[:1], "o", color=mark.colour, markersize=5.5,
+            markerfacecolor=fill, clip_on=False,
+        )  # fmt: skip
+    # an axis shows zero, and what can be reached
+    known = [
+        end for e in panel.marks for end in (e.value, e.low, e.high) if end is not None
+    ]
+    most = panel.most or 1.06 * max(known, default=0.0) or 1.0
+    if panel.signed:
+        axes.axvline(0.0, color=INK, linewidth=0.8)
+        axes.set_xlim(min(1.06 * min(known, default=0.0), -1.0), max(most, 1.0))
+    else:
+        axes.set_xlim(-0.015 * most, 1.015 * most)

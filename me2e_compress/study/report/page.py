@@ -9,13 +9,13 @@ from markupsafe import Markup
 
 from me2e_compress.display import Table, counted, in_markdown
 from me2e_compress.errors import StudyError
-from me2e_compress.metrics.measure import Estimate
+from me2e_compress.metrics.route_summary import shown_by
 from me2e_compress.registry import drafts
 from me2e_compress.registry.drafts import MARK
 from me2e_compress.runtime.atomic import write_bytes, write_document
-from me2e_compress.study.cells import number
+from me2e_compress.study.cells import estimate_cell
 from me2e_compress.study.drive_record import DriveRecord
-from me2e_compress.study.report.figures import curves, forest, pareto
+from me2e_compress.study.report.figures import MOST_DRIVES, answer, differences, road
 from me2e_compress.study.study_result import StudyResult
 from me2e_compress.study.workspace import HTML, JSON, MARKDOWN
 from me2e_compress.workflows.checks import writing
@@ -23,32 +23,31 @@ from me2e_compress.workflows.checks import writing
 
 @dataclass(frozen=True)
 class Drawing:
-    """A picture with a caption above it, and a note below."""
+    """A picture with a note below it."""
 
     picture: Markup
     note: str = ""
-    caption: str = ""
 
 
 @dataclass(frozen=True)
 class Section:
-    """A heading with pictures, their note, tables, and named files to link."""
+    """A heading with pictures; its tables, and files to link, are folded."""
 
     title: str
     tables: tuple[Table, ...] = ()
     files: tuple[tuple[str, str], ...] = ()
     drawings: tuple[Drawing, ...] = ()
-    note: str = ""
 
 
 @dataclass(frozen=True)
 class Page:
-    """All that a page shows.
+    """All that a page shows: the answer first, the details folded.
 
     Attributes:
         findings: What a reader should remember: a name and a sentence.
         made: How it was made, by name.
         variants: Name of each variant, what it was made of, and its sha256.
+        answer: The picture that stands before everything else.
     """
 
     title: str
@@ -59,6 +58,7 @@ class Page:
     findings: Sequence[tuple[str, str]] = ()
     findings_note: str = ""
     alerts: Sequence[str] = ()
+    answer: Drawing | None = None
 
     def html(self) -> str:
         """Write it as HTML that needs no other file."""
@@ -73,7 +73,6 @@ class Page:
 
 
 TIMES = "\N{MULTIPLICATION SIGN}"
-COSTS = "What a point of driving score costs"
 
 
 def study_page(
@@ -102,92 +101,72 @@ def study_page(
         ("Versions", ", ".join(f"{k} {text}" for k, text in outcome.versions.items())),
         ("Seed", str(outcome.study.seed)),
     ]
-    # what is remembered stands first
-    remembered = findings(outcome)
-    note = (
-        f"Against {outcome.study.baseline}, the same routes; in brackets the 95 %"
-        " interval of the mean difference."
-    )
-    free = [each.name for each in outcome.study.conditions if each.latency == "none"]
-    if free:
-        note += (
-            f" Decisions cost no time under {', '.join(free)}: no latency shows there."
-        )
     return Page(
         outcome.title,
         _lede(outcome),
         [*_sections(outcome), *sections],
         made,
         variants,
-        remembered,
-        note if remembered else "",
+        findings(outcome),
+        limits(outcome),
         outcome.alerts(),
+        Drawing(answer(outcome), _how_to_read(outcome)),
     )
 
 
 def _sections(outcome: StudyResult) -> list[Section]:
     """Return the sections that have something to show, in reading order."""
-    study, baseline = outcome.study, outcome.study.baseline
-    # pictures by the heading that they stand under
-    drawings = dict[str, tuple[Drawing, ...]]()
-    if (curve := curves(outcome)) is not None:
-        note = "Dots are means over routes, bars their 95 % intervals."
-        drawings["Scoreboard"] = (Drawing(curve, note),)
-    if (gaps := forest(outcome)) is not None:
-        note = (
-            f"Each dot is the mean difference to {baseline} over the routes, the bar"
-            " its 95 % interval; blue where it does not hold zero."
-        )
-        drawings["Paired differences"] = (Drawing(gaps, note),)
-    fronts = {each.name: pareto(outcome, each) for each in study.conditions}
-    drawn = {name: front for name, front in fronts.items() if front is not None}
-    drawings[COSTS] = tuple(
-        Drawing(front, caption=name if len(drawn) > 1 else "")
-        for name, front in drawn.items()
-    )
+    baseline, tables = outcome.study.baseline, dict(outcome.tables_by_section)
+    note = "Means over the routes, with their 95 % intervals."
+    drawings = {"On the road": (Drawing(road(outcome), note),)}
     # without a difference there is nothing to compare
-    tables = dict(outcome.tables_by_section)
-    headings = list(tables)
-    headings.insert(headings.index("Route by route"), COSTS)
-    if gaps is None:
-        tables["Paired differences"] = ()
-    notes = {
-        COSTS: "The line joins the variants that no other beats on both counts. Bars:"
-        f" 95 % intervals of the driving score. Black: {baseline}. Where there are"
-        f" many, only the front and {baseline} are named.",
-    }
-    return [
-        Section(
-            name,
-            tables.get(name, ()),
-            drawings=drawings.get(name, ()),
-            note=notes.get(name, ""),
+    if (gaps := differences(outcome)) is None:
+        tables["Differences"] = ()
+    else:
+        note = (
+            f"Each drive minus that of {baseline}, route by route, and the 95 %"
+            " interval of the mean. Blue and filled: it does not hold zero. Grey and"
+            " empty: no difference is shown."
         )
-        for name in headings
-        if tables.get(name) or drawings.get(name)
+        drawings["Differences"] = (Drawing(gaps, note),)
+    return [
+        Section(name, theirs, drawings=drawings.get(name, ()))
+        for name, theirs in tables.items()
+        if theirs
     ]
 
 
 def _lede(outcome: StudyResult) -> str:
-    # what was driven
-    study = outcome.study
-    driven, whole = outcome.coverage
-    share = f"{driven}" if driven == whole else f"{driven} of {whole}"
-    where = f"of {study.driven_by.label}"
-    names = ", ".join(each.name for each in study.conditions)
-    said = (
-        f"{counted(len(study.variants), 'variant')} on {share} routes {where}, "
-        f"closed loop; {counted(len(study.conditions), 'condition')}: {names}."
-    )
-    # what so many routes can show
-    found = [each.difference for each in outcome.drives if each.difference is not None]
-    if not found:
-        return said
-    least = max(each.smallest_shown for each in found)
+    study, (driven, whole) = outcome.study, outcome.coverage
+    share = "" if driven == whole else f"{driven} of "
+    described = "; ".join(outcome.described(each) for each in study.conditions)
     return (
-        f"{said} {counted(driven, 'route')} cannot show a difference below {least:.1f}"
-        " points of driving score."
+        f"Drivers compared in closed loop on the same {share}{counted(whole, 'route')}"
+        f" of {study.driven_by.label}. {described}."
     )
+
+
+def _how_to_read(outcome: StudyResult) -> str:
+    """Say what the bars, dots and lines of the answer are."""
+    study = outcome.study
+    frames = max(each.fidelity.frames for each in outcome.variants)
+    notes = [f"Black: {study.baseline}, which the others are compared with."]
+    if outcome.timed:
+        notes.append("Time: median of one inference.")
+    if frames:
+        notes.append(
+            "Plan: how far the planned waypoints are from those of"
+            f" {study.baseline}, mean over {counted(frames, 'frame')} (dot) and the"
+            " largest distance (end of the line)."
+        )
+    routes = outcome.coverage[0]
+    notes.append(
+        f"Driving score: mean over {counted(routes, 'route')} (dot) and its 95 %"
+        " interval (line and brackets)."
+    )
+    if len(outcome.drives) > MOST_DRIVES:
+        notes.append(f"Driving scores are those under {study.conditions[0].name}.")
+    return " ".join(notes)
 
 
 def findings(outcome: StudyResult) -> tuple[tuple[str, str], ...]:
@@ -200,7 +179,7 @@ def findings(outcome: StudyResult) -> tuple[tuple[str, str], ...]:
             continue
         compared = (
             (variant.size_mb, baseline.size_mb, "the size"),
-            (variant.latency_ms[50], baseline.latency_ms[50], "the median latency"),
+            (variant.latency_ms[50], baseline.latency_ms[50], "the time of a decision"),
         )
         costs = [
             f"{one.value / other.value:.2f} {TIMES} {what}"
@@ -218,22 +197,29 @@ def _road(drive: DriveRecord, several: bool) -> str:
     where = f"{drive.condition}: " if several else ""
     if drive.difference is None:
         return ""
-    gap = drive.difference.driving_score
-    points = _signed(f"{where}driving score ", gap)
-    if not points:
-        value = number(gap.value or 0.0, "+.1f")
-        return f"{where}driving score {value} points on {gap.n} route"
-    limit = f"{gap.n} routes show none below {drive.difference.smallest_shown:.1f}"
-    kept = _signed("; room kept ", drive.difference.room_kept)
-    return f"{points}, {drive.difference.verdict}; {limit}{kept}"
+    points = estimate_cell(drive.difference.driving_score, signed=True)
+    words = f"{points.text} points" + f" ({points.detail})" * bool(points.detail)
+    return f"{where}driving score {words}, {drive.difference.verdict}"
 
 
-def _signed(what: str, gap: Estimate) -> str:
-    ends = [each for each in (gap.value, gap.low, gap.high) if each is not None]
-    if len(ends) < 3:
+def limits(outcome: StudyResult) -> str:
+    """Say what differences are, and what so many routes cannot show; or nothing."""
+    gaps = [each.difference for each in outcome.drives if each.difference is not None]
+    if not gaps:
         return ""
-    value, low, high = (number(each, "+.1f") for each in ends)
-    return f"{what}{value} points ({low} to {high})"
+    (routes, whole), least = outcome.coverage, max(e.smallest_shown for e in gaps)
+    rest = f", all {whole} none below {shown_by(whole):.1f}" if routes < whole else ""
+    note = (
+        f"Differences to {outcome.study.baseline} on the same routes, in brackets the"
+        f" 95 % interval of the mean. {counted(routes, 'route')} cannot show a"
+        f" difference below {least:.1f} points of driving score{rest}."
+    )
+    free = [each.name for each in outcome.study.conditions if each.latency == "none"]
+    if free:
+        note += (
+            f" Decisions cost no time under {', '.join(free)}: no latency shows there."
+        )
+    return note
 
 
 @dataclass(frozen=True)
