@@ -14,14 +14,16 @@ from me2e_compress.quantization.decision import Decision, QuantPlan
 from me2e_compress.quantization.scheme import QuantScheme
 
 
-def test_a_plan_is_told_by_module_and_rule() -> None:
+def test_a_plan_has_a_row_a_module_with_the_rules_that_kept_float() -> None:
+    rules = [("int8", "layer")] * 3 + [("float", "small-product"), ("float", "gemv")]
     decisions = tuple(
-        Decision(f"n<{at}>", f"o{at}", "MatMul", "head", "int8", "layer", "it is", ())
-        for at in range(400)
+        Decision(f"n{at}", f"o{at}", "MatMul", "head", dtype, rule, "it is", ())
+        for at, (dtype, rule) in enumerate(rules)
     )
     (shown,) = QuantPlan(QuantScheme("full", ("head",)), decisions).tables()
 
-    assert [cell.text for cell in shown.rows[0]] == ["head", "int8", "layer", "400"]
+    cells = [[cell.text for cell in row] for row in shown.rows]
+    assert cells == [["head", "gemv 1, small-product 1", "3", "2"]]
 
 
 @pytest.mark.parametrize(

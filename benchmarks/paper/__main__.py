@@ -20,7 +20,6 @@ from pathlib import Path
 
 from benchmarks.bench_study import told
 from benchmarks.paper.drives import FILE
-from benchmarks.paper.findings import Verdict
 from benchmarks.paper.questions import SHIPPED
 from benchmarks.paper.records import RECORDS, add_facts, files, read_paper
 from benchmarks.paper.result import paper_page
@@ -75,16 +74,10 @@ class Page:
         if not (records / FILE).is_file():
             return self.head + NOTHING
         found = read_paper(load_study(self.study), records)
-        verdicts = [each.verdict for each in found.findings]
-        counts = ", ".join(
-            f"{verdicts.count(each)} {each.value}"
-            for each in Verdict
-            if each in verdicts
-        )
         since = f"committed {asked_at}" if asked_at else "not committed"
         kept = self.kept.relative_to(ROOT)
         answer = (
-            f"Of its {len(verdicts)} findings {counts}. {found.headline}; driven on"
+            f"{found.verdicts} {found.headline}; driven on"
             f" {found.machine}; questions {since}. All of this is written by"
             f" `{self.command}` from [every route](../../{kept}); `-o PAGE.html` draws"
             " the figures.\n\n"

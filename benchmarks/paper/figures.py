@@ -4,7 +4,6 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import PercentFormatter
@@ -25,6 +24,12 @@ from me2e_compress.study.report.figures import (
 from me2e_compress.study.workload import held_frames
 
 RATE_TICKS = (1, 2, 3, 5, 10, 20, 30)
+COLOURS = (
+    *("#0072b2", "#e69f00", "#009e73", "#cc79a7", "#56b4e9"),
+    *("#d55e00", "#f0e442", "#8c8c8c", "#44337a", "#b7d3a8"),
+)
+"""Of Okabe and Ito (2008), whom readers with any colour vision can tell apart, and
+three in reserve."""
 SLOWEST_SHOWN = 6
 """Variants whose tails are drawn; more lines cannot be told apart."""
 
@@ -53,8 +58,7 @@ def where_the_time_goes(result: PaperDrives) -> Figure | None:
         _stack(left, baseline.modules_us, baseline.variant)
         # tails of several variants on the right
         names = _shown_tails(result)
-        colours = colormaps["tab10"].colors  # type: ignore[attr-defined]
-        for name, colour in zip(names, (BASELINE, *colours), strict=False):
+        for name, colour in zip(names, (BASELINE, *COLOURS), strict=False):
             _tail(right, result.fact(name).latency_us, name, colour)
         right.set_yscale("log")
         right.yaxis.set_major_formatter(PercentFormatter(1.0))
@@ -183,13 +187,12 @@ def _rate_axis(axes: Axes) -> None:
 def _stack(axes: Axes, parts: Mapping[str, tuple[int, ...]], name: str) -> None:
     """Draw one bar per inference, one colour per module, the largest at the bottom."""
     # largest module first, at the bottom
-    colours = colormaps["tab10"].colors  # type: ignore[attr-defined]
     ordered = sorted(parts.items(), key=lambda part: -sum(part[1]))
     total = sum(sum(samples) for _, samples in ordered)
     count = len(ordered[0][1])
     # one bar per inference
     at, floor = np.arange(1, count + 1), np.zeros(count)
-    for (module, samples), colour in zip(ordered, colours, strict=False):
+    for (module, samples), colour in zip(ordered, COLOURS, strict=False):
         height = np.array(samples) / 1e3
         label = f"{module}  {sum(samples) / max(1, total):.0%}"
         axes.bar(at, height, 1.0, floor, color=colour, label=label, linewidth=0)

@@ -1,6 +1,7 @@
 """Results of the paper's study so far, and their page."""
 
 import functools
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -11,6 +12,7 @@ from benchmarks.paper.accident import plans_before
 from benchmarks.paper.drives import PaperDrives
 from benchmarks.paper.findings import (
     Finding,
+    Verdict,
     findings,
     findings_table,
     told_of_questions,
@@ -39,6 +41,13 @@ class PaperResult(PaperDrives):
     def findings(self) -> tuple[Finding, ...]:
         """The paper's findings as questions, answered by these drives."""
         return findings(self)
+
+    @property
+    def verdicts(self) -> str:
+        """How many findings have which verdict."""
+        found = Counter(each.verdict for each in self.findings)
+        counts = ", ".join(f"{found[e]} {e.value}" for e in Verdict if found[e])
+        return f"Of its {len(self.findings)} findings {counts}."
 
     def tables(self) -> tuple[Table, ...]:
         """Return the findings, then the paper's tables in its order."""
@@ -84,7 +93,7 @@ def paper_page(result: PaperResult, command: str = "") -> Page:
     findings, *tables = result.tables()
     return Page(
         result.title,
-        result.headline,
+        f"{result.verdicts} {result.headline}.",
         [Section("Findings", (findings,)), *(_section(e, result) for e in tables)],
         [
             ("Command", command),

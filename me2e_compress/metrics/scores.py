@@ -253,14 +253,13 @@ def _mean_ability(
 
 @dataclass(frozen=True, slots=True)
 class Quotients:
-    """One sum over records, divided by the size of the set or by the records."""
+    """One sum over records, divided by the size of the set or by the records.
 
-    over_set: Measure
-    over_driven: Measure
+    None without records.
+    """
 
-    def to_json(self) -> dict[str, float | None]:
-        """Return both values."""
-        return {"set": self.over_set.value, "driven": self.over_driven.value}
+    set: float | None = None
+    driven: float | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -274,27 +273,8 @@ class LeaderboardScores:
 
     set_size: int
     driven: int
-    given_score: Quotients
-    given_completion: Quotients
-    given_penalty: Quotients
-    score: Quotients
-    penalty: Quotients
-    success_rate: Quotients
-
-    def to_json(self) -> dict[str, Any]:
-        """Return given and computed scores, apart."""
-        return {
-            "given": {
-                "driving_score": self.given_score.to_json(),
-                "completion": self.given_completion.to_json(),
-                "penalty": self.given_penalty.to_json(),
-            },
-            "computed": {
-                "driving_score": self.score.to_json(),
-                "penalty": self.penalty.to_json(),
-                "success_rate": self.success_rate.to_json(),
-            },
-        }
+    given: Mapping[str, Quotients]
+    computed: Mapping[str, Quotients]
 
 
 def leaderboard_scores(
@@ -304,20 +284,22 @@ def leaderboard_scores(
     given = [each.given for each in episodes if each.given is not None]
     scored = [route_scores.route_score(each) for each in episodes]
 
-    def quotients(values: Sequence[float], unit: str = "%") -> Quotients:
+    def quotients(values: Sequence[float]) -> Quotients:
         if not values:
-            nothing = Measure(None, unit, "there is no record")
-            return Quotients(nothing, nothing)
-        over_set = Measure(sum(values) / set_size, unit)
-        return Quotients(over_set, Measure(fmean(values), unit))
+            return Quotients()
+        return Quotients(sum(values) / set_size, fmean(values))
 
     return LeaderboardScores(
         set_size,
         len(episodes),
-        given_score=quotients([each.composed_percent for each in given]),
-        given_completion=quotients([each.completion_percent for each in given]),
-        given_penalty=quotients([each.penalty for each in given], "ratio"),
-        score=quotients([each.composed for each in scored]),
-        penalty=quotients([each.penalty for each in scored], "ratio"),
-        success_rate=quotients([100.0 * success(each) for each in episodes]),
+        {
+            "driving_score": quotients([each.composed_percent for each in given]),
+            "completion": quotients([each.completion_percent for each in given]),
+            "penalty": quotients([each.penalty for each in given]),
+        },
+        {
+            "driving_score": quotients([each.composed for each in scored]),
+            "penalty": quotients([each.penalty for each in scored]),
+            "success_rate": quotients([100.0 * success(each) for each in episodes]),
+        },
     )

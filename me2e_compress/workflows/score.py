@@ -17,7 +17,7 @@ from me2e_compress.metrics import BUDGET_MS
 from me2e_compress.metrics import scores as metrics
 from me2e_compress.metrics.deadlines import Deadlines, charged, deadlines_table
 from me2e_compress.metrics.episode import Episode
-from me2e_compress.metrics.measure import Estimate, Measure
+from me2e_compress.metrics.measure import Estimate
 from me2e_compress.metrics.route_scores import stood_most
 from me2e_compress.metrics.scores import (
     LeaderboardScores,
@@ -63,25 +63,22 @@ class RealRun:
         ]
         # not every figure is both given by the simulator and computed here
         of = self.leaderboard
-        none = Measure(None, "", "not so")
-        nothing = Quotients(none, none)
         figures = [
-            ("driving score", of.given_score, of.score, "%"),
-            ("success rate", nothing, of.success_rate, "%"),
-            ("route completion", of.given_completion, nothing, "%"),
-            ("infraction penalty", of.given_penalty, of.penalty, "ratio"),
+            ("driving score", "driving_score", "%"),
+            ("success rate", "success_rate", "%"),
+            ("route completion", "completion", "%"),
+            ("infraction penalty", "penalty", "ratio"),
         ]
         rows = list[tuple[str, ...]]()
-        for label, given, computed, unit in figures:
+        for label, key, unit in figures:
+            both = [each.get(key, Quotients()) for each in (of.given, of.computed)]
             if unit == "%":  # a missing route has no penalty
-                over = (given.over_set, computed.over_set)
-                values = [number(each.value, ".4f") for each in over]
+                values = [number(each.set, ".4f") for each in both]
                 rows.append((label, "set", *values, str(of.set_size), unit))
-            over = (given.over_driven, computed.over_driven)
-            values = [number(each.value, ".4f") for each in over]
+            values = [number(each.driven, ".4f") for each in both]
             rows.append((label, "driven", *values, str(of.driven), unit))
         real = f"{name}: real runs, Bench2Drive's routes"
-        both = "given by the simulator, and computed with Bench2Drive's penalties"
+        words = "given by the simulator, and computed with Bench2Drive's penalties"
         columns = ("score", "over", "given", "computed", "n", "unit")
         return (
             table(
@@ -90,7 +87,7 @@ class RealRun:
                 counts,
                 words=2,
             ),
-            table(both, columns, rows, words=2),
+            table(words, columns, rows, words=2),
         )
 
     def alerts(self, name: str) -> Iterator[str]:
@@ -133,7 +130,8 @@ class RealRun:
             "leaderboard": {
                 "route_set": found.route_set,
                 "set_size": self.leaderboard.set_size,
-                **self.leaderboard.to_json(),
+                "given": self.leaderboard.given,
+                "computed": self.leaderboard.computed,
             },
             "records": {
                 "evaluated": len(found.episodes),
@@ -157,13 +155,14 @@ class RealRun:
         for path, file in self.collected.stated.items():
             episodes = [each.episode for each in file.records]
             again = leaderboard_scores(episodes)
-            score, rate = again.given_score, again.success_rate
+            score = again.given["driving_score"]
+            rate = again.computed["success_rate"]
             # of the whole set, or of the routes that were driven (Dev10)
             means = {
-                "driving score": (score.over_set.value, score.over_driven.value),
+                "driving score": (score.set, score.driven),
                 "success rate": tuple(
                     None if mean is None else mean / 100.0
-                    for mean in (rate.over_set.value, rate.over_driven.value)
+                    for mean in (rate.set, rate.driven)
                 ),
                 "eval num": (float(len(episodes)),),
             }

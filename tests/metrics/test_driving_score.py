@@ -12,7 +12,7 @@ from me2e_compress.metrics.episode import (
     InfractionKind,
 )
 from me2e_compress.metrics.route_scores import RouteScore, route_score
-from me2e_compress.metrics.scores import leaderboard_scores
+from me2e_compress.metrics.scores import Quotients, leaderboard_scores
 from tests.metrics.drives import drive, infraction
 
 # Bench2Drive, statistics_manager.py; give way is ours.
@@ -113,19 +113,19 @@ def test_both_quotients_of_what_was_given_and_computed() -> None:
     found = leaderboard_scores(ROUTES)
 
     for quotients, total in (
-        (found.given_score, 189.9),
-        (found.score, 190.0),
-        (found.success_rate, 100.0),
+        (found.given["driving_score"], 189.9),
+        (found.computed["driving_score"], 190.0),
+        (found.computed["success_rate"], 100.0),
     ):
-        assert quotients.over_set.value == pytest.approx(total / 220)
-        assert quotients.over_driven.value == pytest.approx(total / 3)
+        assert quotients.set == pytest.approx(total / 220)
+        assert quotients.driven == pytest.approx(total / 3)
 
 
 def test_no_record_has_no_score_and_another_status_is_no_success() -> None:
     odd = given(drive(), "Failed - TickRuntime", 100.0)
 
-    assert leaderboard_scores(()).score.over_set.reason == "there is no record"
-    assert leaderboard_scores([odd]).success_rate.over_driven.value == 0.0
+    assert leaderboard_scores(()).computed["driving_score"] == Quotients()
+    assert leaderboard_scores([odd]).computed["success_rate"].driven == 0.0
 
 
 TESTED = (

@@ -63,7 +63,7 @@ def test_another_evaluator_drives_a_study(asked: Path, tmp_path: Path) -> None:
     assert "3 of 5 routes" in found.headline
     written = write_study(found, tmp_path / "out")
     page = written.report.read_text(encoding="utf-8")
-    assert "on 3 of 5 routes of lanes{count=5}" in page
+    assert "the same 3 of 5 routes of lanes{count=5}" in page
     document = json.loads(written.record.read_text(encoding="utf-8"))
     assert document["evaluator"] == "lanes{count=5}"
     assert document["routes"] == {"driven": 3, "set": 5}

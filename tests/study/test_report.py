@@ -286,7 +286,7 @@ def test_one_variant_is_not_compared(found: StudyResult) -> None:
         "slow, slow",
     ]
     assert "Difference" not in "".join(each.title for each in alone.tables())
-    assert "<h2>Differences</h2>" not in study_page(alone).html()
+    assert "<h2>Differences" not in study_page(alone).html()
 
 
 def test_markdown() -> None:
@@ -306,18 +306,8 @@ def test_markdown() -> None:
     )
 
 
-@pytest.mark.parametrize(
-    ("value", "form", "text"),
-    [
-        (-0.04, ".1f", "0.0"),
-        (-0.04, "+.1f", "+0.0"),
-        (-0.4, "+.1f", f"{MINUS}0.4"),
-        (12.34, ".1f", "12.3"),
-        (-5.0, ".0f", f"{MINUS}5"),
-    ],
-)
-def test_numbers(value: float, form: str, text: str) -> None:
-    assert number(value, form) == text
+def test_a_minus_is_a_minus() -> None:
+    assert number(-0.4, "+.1f") == f"{MINUS}0.4"
 
 
 # Markup is text in every page and drawing of a report.

@@ -3,7 +3,7 @@
 import io
 import itertools
 import textwrap
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,6 +16,7 @@ from matplotlib.style import context
 
 from me2e_compress.display import in_words
 from me2e_compress.metrics.measure import Estimate, Measure
+from me2e_compress.metrics.scores import Scores
 from me2e_compress.study.cells import estimate_cell, measure_cell, number
 from me2e_compress.study.drive_record import DriveRecord
 from me2e_compress.study.outcome import VariantOutcome
@@ -34,6 +35,12 @@ MOST_DRIVES = 14
 """With more drives than this, the first figure has those of one condition alone."""
 LONGEST_NAME = 20
 """Characters of a name on one line."""
+SCORES: tuple[tuple[str, float | None, Callable[[Scores], Estimate]], ...] = (
+    ("Success rate, %", 100.0, lambda scores: scores.success_rate),
+    ("Room kept to others, %", 100.0, lambda scores: scores.safety.room_kept),
+    ("Speed, % of the traffic's", None, lambda scores: scores.efficiency),
+)
+"""Title, largest value there can be, and score of each panel of the road."""
 
 
 def styled() -> AbstractContextManager[None]:
@@ -118,15 +125,15 @@ def road(outcome: StudyResult) -> Markup:
     """Draw the scores of every drive."""
     rows = list(enumerate(outcome.drives))
     panels = [_road(outcome, rows)] * (len(outcome.drives) > MOST_DRIVES)
-    titles = "Success rate, %", "Room kept to others, %", "Efficiency, %"
-    for title in titles:
-        marks = [
-            Mark.of(place, _colour(outcome, drive.variant), estimate)
-            for place, drive in rows
-            if (estimate := _score(drive, title)) is not None
-        ]
-        most = None if title == "Efficiency, %" else 100.0
-        panels.append(Panel(title, marks, most=most))
+    scored = [(place, e.variant, e.scores) for place, e in rows if e.scores]
+    panels += [
+        Panel(
+            title,
+            [Mark.of(at, _colour(outcome, who), pick(of)) for at, who, of in scored],
+            most=most,
+        )
+        for title, most, pick in SCORES
+    ]
     return _drawn({outcome.label(e): i for i, e in rows}, len(rows), panels)
 
 
@@ -150,17 +157,6 @@ def differences(outcome: StudyResult) -> Markup | None:
             for title, of in panels.items()
         ],
     )
-
-
-def _score(drive: DriveRecord, title: str) -> Estimate | None:
-    if drive.scores is None:
-        return None
-    scores = drive.scores
-    return {
-        "Success rate, %": scores.success_rate,
-        "Room kept to others, %": scores.safety.room_kept,
-        "Efficiency, %": scores.efficiency,
-    }[title]
 
 
 def _difference(place: int, gap: Estimate) -> Mark:

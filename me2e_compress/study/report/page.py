@@ -117,8 +117,13 @@ def study_page(
 def _sections(outcome: StudyResult) -> list[Section]:
     """Return the sections that have something to show, in reading order."""
     baseline, tables = outcome.study.baseline, dict(outcome.tables_by_section)
-    note = "Means over the routes, with their 95 % intervals."
+    note = (
+        "Means over the routes, with their 95 % intervals. Success: the whole route"
+        " without an infraction. Room kept: 100 where nobody came near, 0 after a"
+        " collision of the driver's own fault."
+    )
     drawings = {"On the road": (Drawing(road(outcome), note),)}
+    titles = {"Differences": f"Differences to {baseline} on the same routes"}
     # without a difference there is nothing to compare
     if (gaps := differences(outcome)) is None:
         tables["Differences"] = ()
@@ -130,7 +135,7 @@ def _sections(outcome: StudyResult) -> list[Section]:
         )
         drawings["Differences"] = (Drawing(gaps, note),)
     return [
-        Section(name, theirs, drawings=drawings.get(name, ()))
+        Section(titles.get(name, name), theirs, drawings=drawings.get(name, ()))
         for name, theirs in tables.items()
         if theirs
     ]
