@@ -17,7 +17,7 @@ from me2e_compress.display import reason
 from me2e_compress.errors import GraphError
 from me2e_compress.graph import provenance, structure
 from me2e_compress.graph.nodes import STANDARD, nodes_of
-from me2e_compress.graph.opset import lower
+from me2e_compress.graph.opset import fit
 from me2e_compress.graph.summary import weight_bytes
 from me2e_compress.graph.validity import PLAIN_INITIALIZERS_SINCE_IR
 from me2e_compress.registry import drafts
@@ -36,8 +36,9 @@ def load(path: str | Path) -> ir.Model:
 
     Initializers that the exporter also listed as inputs
     (``keep_initializers_as_inputs``) stop being inputs, which is valid from IR version
-    4 on: older models are raised to that. Newer ones than onnxruntime reads are
-    written down to what it does (:func:`~me2e_compress.graph.opset.lowered` says so).
+    4 on: older models are raised to that. A graph in an
+    opset in which onnxruntime cannot run it is written in another
+    (:func:`~me2e_compress.graph.opset.read_as` says so).
 
     Raises:
         GraphError: no such file, not an ONNX model, cut short, or its data file is
@@ -67,7 +68,7 @@ def load(path: str | Path) -> ir.Model:
     ir.external_data.set_base_dir(model.graph, path.parent)
     _name_standard(model)
     settle(model, path)
-    lower(model, path)
+    fit(model, path)
     common.RemoveInitializersFromInputsPass()(model)
     model.ir_version = max(model.ir_version, PLAIN_INITIALIZERS_SINCE_IR)
     return model

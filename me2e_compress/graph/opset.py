@@ -1,6 +1,6 @@
-"""Graphs that are newer than the runtime: written down to what it reads."""
+"""Graphs in an opset in which onnxruntime cannot run them: written in another."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 
 import onnx
@@ -9,66 +9,103 @@ import onnx_ir as ir
 
 from me2e_compress.errors import GraphError
 from me2e_compress.graph.nodes import STANDARD, has_subgraph, is_standard, opset_of
+from me2e_compress.graph.runtime_operators import (
+    ADDED,
+    has_operator,
+    newest_ir,
+    newest_opset,
+    since,
+)
 from me2e_compress.graph.shapes import infer_shapes
 
-NEWEST_OPSET, NEWEST_IR = 26, 13
-"""The newest opset and IR version that onnxruntime 1.31 reads."""
+OLDEST_OPSET = 13
+"""The oldest opset that a graph is written in, as *import-normalize* does."""
 
-LOWERED = "me2e.lowered"
-"""Key of ``model.meta`` with what :func:`lower` changed, in words."""
+_CHANGES = "me2e.read_as"
+"""Key of ``model.meta`` with what :func:`fit` changed, in words."""
+
+_NO_NEWER = "onnxruntime reads no newer"
 
 
-def lower(model: ir.Model, path: Path) -> None:
-    """Write a graph in the newest opset and IR version that onnxruntime reads.
+def fit(model: ir.Model, path: Path) -> None:
+    """Write a graph in an opset and IR version in which onnxruntime can run it.
 
-    Operators that did not change since then stay as they are, others are converted by
-    ONNX's version converter, one by one, so that names and metadata stay. What changed
-    stands in ``model.meta`` under ``LOWERED``.
+    One that is newer than onnxruntime is written in the newest that it reads. Where
+    it has an operator of the graph in other opsets alone (RoiAlign before 22,
+    RMSNormalization from 23 on), the graph is written in the nearest older one in which
+    it has all of them, or else in a newer one. Operators that did not change stay as
+    they are, others are converted by ONNX's version converter, one by one, so that
+    names and metadata stay. :func:`read_as` says what changed.
 
     Raises:
-        GraphError: the opset is unknown, or an operator cannot be written in it.
+        GraphError: the graph is newer than onnxruntime, and its opset is unknown or an
+            operator cannot be written in an older one.
     """
     changes = []
-    if model.ir_version > NEWEST_IR:
-        changes.append(f"IR version {model.ir_version} became {NEWEST_IR}")
-        model.ir_version = NEWEST_IR
-    newest = max(opset for _, opset in bodies(model))
-    if newest > NEWEST_OPSET:
-        changes.append(f"opset {newest} became {NEWEST_OPSET}")
-        _lower_opset(model, newest, path)
+    if model.ir_version > newest_ir():
+        version = f"IR version {model.ir_version} became {newest_ir()}"
+        changes.append(f"{version}: {_NO_NEWER}")
+        model.ir_version = newest_ir()
+    if change := _fit_opset(model, path):
+        changes.append(change)
     if changes:
-        model.meta[LOWERED] = ", ".join(changes)
+        model.meta[_CHANGES] = ", ".join(changes)
 
 
-def lowered(model: ir.Model) -> str:
-    """Say what was changed when a graph was read; empty if nothing was."""
-    return str(model.meta.get(LOWERED, ""))
+def read_as(model: ir.Model) -> str:
+    """Say what was changed when a graph was read, and why; empty if nothing was."""
+    return str(model.meta.get(_CHANGES, ""))
 
 
-def _lower_opset(model: ir.Model, newest: int, path: Path) -> None:
-    known = onnx.defs.onnx_opset_version()
-    if newest > known:
+def _fit_opset(model: ir.Model, path: Path) -> str:
+    """Write a graph in another opset if it needs one; return what changed and why."""
+    opset, newest = max(opset for _, opset in bodies(model)), newest_opset()
+    lacking, why = _lacking(model, opset, opset), _NO_NEWER
+    if opset <= newest and not lacking:
+        return ""
+    if opset > (known := onnx.defs.onnx_opset_version()):
         raise GraphError(
-            f"{path}: opset {newest}: onnxruntime reads up to {NEWEST_OPSET}, and onnx"
+            f"{path}: opset {opset}: onnxruntime reads up to {newest}, and onnx"
             f" {onnx.__version__} converts from {known} at most"
         )
-    changed = [
-        (node, opset)
+    if lacking := lacking or [each for each in ADDED if not has_operator(each, opset)]:
+        why = f"onnxruntime has no {' and no '.join(lacking)} in {opset}"
+    older = range(min(opset, newest), OLDEST_OPSET - 1, -1)
+    nearest = (*older, *range(opset + 1, newest + 1))
+    able = [each for each in nearest if not _lacking(model, opset, each)]
+    refusals = []
+    for wanted in able or ([newest] if opset > newest else []):
+        refusal = _write_in(model, opset, wanted)
+        if not refusal:
+            return f"opset {opset} became {wanted}: {why}"
+        refusals.append(refusal)
+    if opset <= newest:  # what cannot be run may be looked at
+        return ""
+    raise GraphError(
+        f"{path}: opset {opset}: onnxruntime reads up to {newest}, and {refusals[0]}"
+    )
+
+
+def _lacking(model: ir.Model, before: int, wanted: int) -> list[str]:
+    """List the operators that onnxruntime has, but not once a graph is rewritten."""
+    opsets = range(OLDEST_OPSET, newest_opset() + 1)
+    used = {
+        (node.op_type, _written(opset, before, wanted))
         for body, opset in bodies(model)
         for node in body.all_nodes()
-        if _since(node, opset) > NEWEST_OPSET
+        if is_standard(node)
+    }
+    return [
+        op_type
+        for op_type, opset in sorted(used)
+        if not has_operator(op_type, opset)
+        and any(has_operator(op_type, each) for each in opsets)
     ]
-    if failure := _write_in(model, changed, NEWEST_OPSET):
-        node, opset, reason = failure
-        raise GraphError(
-            f"{path}: opset {opset}: onnxruntime reads up to {NEWEST_OPSET}, and"
-            f" {node.op_type} {node.name!r} cannot be written in that: {reason}"
-        )
-    functions = [function.opset_imports for function in model.functions.values()]
-    for imports in (model.opset_imports, *functions):
-        for domain in STANDARD:
-            if imports.get(domain, 0) > NEWEST_OPSET:
-                imports[domain] = NEWEST_OPSET
+
+
+def _written(opset: int, before: int, wanted: int) -> int:
+    """Return the opset of a body once the newest of its graph is another."""
+    return min(opset, wanted) if wanted < before else max(opset, wanted)
 
 
 def bodies(model: ir.Model) -> Iterator[tuple[ir.Graph | ir.Function, int]]:
@@ -79,52 +116,69 @@ def bodies(model: ir.Model) -> Iterator[tuple[ir.Graph | ir.Function, int]]:
         yield function, opset_of(function) or main
 
 
-def _since(node: ir.Node, opset: int) -> int:
-    """Return the opset that an operator has been as it is since; 0 of a plugin."""
-    if not is_standard(node) or not onnx.defs.has(node.op_type, opset, ""):
-        return 0
-    return int(onnx.defs.get_schema(node.op_type, opset, "").since_version)
-
-
-def _write_in(
-    model: ir.Model, nodes: Sequence[tuple[ir.Node, int]], opset: int
-) -> tuple[ir.Node, int, str] | None:
-    """Write nodes, each with its opset, in another; return the first that refuses."""
-    if nodes:
+def _write_in(model: ir.Model, before: int, wanted: int) -> str:
+    """Write a graph in another opset; return why it stays as it was if it does."""
+    changed = [
+        (node, opset, after)
+        for body, opset in bodies(model)
+        for node in body.all_nodes()
+        if is_standard(node)
+        and since(node.op_type, opset)
+        != since(node.op_type, after := _written(opset, before, wanted))
+        and since(node.op_type, opset)
+    ]
+    if changed:
         infer_shapes(model)
-    for node, before in nodes:
-        if (reason := _rewrite(node, before, opset)) is not None:
-            return node, before, reason
-    return None
+    gone = list[tuple[ir.Node, str]]()
+    for node, opset, after in changed:
+        try:
+            gone += [(node, name) for name in _dropped(node, opset, after)]
+        except _RefusedError as refusal:
+            called = f"{node.op_type} {node.name!r}"
+            return f"{called} cannot be written in that: {refusal}"
+    for node, name in gone:
+        del node.attributes[name]
+    # What the bodies import
+    main = model.opset_imports
+    for imports in (main, *(each.opset_imports for each in model.functions.values())):
+        for domain in STANDARD:
+            if domain in imports:
+                imports[domain] = _written(imports[domain], before, wanted)
+    return ""
 
 
-def _rewrite(node: ir.Node, opset: int, wanted: int) -> str | None:
-    """Write a node as another opset has it; return why that cannot be done."""
-    if has_subgraph(node):
-        return "it holds a graph"
+class _RefusedError(Exception):
+    """Why a node cannot be written in another opset."""
+
+
+def _dropped(node: ir.Node, opset: int, wanted: int) -> list[str]:
+    """Return the attributes that a node loses as another opset has it."""
+    if has_subgraph(node):  # If, Loop and Scan are as they were, for more types
+        if opset < OLDEST_OPSET:
+            raise _RefusedError("it holds a graph")
+        return []
     try:
-        older = onnx.version_converter.convert_version(alone(node, opset), wanted)
+        other = onnx.version_converter.convert_version(alone(node, opset), wanted)
     except (onnx.version_converter.ConvertError, RuntimeError) as error:
-        return why_not(error)
-    written = older.graph.node
+        raise _RefusedError(why_not(error)) from error
+    written = other.graph.node
     if len(written) != 1 or written[0].op_type != node.op_type:
-        return "it takes several operators"
+        raise _RefusedError("it takes several operators")
     names = [value.name if value is not None else "" for value in node.inputs]
     if list(written[0].input) != names:
-        return "its inputs are others"
+        raise _RefusedError("its inputs are others")
     schema = onnx.defs.get_schema(node.op_type, wanted, "")
     kept = {attribute.name for attribute in written[0].attribute}
-    for name in list(node.attributes):
-        if name not in kept:
-            del node.attributes[name]
-        elif name not in schema.attributes:
-            return f"{name} is new"
-    return None
+    if new := [name for name in kept if name not in schema.attributes]:
+        raise _RefusedError(f"{new[0]} is new")
+    return [name for name in node.attributes if name not in kept]
 
 
 def changed_since(node: ir.Node, before: int, opset: int) -> bool:
     """Return whether a standard operator is another one in a newer opset."""
-    return _since(node, before) != _since(node, opset)
+    return is_standard(node) and since(node.op_type, before) != since(
+        node.op_type, opset
+    )
 
 
 def why_not(error: Exception) -> str:
@@ -148,4 +202,6 @@ def alone(node: ir.Node, opset: int) -> onnx.ModelProto:
         [info(value) for value in node.outputs if value.name],
     )
     imports = [onnx.helper.make_opsetid("", opset)]
-    return onnx.helper.make_model(body, opset_imports=imports, ir_version=NEWEST_IR)
+    return onnx.helper.make_model(
+        body, opset_imports=imports, ir_version=onnx.IR_VERSION
+    )

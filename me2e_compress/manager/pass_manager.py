@@ -18,7 +18,7 @@ from me2e_compress.errors import (
     PreconditionError,
     VerificationError,
 )
-from me2e_compress.graph.opset import lowered
+from me2e_compress.graph.opset import read_as
 from me2e_compress.manager import equivalence, reproducer
 from me2e_compress.manager.attempt import attempt, blame_file
 from me2e_compress.manager.equivalence import TryFirst
@@ -77,7 +77,7 @@ class PassManager:
         with collector_paused():
             say = progress or (lambda done, total, what: None)
             report = self._run(model.clone(), context, say)
-            return dataclasses.replace(report, read_as=lowered(model))
+            return dataclasses.replace(report, read_as=read_as(model))
 
     def _run(self, model: ir.Model, context: Context, progress: Progress) -> Report:
         graph.infer_shapes(model)

@@ -5,20 +5,16 @@ before opset 20, for one, which exporters write where a Python number leaked in.
 """
 
 import functools
-from collections.abc import Iterator, Mapping, Sequence
-from typing import Any, TypeAlias
+from collections.abc import Iterator
+from typing import Any
 
 import onnx
 import onnx_ir as ir
-from onnxruntime.capi import onnxruntime_pybind11_state as _native  # pyright: ignore[reportAttributeAccessIssue]
 
 from me2e_compress.graph import opset_of
 from me2e_compress.graph.nodes import is_read, is_standard, nodes_in
+from me2e_compress.graph.runtime_operators import kernels, serves
 
-_NEWEST = 2**31 - 1
-"""The last version of a kernel that nothing has replaced."""
-_Kernel: TypeAlias = tuple[int, int, Mapping[str, Sequence[str]]]
-"""First and last version of a kernel's operator, and types by name of a constraint."""
 _CAST_BY_ITSELF = (ir.DataType.FLOAT16, ir.DataType.BFLOAT16)
 """Types that onnxruntime casts to float32 and back where it has no kernel."""
 
@@ -38,18 +34,19 @@ def without_kernel(model: ir.Model) -> Iterator[tuple[ir.Node, str]]:
 
 
 def _missing(node: ir.Node, opset: int) -> str:
-    """Name the element types that no kernel takes together; empty if one does."""
-    kernels, schema = _kernels().get(node.op_type, ()), _schema(node.op_type, opset)
+    """Name the opset, or the types that no kernel takes together; empty if one does."""
+    schema = _schema(node.op_type, opset)
     if schema is None or node.op_type == "Constant":  # which becomes a weight
         return ""
     given = _given(node, schema)
     if given is None:
         return ""
-    for first, last, types in kernels:
-        # A kernel without a last version serves the version of its operator alone.
-        since = schema.since_version
-        serves = since == first if last == _NEWEST else first <= since <= last
-        if serves and all(word in types.get(n, (word,)) for n, word, _ in given):
+    listed = kernels().get(node.op_type, ())
+    able = [kernel for kernel in listed if serves(kernel, schema.since_version)]
+    if not able:
+        return f"opset {opset}"
+    for _, _, types in able:
+        if all(word in types.get(n, (word,)) for n, word, _ in given):
             return ""
     return " and ".join(dict.fromkeys(kind for _, _, kind in given))
 
@@ -89,17 +86,6 @@ def _schema(op_type: str, opset: int) -> onnx.defs.OpSchema | None:
         return None
     is_made = found.has_function or found.has_context_dependent_function
     return None if is_made else found
-
-
-@functools.cache
-def _kernels() -> Mapping[str, Sequence[_Kernel]]:
-    """Return the CPU's kernels of ONNX's own operators, by operator; 8 ms, once."""
-    kernels: dict[str, list[_Kernel]] = {}
-    for each in _native.get_all_opkernel_def():
-        if each.provider == "CPUExecutionProvider" and not each.domain:
-            kernel = (*each.version_range, dict(each.type_constraints))
-            kernels.setdefault(each.op_name, []).append(kernel)
-    return kernels
 
 
 def remedy(model: ir.Model, missing: str) -> str:

@@ -34,7 +34,7 @@ from me2e_compress.driving.adapter.outputs import adapted
 from me2e_compress.errors import FORMER, GraphError
 from me2e_compress.graph.modules.assign import map_of
 from me2e_compress.graph.modules.module_map import ModuleMap
-from me2e_compress.graph.opset import lowered
+from me2e_compress.graph.opset import read_as
 from me2e_compress.graph.shapes import unshaped_plugins
 from me2e_compress.operators.kernels.trampoline import why_not
 from me2e_compress.registry.drafts import is_marked
@@ -67,14 +67,14 @@ def model_path(text: str | Path, beside: Path = Path()) -> Path:
 def read_graph(
     path: Path, listener: Listener, adapter: Given = None, module_map: Given = None
 ) -> ir.Model:
-    """Read a graph; warn of a lowered opset and of missing shapes.
+    """Read a graph; warn of another opset and of missing shapes.
 
     What an adapter and a map state becomes metadata of the graph; see :func:`adapted`.
     """
     model = graph.load(path)
     adapted(model, adapter, module_map or own_map(path))
-    if said := lowered(model):
-        listener.on_warning(f"{path}: {said}: onnxruntime reads no newer")
+    if said := read_as(model):
+        listener.on_warning(f"{path}: {said}")
     if lack := lacking_shapes(model):
         listener.on_warning(f"{path}: {lack}")
     return model

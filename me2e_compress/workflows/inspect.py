@@ -17,7 +17,7 @@ from me2e_compress.graph import provenance
 from me2e_compress.graph.modules.assign import Item, assign, itemise
 from me2e_compress.graph.modules.module_map import ModuleMap
 from me2e_compress.graph.nodes import is_read
-from me2e_compress.graph.opset import lowered
+from me2e_compress.graph.opset import read_as
 from me2e_compress.graph.recurrence import recurrent_inputs
 from me2e_compress.graph.summary import (
     Port,
@@ -288,7 +288,7 @@ def inspect(model: str | Path, options: InspectOptions | None = None) -> Inspect
         unknown,
         dict(Counter(map(why_uncounted, uncounted)).most_common()),
         tuple(open_dimensions(loaded)),
-        lowered(loaded),
+        read_as(loaded),
         "; ".join(filter(None, hints)),
         fed_back,
         weights=named_weights(loaded.metadata_props),

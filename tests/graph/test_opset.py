@@ -1,4 +1,4 @@
-"""Graphs that are newer than onnxruntime."""
+"""Graphs in an opset in which onnxruntime cannot run them."""
 
 from pathlib import Path
 
@@ -7,15 +7,17 @@ import pytest
 
 from me2e_compress import graph
 from me2e_compress.errors import GraphError
-from me2e_compress.graph.opset import NEWEST_IR, NEWEST_OPSET, lowered
+from me2e_compress.graph.opset import read_as
+from me2e_compress.graph.runtime_operators import newest_ir, newest_opset
 from me2e_compress.runtime.session import Session
 
 
-def written(folder: Path, body: str, *, opset: int = 28, version: int = 14) -> Path:
-    """Write a graph on x, a number a and integers i."""
+def written(folder: Path, body: str, *, opset: int = 28, version: int = 15) -> Path:
+    """Write a graph on x, a number a, a condition c and integers i."""
     model = ir.from_onnx_text(
         f'<ir_version: 13, opset_import: ["" : {opset}, "trt" : 1]>\n'
-        f"m (float[4,4] x, float a, int32[4] i) => (float[4,4] y) {{ {body} }}"
+        f"m (float[4,4] x, float[1,2,4,4] x4, float a, bool c, int32[4] i)"
+        f" => (float[4,4] y) {{ {body} }}"
     )
     model.ir_version = version
     path = folder / "new.onnx"
@@ -28,11 +30,15 @@ def test_an_operator_that_did_not_change_is_written_in_the_older_opset(
     tmp_path: Path, body: str
 ) -> None:
     model = graph.load(written(tmp_path, body))
-    assert (model.opset_imports[""], model.ir_version) == (NEWEST_OPSET, NEWEST_IR)
-    assert lowered(model) == "IR version 14 became 13, opset 28 became 26"
-    fits = graph.load(written(tmp_path, body, opset=26, version=13))
-    assert lowered(fits) == ""
-    with pytest.raises(GraphError, match="opset 99: onnxruntime reads up to 26, and"):
+    assert (model.opset_imports[""], model.ir_version) == (newest_opset(), newest_ir())
+    assert read_as(model) == (
+        f"IR version 15 became {newest_ir()}: onnxruntime reads no newer, opset 28"
+        f" became {newest_opset()}: onnxruntime has no QuantizeLinear and no"
+        " DequantizeLinear in 28"
+    )
+    fits = written(tmp_path, body, opset=newest_opset(), version=newest_ir())
+    assert read_as(graph.load(fits)) == ""
+    with pytest.raises(GraphError, match=r"opset 99: onnxruntime reads up to 2\d, and"):
         graph.load(written(tmp_path, body, opset=99))
 
 
@@ -74,5 +80,43 @@ def test_names_and_metadata_of_a_node_that_is_converted_stay(tmp_path: Path) -> 
 def test_what_the_older_opset_cannot_say_is_one_line(
     tmp_path: Path, body: str, reason: str
 ) -> None:
-    with pytest.raises(GraphError, match=rf"new\.onnx: opset 28: .*26, and {reason}"):
+    with pytest.raises(GraphError, match=rf"new\.onnx: opset 28: .*, and {reason}"):
         graph.load(written(tmp_path, body))
+
+
+BRANCHES = (
+    "b = If(c) <then_branch = t () => (float u) { u = Relu(a) },"
+    " else_branch = e () => (float u) { u = Neg(a) }>"
+)
+
+
+@pytest.mark.parametrize(
+    ("body", "opset", "instead"),
+    [
+        ("y = Swish(x)", 26, 24),
+        ("y = Swish(x)", 18, 24),
+        ("y = RMSNormalization(x, x)", 18, 23),
+        (f"p = GlobalLpPool(x4) y = Relu(x) {BRANCHES}", 23, 21),
+        ("y = Relu(x)", 20, 20),
+        ("y = HardSwish(x)", 27, 27),
+    ],
+)
+def test_a_graph_is_written_in_the_nearest_opset_that_has_all_its_operators(
+    tmp_path: Path, body: str, opset: int, instead: int
+) -> None:
+    model = graph.load(written(tmp_path, body, opset=opset, version=10))
+    assert model.opset_imports[""] == instead
+    why = f"onnxruntime has no {model.graph[0].op_type} in {opset}"
+    said = f"opset {opset} became {instead}: {why}" if opset != instead else ""
+    assert read_as(model) == said
+    assert list(Session(model).outputs) == ["y"]
+
+
+def test_operators_that_no_opset_has_together_stay(tmp_path: Path) -> None:
+    pooled = "p = GlobalLpPool(x4) m = ReduceMax<keepdims=0>(p)"
+    body = f"{pooled} n = RMSNormalization(x, x) y = Mul(m, n)"
+    path = written(tmp_path, body, opset=23)
+    model = graph.load(path)
+    assert (model.opset_imports[""], read_as(model).count("opset")) == (23, 0)
+    with pytest.raises(GraphError, match="no kernel for GlobalLpPool of opset 23"):
+        Session(model)

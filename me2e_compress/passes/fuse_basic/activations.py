@@ -37,6 +37,7 @@ from me2e_compress.graph.rewrite import (
     product,
     var,
 )
+from me2e_compress.graph.runtime_operators import has_operator
 
 SINCE = {
     "Gelu": 20, "HardSwish": 14, "LayerNormalization": 17, "Mish": 18, "Swish": 24
@@ -84,10 +85,13 @@ def fusions(*, swish: bool) -> tuple[Fusion, ...]:
     swish_opset = needs_opset("Swish", SINCE["Swish"])
 
     def swish_check(match: Match, facts: Facts) -> str | None:
-        reason = swish_opset(match, facts)
-        if reason is None and not swish:
+        if reason := swish_opset(match, facts):
+            return reason
+        if not swish:
             return "Swish, for which onnxruntime has no kernel"
-        return reason
+        if not has_operator("Swish", facts.opset):
+            return f"onnxruntime has no Swish in opset {facts.opset}"
+        return None
 
     gated, sixth = op("HardSigmoid", X, where=_is_sixth), 1 / 6
     tanh, gate = {"approximate": "tanh"}, {"alpha": sixth, "beta": 0.5}
