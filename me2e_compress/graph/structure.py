@@ -12,6 +12,7 @@ from collections import Counter
 from collections.abc import Collection, Iterable, Mapping, Sequence
 
 import onnx
+import onnx_ir as ir
 from onnx import TensorProto
 from onnx.onnx_cpp2py_export.checker import CheckerContext
 
@@ -23,18 +24,6 @@ LARGEST_ELEMENTS = 2**40
 HIGHEST_RANK = 64
 
 _TYPES = frozenset(TensorProto.DataType.values()) - {TensorProto.UNDEFINED}
-_BITS: Mapping[int, int] = {
-    TensorProto.FLOAT: 32, TensorProto.UINT8: 8, TensorProto.INT8: 8,
-    TensorProto.UINT16: 16, TensorProto.INT16: 16, TensorProto.INT32: 32,
-    TensorProto.INT64: 64, TensorProto.BOOL: 8, TensorProto.FLOAT16: 16,
-    TensorProto.DOUBLE: 64, TensorProto.UINT32: 32, TensorProto.UINT64: 64,
-    TensorProto.COMPLEX64: 64, TensorProto.COMPLEX128: 128, TensorProto.BFLOAT16: 16,
-    TensorProto.FLOAT8E4M3FN: 8, TensorProto.FLOAT8E4M3FNUZ: 8,
-    TensorProto.FLOAT8E5M2: 8, TensorProto.FLOAT8E5M2FNUZ: 8, TensorProto.UINT4: 4,
-    TensorProto.INT4: 4, TensorProto.FLOAT4E2M1: 4,
-}  # fmt: skip
-"""Bits of an element in ``raw_data``; of other types, such as text, it has none."""
-
 _FIELDS = (
     "float_data", "int32_data", "string_data", "int64_data", "double_data",
     "uint64_data",
@@ -93,7 +82,7 @@ def _check_tensor(tensor: TensorProto, what: str) -> None:
     filled = [name for name in _FIELDS if getattr(tensor, name)]
     if filled and (len(filled) > 1 or tensor.raw_data):
         raise GraphError(f"{what} holds its data twice")
-    bits = _BITS.get(kind)
+    bits = ir.DataType(kind).bitwidth if kind != TensorProto.STRING else None
     if bits is not None and not filled:
         wanted, length = -(-count * bits // 8), len(tensor.raw_data)
         if wanted != length:
@@ -102,8 +91,8 @@ def _check_tensor(tensor: TensorProto, what: str) -> None:
     # The elements stand one by one in a field of their type
     if kind in (TensorProto.COMPLEX64, TensorProto.COMPLEX128):
         count *= 2  # real and imaginary part
-    elif bits == 4:
-        count = -(-count // 2)  # two in a byte
+    elif bits in (2, 4):
+        count = -(-count * bits // 8)  # several in a byte
     length = len(getattr(tensor, onnx.helper.tensor_dtype_to_field(kind)))
     if count != length:
         raise GraphError(f"{what} has {length} values, its shape says {count}")

@@ -40,6 +40,22 @@ def is_dequantized(value: ir.Value | None) -> bool:
     return maker(value, DEQUANTIZE) is not None
 
 
+def stored_type(node: ir.Node) -> ir.DataType:
+    """Return the type of the numbers that a node of a pair writes or reads.
+
+    That of its zero point or, without one, of the tensor that is read; else what
+    ``output_dtype`` of the quantizer says: uint8 by default.
+    """
+    source = node if node.op_type == QUANTIZE else maker(node.inputs[0], QUANTIZE)
+    typed = graph.input_at(source or node, 2)
+    if typed is None and source is None:
+        typed = node.inputs[0]
+    if typed is not None and typed.dtype is not None:
+        return typed.dtype
+    number = 0 if source is None else source.attributes.get_int("output_dtype", 0)
+    return ir.DataType(number or ir.DataType.UINT8)
+
+
 def describe_quantized(model: ir.Model) -> str | None:
     """Describe operators, grid and producer of a quantized graph; None for others."""
     counts = Counter(
@@ -56,10 +72,7 @@ def describe_quantized(model: ir.Model) -> str | None:
         # the element types of all pairs, and whether they are symmetric
         pairs = [node for node in model.graph.all_nodes() if node.op_type in PAIR]
         zeros = [graph.input_at(node, 2) for node in pairs]
-        types = dict.fromkeys(
-            "uint8" if zero is None or zero.dtype is None else zero.dtype.name.lower()
-            for zero in zeros
-        )
+        types = dict.fromkeys(stored_type(node).name.lower() for node in pairs)
         arrays = [graph.array_of(zero) for zero in zeros]
         centred = not any(array.any() for array in arrays if array is not None)
         grid = "zero points 0" if centred else "zero points that are not 0"

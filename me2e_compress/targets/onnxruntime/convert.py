@@ -33,7 +33,12 @@ from me2e_compress.targets.onnxruntime.region import (
     is_clip_at_zero,
     objection,
 )
-from me2e_compress.targets.quantized import DEQUANTIZE, QUANTIZE, is_dequantized
+from me2e_compress.targets.quantized import (
+    DEQUANTIZE,
+    QUANTIZE,
+    is_dequantized,
+    stored_type,
+)
 from me2e_compress.targets.weights import QuantizedWeight
 
 Floats = npt.NDArray[np.float32]
@@ -267,7 +272,7 @@ def slow_here(model: ir.Model, provider: Provider = CPU) -> str | None:
         return None
     form, remedy = "a form that is", ""
     read = [pair for node in slow if (pair := dequantizer_of(node.inputs[0]))]
-    kinds = {_kind_of(pair) for pair in read}
+    kinds = {stored_type(pair) for pair in read}
     if kinds.issubset(_OF_TENSORRT) and not any(_zeros_of(pair).any() for pair in read):
         form = "TensorRT's form,"
         if kinds == {ir.DataType.INT8}:
@@ -286,7 +291,7 @@ def _is_fast(layer: ir.Node) -> bool:
     if layer.op_type == "ConvTranspose" or left is None:
         return False
     # sessions take a pair in that is of uint8, or of int8 with a zero point
-    kind = _kind_of(left)
+    kind = stored_type(left)
     if kind not in _LEAST or (kind != ir.DataType.UINT8 and len(left.inputs) <= 2):
         return False
     # products of two activations, as an attention's, take 1.1 to 1.8 of float's time
@@ -320,7 +325,7 @@ def _ends(value: ir.Value, *, takes_relu: bool) -> list[ir.Node]:
     if is_clip_at_zero(readers[0]):
         ends = _ends(behind, takes_relu=takes_relu)
         for end in ends if takes_relu else ():
-            least = _LEAST.get(_kind_of(end)) if end.op_type == QUANTIZE else None
+            least = _LEAST.get(stored_type(end)) if end.op_type == QUANTIZE else None
             takes_relu &= least is not None and bool((_zeros_of(end) == least).all())
         return ends if takes_relu else [*readers, *ends]
     passed = readers[0].op_type in PASSED
@@ -331,17 +336,3 @@ def _zeros_of(pair: ir.Node) -> npt.NDArray[np.generic]:
     """Return the zero points of a QuantizeLinear or DequantizeLinear; 0 without."""
     zeros = array_of(input_at(pair, 2))
     return np.zeros(1, np.int8) if zeros is None else zeros
-
-
-def _kind_of(pair: ir.Node) -> ir.DataType:
-    """Return what a QuantizeLinear writes, or a DequantizeLinear reads.
-
-    That is its zero point's type or, without one, what ``output_dtype`` says: uint8 by
-    default.
-    """
-    zeros = array_of(input_at(pair, 2))
-    if zeros is not None:
-        return ir.DataType.from_numpy(zeros.dtype)
-    source = pair if pair.op_type == QUANTIZE else maker(pair.inputs[0], QUANTIZE)
-    number = 0 if source is None else source.attributes.get_int("output_dtype", 0)
-    return ir.DataType(number or ir.DataType.UINT8)

@@ -23,6 +23,7 @@ from me2e_compress.targets.quantized import (
     is_dequantized,
     is_quantized,
     pairs_of,
+    stored_type,
 )
 
 Check: TypeAlias = Callable[[ir.Node], str | None]
@@ -73,7 +74,7 @@ alone, with scales by block."""
 def zero_points(model: ir.Model) -> Iterator[LintFinding]:
     """Check that quantization is symmetric: zero points are 0, of a type it takes."""
     for node in pairs_of(model):
-        value, kind = graph.input_at(node, 2), _stored_type(node)
+        value, kind = graph.input_at(node, 2), stored_type(node)
         if kind not in (_WEIGHTS if _is_weight(node) else _ACTIVATIONS):
             wanted = "int8 or float8e4m3fn"
             if kind == ir.DataType.INT4:
@@ -86,15 +87,6 @@ def zero_points(model: ir.Model) -> Iterator[LintFinding]:
         elif zero is not None and zero.astype(np.float32).any():
             found = float(zero.reshape(-1)[np.flatnonzero(zero)[0]])
             yield error("zero-point", node, f"zero point {found:g}, must be 0")
-
-
-def _stored_type(node: ir.Node) -> ir.DataType:
-    """Return the quantized type: the tensor's, else the zero point's, else uint8."""
-    source, zero = node.inputs[0], graph.input_at(node, 2)
-    kind = None if zero is None else zero.dtype
-    if node.op_type == DEQUANTIZE and source is not None:
-        kind = source.dtype or kind
-    return kind or ir.DataType.UINT8
 
 
 def _is_weight(node: ir.Node) -> bool:
@@ -191,7 +183,7 @@ def channel_scales(model: ir.Model) -> Iterator[LintFinding]:
 def _is_by_block(node: ir.Node) -> bool:
     """Return whether a pair is that of an int4 weight, whose scales are by block."""
     blocks = node.attributes.get_int("block_size", 0)
-    return _stored_type(node) == ir.DataType.INT4 and blocks > 0 and _is_weight(node)
+    return stored_type(node) == ir.DataType.INT4 and blocks > 0 and _is_weight(node)
 
 
 def _wrong_axes(node: ir.Node, scale: tuple[int, ...]) -> Iterator[str]:
