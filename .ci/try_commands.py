@@ -55,7 +55,6 @@ USES = (
     "ranges ranges.json",
     f"compress highway -r feature-ext --frames {FRAMES} -o small.onnx",
     "lint small.onnx",
-    "build small.onnx -o small.engine",
     f"sensitivity highway {FRAMES} -o sensitive.toml",
     f"search highway {FRAMES} --max-mb 5 -o found.toml",
     f"compare highway small.onnx {FRAMES}",

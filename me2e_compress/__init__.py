@@ -50,10 +50,8 @@ if TYPE_CHECKING:  # what a type checker sees; at run time names load when asked
     from me2e_compress.workflows.evaluate import ModelCheck as ModelCheck
     from me2e_compress.workflows.evaluate import check_model as check_model
     from me2e_compress.workflows.evaluate import evaluate as evaluate
-    from me2e_compress.workflows.files import EngineResult as EngineResult
     from me2e_compress.workflows.files import JoinResult as JoinResult
     from me2e_compress.workflows.files import SplitResult as SplitResult
-    from me2e_compress.workflows.files import build as build
     from me2e_compress.workflows.files import join as join
     from me2e_compress.workflows.files import split as split
     from me2e_compress.workflows.frames import record_frames as record_frames
@@ -61,7 +59,6 @@ if TYPE_CHECKING:  # what a type checker sees; at run time names load when asked
     from me2e_compress.workflows.inspect import inspect as inspect
     from me2e_compress.workflows.lint import LintResult as LintResult
     from me2e_compress.workflows.lint import lint as lint
-    from me2e_compress.workflows.options import BuildOptions as BuildOptions
     from me2e_compress.workflows.options import CalibrateOptions as CalibrateOptions
     from me2e_compress.workflows.options import CompareOptions as CompareOptions
     from me2e_compress.workflows.options import CompressOptions as CompressOptions
@@ -108,12 +105,12 @@ _ROOMS = {
     "workflows.compare_dump": "DumpResult compare_dump",
     "workflows.compress": "CompressResult compress",
     "workflows.evaluate": "EvaluateResult ModelCheck check_model evaluate",
-    "workflows.files": "EngineResult JoinResult SplitResult build join split",
+    "workflows.files": "JoinResult SplitResult join split",
     "workflows.frames": "record_frames",
     "workflows.inspect": "InspectResult inspect",
     "workflows.lint": "LintResult lint",
     "workflows.options": (
-        "BuildOptions CalibrateOptions CompareOptions CompressOptions EerOptions "
+        "CalibrateOptions CompareOptions CompressOptions EerOptions "
         "EvaluateOptions FramesOptions GraphOptions InspectOptions LintOptions "
         "PlanOptions ProfileOptions SearchOptions SensitivityOptions WriteOptions"
     ),

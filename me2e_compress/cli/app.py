@@ -61,7 +61,7 @@ def _shown(default: object) -> str | None:
 _PANELS = {
     "Start here": "demo doctor list",
     "Graphs and frames": "export inspect join split frames",
-    "Compress": "plan calibrate ranges compress lint build sensitivity search",
+    "Compress": "plan calibrate ranges compress lint sensitivity search",
     "Compare and measure": "compare profile",
     "Drive": "evaluate score study routes",
 }
@@ -96,8 +96,10 @@ def options_of(name: str) -> list[str]:
 
 
 def _refuse_former(words: Sequence[str]) -> None:
-    """Refuse an option that is gone, with what replaces it."""
+    """Refuse a command or an option that is gone, with what replaces it."""
     name, taken = next(iter(words), ""), set[str]()
+    if gone := FORMER.get(f"command {name}"):
+        raise CycloptsError(gone)
     if name in COMMANDS:
         arguments = app[name].assemble_argument_collection()
         taken = {flag for each in arguments if each.parse for flag in each.names}

@@ -21,7 +21,6 @@ from me2e_compress.cli.console import (
 from me2e_compress.errors import EvaluationError, OptionError, RecipeError
 from me2e_compress.extras import need_extra
 from me2e_compress.workflows.options import (
-    BuildOptions,
     CalibrateOptions,
     CompareOptions,
     CompressOptions,
@@ -265,20 +264,6 @@ def lint(model: str, /, *, options: LintOptions | None = None) -> None:
         result = workflow(model, options, listener)
     show(result, result.shown(every=is_verbose()).tables)
     result.check()
-
-
-def build(
-    model: str, /, *, output: Output, options: BuildOptions | None = None
-) -> None:
-    """Build a TensorRT engine of a graph, for the GPU of this machine.
-
-    Args:
-        model: the ONNX file, or highway; not changed
-        output: the engine
-    """
-    from me2e_compress.workflows.files import build as workflow
-
-    show_of(workflow, model, output, options)
 
 
 def sensitivity(

@@ -1,4 +1,4 @@
-"""From file to file: a model that ships, a joined stack and its parts, an engine."""
+"""From file to file: a model that ships, a joined stack and its parts."""
 
 import dataclasses
 from pathlib import Path
@@ -11,21 +11,9 @@ from me2e_compress.graph.files import data_names
 from me2e_compress.graph.stack.join import JoinedStack
 from me2e_compress.graph.stack.split import split_stack
 from me2e_compress.registry import drafts
-from me2e_compress.runtime.atomic import write_bytes
 from me2e_compress.shipped import drivers as shipped
-from me2e_compress.targets.tensorrt.tensorrt_engine import (
-    EngineSettings,
-    TensorRTEngine,
-    build_engine,
-)
-from me2e_compress.workflows.checks import (
-    check_folder,
-    model_path,
-    output_path,
-    writing,
-)
-from me2e_compress.workflows.options import BuildOptions
-from me2e_compress.workflows.result import SILENT, Listener, Result, Shown
+from me2e_compress.workflows.checks import check_folder, model_path, writing
+from me2e_compress.workflows.result import Result, Shown
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
@@ -171,59 +159,3 @@ def split(
             graph.save(parts[part], path)
     missing = tuple(each for each in joined.parts if each not in files)
     return SplitResult(output, files, missing)
-
-
-@dataclasses.dataclass(frozen=True, repr=False)
-class EngineResult(Result):
-    """A TensorRT engine that was written."""
-
-    model: Path
-    output: Path
-    engine: TensorRTEngine
-
-    @property
-    def headline(self) -> str:
-        """The engine file, its size, TensorRT's version and the build time."""
-        found = self.engine
-        return (
-            f"{self.output}: {megabytes(len(found.content))} MB, TensorRT"
-            f" {found.version}, {counted(found.layers, 'layer')} parsed,"
-            f" {found.seconds:.0f} s; it fits this GPU and this version"
-        )
-
-    def to_json(self) -> dict[str, object]:
-        """Return everything about the engine except its bytes."""
-        return {
-            "engine_bytes": len(self.engine.content),
-            "tensorrt": self.engine.version,
-            "layers": self.engine.layers,
-            "seconds": self.engine.seconds,
-        }
-
-
-def build(
-    model: str | Path,
-    output: str | Path,
-    options: BuildOptions | None = None,
-    listener: Listener = SILENT,
-) -> EngineResult:
-    """Build a TensorRT engine of a graph for the GPU of this machine.
-
-    The model is an ONNX file or the name of one that ships.
-
-    Raises:
-        GraphError: The model does not exist, or the output would harm an input.
-        MissingPackageError: TensorRT is not installed.
-        PreconditionError: TensorRT lacks an option, or refuses the graph.
-    """
-    options = options or BuildOptions()
-    source, output = model_path(model), output_path(output)
-    # the engine is written only when it is whole
-    with writing([output], (source,), force=options.force):
-        listener.on_progress("build", 0, 1, source.name)
-        settings = EngineSettings(options.precision, options.plugins)
-        engine = build_engine(source, settings)
-        with drafts.written(output, GraphError):
-            write_bytes(output, engine.content)
-        listener.on_progress("build", 1, 1, source.name)
-    return EngineResult(source, output, engine)

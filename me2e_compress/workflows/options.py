@@ -11,7 +11,7 @@ import dataclasses
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeAlias
+from typing import TYPE_CHECKING, Annotated, Any, TypeAlias
 
 from cyclopts import Parameter, Token
 
@@ -304,16 +304,6 @@ class LintOptions(ProviderOptions):
         """An option that only TensorRT serves; empty if none is given."""
         version = "" if self.target_version is None else "target-version"
         return "trt-check" if self.trt_check else version
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class BuildOptions(WriteOptions):
-    """How an engine is built."""
-
-    precision: Literal["graph", "fp16"] = "graph"
-    """graph: its own types; fp16: float too"""
-    plugins: tuple[Path, ...] = ()
-    """a library of TensorRT plugins; once for each"""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

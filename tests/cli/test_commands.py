@@ -1,4 +1,4 @@
-"""Every command explains itself; what list, doctor, lint, build and export answer."""
+"""Every command explains itself; what list, doctor, lint and export answer."""
 
 import re
 from pathlib import Path
@@ -10,11 +10,6 @@ from me2e_compress.cli.app import COMMANDS
 from me2e_compress.cli.console import print_json
 from me2e_compress.graph.modules.module_map import presets
 from me2e_compress.manager import recipe
-from me2e_compress.targets.tensorrt.tensorrt_engine import (
-    EngineSettings,
-    TensorRTEngine,
-)
-from me2e_compress.workflows import files as workflow
 from me2e_compress.workflows.frames import FramesResult
 from me2e_compress.workflows.listing import KINDS, REGISTRIES
 from me2e_compress.workflows.options import FramesOptions
@@ -149,25 +144,6 @@ def test_trt_check_says_what_was_asked_and_of_whom(cli: Cli, dense: Path) -> Non
 
     assert "TensorRT-RTX 1" in said
     assert "parsed, built for SM86\nkernels with int8 operands: 0 of 1 prod" in said
-
-
-def test_an_engine_is_written_once_and_not_over_a_file_of_the_users(
-    cli: Cli, dense: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    asked = list[EngineSettings]()
-
-    def build_engine(path: Path, settings: EngineSettings) -> TensorRTEngine:
-        asked.append(settings)
-        return TensorRTEngine(b"engine", "10.4.0", 3, 1.5)
-
-    monkeypatch.setattr(workflow, "build_engine", build_engine)
-    (dense / "mine.engine").write_text("mine")
-
-    cli.document("build dense.onnx -o d.engine --precision fp16")
-    cli.refused("build dense.onnx -o mine.engine")
-
-    assert (dense / "d.engine").read_bytes() == b"engine"
-    assert asked == [EngineSettings("fp16")]
 
 
 def test_frames_that_there_are_count_not_those_asked_for(

@@ -21,6 +21,7 @@ __all__ = ["cli", "command"]
     ("line", "instead"),
     [
         ("inspect highway --modelled-energy 7nm", ""),
+        ("build m.onnx -o m.engine", "trtexec"),
         ("score results --modelled a=1", ""),
         ("plan highway --weight-only-gemv", "--rules 'safe{without=[gemv]}'"),
         ("plan highway --weight-only-gemv=1", "--rules 'safe{without=[gemv]}'"),
