@@ -44,8 +44,7 @@ compress seven.onnx -r full --target tensorrt --frames seven -o seven.full.onnx
 calibrate seven.onnx seven -o seven.ranges.json --method percentile:99.9
 compress seven.onnx --scheme full --target tensorrt --ranges seven.ranges.json \
 --method percentile:99.9 -o seven.ranges.onnx
-calibrate highway frames -o ranges.json --tensorrt-cache trt.cache \
---onnxruntime-table table
+calibrate highway frames -o ranges.json
 plan highway --scheme prediction -o prediction.plan.json
 evaluate blind --routes 44 -o blind
 evaluate blind:9 --routes 2 --latency trace{trace=trace.json,in_order=true} \

@@ -61,6 +61,8 @@ FORMER = {
     "--pick": f"--pick {_NOW} generate.examine(route): routes admits its own",
     "--tactic-source": "--tactic-source is gone since 0.3.0: TensorRT chooses",
     "--seed": "--seed is of compress, evaluate, frames and routes since 0.3.0",
+    "--tensorrt-cache": f"--tensorrt-cache {_NOW} compress: int8 pairs have the scales",
+    "--onnxruntime-table": f"--onnxruntime-table {_NOW} compress, whose file is int8",
     "--unproven": f"--unproven {_NOW} --verify-frames 0, which asks for no proof",
     "--threads": "--threads is of calibrate and profile since 0.3.0",
     "--energy-out": f"--energy-out {_NOW} TRACE.energy.json beside the trace",

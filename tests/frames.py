@@ -1,6 +1,7 @@
-"""Write recordings for tests."""
+"""Write recordings, and the cache of another tool, for tests."""
 
 import json
+import struct
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -20,3 +21,12 @@ def record(
             np.savez(stream, **arrays)  # type: ignore[arg-type]
     (folder / "scenes.json").write_text(json.dumps({"scenes": list(scenes)}))
     return folder
+
+
+def tensorrt_cache(tensors: Mapping[str, Sequence[float]]) -> str:
+    """Write bounds, by tensor, as TensorRT 10 writes its calibration cache."""
+    scales = {name: max(-low, high) / 127 for name, (low, high) in tensors.items()}
+    lines = (
+        f"{name}: {struct.pack('!f', each).hex()}" for name, each in scales.items()
+    )
+    return "\n".join(["TRT-101000-MinMaxCalibration", *lines, ""])

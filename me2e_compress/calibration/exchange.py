@@ -1,74 +1,23 @@
-"""Exchange ranges with other tools: TensorRT's cache, onnxruntime's table.
+"""Read ranges of other tools: TensorRT's cache, onnxruntime's table.
 
-Both store one number per tensor, so imported ranges are symmetric: [-reach, reach].
+Both store one number per tensor, so these ranges are symmetric: [-reach, reach].
 """
 
 import dataclasses
-import re
 import struct
-import tempfile
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-import numpy as np
 import onnx_ir as ir
-from onnxruntime.quantization.calibrate import TensorData
-from onnxruntime.quantization.quant_utils import write_calibration_table
 
-from me2e_compress.calibration.observers import QUANT_MAX, MaxMin, scale_of
+from me2e_compress.calibration.observers import QUANT_MAX
 from me2e_compress.calibration.ranges import IMPORTED, LARGEST, Ranges
 from me2e_compress.display import counted
 from me2e_compress.errors import FramesError
 from me2e_compress.graph import digest, provenance
-from me2e_compress.registry import drafts
-from me2e_compress.runtime.atomic import write_bytes
-
-TABLE_FILES = ("calibration.flatbuffers", "calibration.json", "calibration.cache")
-"""Files of an onnxruntime table."""
-
-_MIN_MAX, _ENTROPY = "MinMaxCalibration", "EntropyCalibration2"
-_HEAD = re.compile(r"TRT-\d+-(\w+)")
 
 _LEAST = 0.5
 """Least share of the needed tensors that a cache of this graph has."""
-
-_VERSION = "TRT-101000"
-"""Version in the head of a written cache; TensorRT 10 reads caches of this form."""
-
-
-def write_tensorrt_cache(ranges: Ranges, path: Path) -> None:
-    """Write a TensorRT calibration cache with a line ``name: scale`` for every tensor.
-
-    The scale, reach / 127, is a float32 in big-endian hexadecimal. The head names the
-    calibrator: that of an imported cache, if it is known.
-    """
-    extremes = ranges.method in (MaxMin.name, IMPORTED)
-    kind = ranges.calibrator or (_MIN_MAX if extremes else _ENTROPY)
-    lines = [f"{_VERSION}-{kind}"]
-    lines += [
-        f"{name}: {struct.pack('!f', float(scale_of(*bounds))).hex()}"
-        for name, bounds in ranges.tensors.items()
-    ]
-    write_bytes(path, ("\n".join(lines) + "\n").encode())
-
-
-def write_onnxruntime_table(ranges: Ranges, folder: Path) -> None:
-    """Write onnxruntime's calibration table into a folder, as its own tool does.
-
-    That is ``calibration.flatbuffers``, which its TensorRT provider reads, and the same
-    as ``calibration.json`` and ``calibration.cache`` (a line ``name reach`` per
-    tensor).
-    """
-    # The table keeps the larger bound, not the magnitude: bounds are symmetric.
-    table = dict[str, TensorData]()
-    for name, (low, high) in ranges.tensors.items():
-        reach = np.array(max(abs(low), abs(high)), np.float32)
-        table[name] = TensorData(lowest=-reach, highest=reach)
-    folder.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(dir=folder, prefix=".table-") as draft:
-        write_calibration_table(table, draft)
-        for file in sorted(Path(draft).iterdir()):
-            drafts.put(file, folder / file.name)
 
 
 def read_cache(path: Path) -> Ranges:
@@ -86,7 +35,6 @@ def read_cache(path: Path) -> Ranges:
     except UnicodeDecodeError as error:
         raise FramesError(f"{path}: not a calibration cache ({error})") from error
     # The head tells the two formats apart.
-    head = _HEAD.fullmatch(lines[0]) if lines else None
     if lines and lines[0].startswith("TRT-"):
 
         def number(text: str) -> float:
@@ -99,7 +47,7 @@ def read_cache(path: Path) -> Ranges:
     if not reach:
         raise FramesError(f"{path}: a calibration cache without a tensor")
     bounds = {name: (-each, each) for name, each in reach.items()}
-    return Ranges(bounds, IMPORTED, 0, "", "", calibrator=head[1] if head else "")
+    return Ranges(bounds, IMPORTED, 0, "", "")
 
 
 def taken_from(

@@ -46,7 +46,6 @@ class Ranges:
         frames: number of frames; 0 for imported ranges.
         model: digest of the graph.
         source: fingerprint of the recording.
-        calibrator: TensorRT's; of an imported cache, else empty.
         rms: root mean square of tensors over all frames; empty where it is not known.
         scenes: number of scenes; None where it is not known.
         inputs: what each input of the graph did; empty where it is not known.
@@ -60,7 +59,6 @@ class Ranges:
     frames: int
     model: str
     source: str
-    calibrator: str = ""
     rms: dict[str, float] = dataclasses.field(default_factory=dict)
     scenes: int | None = None
     inputs: dict[str, Activity] = dataclasses.field(default_factory=dict)

@@ -7,13 +7,7 @@ from pathlib import Path
 
 from me2e_compress.calibration.calibrator import Calibrator
 from me2e_compress.calibration.dataset import CalibrationSet
-from me2e_compress.calibration.exchange import (
-    TABLE_FILES,
-    read_cache,
-    taken_from,
-    write_onnxruntime_table,
-    write_tensorrt_cache,
-)
+from me2e_compress.calibration.exchange import read_cache, taken_from
 from me2e_compress.calibration.observers import OBSERVERS
 from me2e_compress.calibration.ranges import Ranges, rms_of
 from me2e_compress.calibration.review import RangeFinding, not_in, review
@@ -25,7 +19,6 @@ from me2e_compress.quantization.decision import keep_readers, overrides_text
 from me2e_compress.registry import documents, drafts
 from me2e_compress.runtime.atomic import write_bytes
 from me2e_compress.workflows.checks import (
-    check_folder,
     model_path,
     output_path,
     read_graph,
@@ -48,16 +41,10 @@ def overrides_beside(output: Path) -> Path:
 
 
 def written_files(output: Path, options: CalibrateOptions) -> list[Path]:
-    """List the files that are written; an onnxruntime table is a folder of three."""
+    """List the files that are written."""
     files = [output, checkpoint_beside(output)]
     if options.imported is not None:
         files.append(overrides_beside(output))
-    if options.tensorrt_cache is not None:
-        files.append(Path(options.tensorrt_cache))
-    if options.onnxruntime_table is not None:
-        folder = Path(options.onnxruntime_table)
-        if folder.is_dir():
-            files += (folder / name for name in TABLE_FILES)
     return files
 
 
@@ -131,8 +118,6 @@ def calibrate(
     named = (options.recipe, options.module_map, options.imported, options.adapter)
     outputs = written_files(output, options)
     inputs = (source, frames, *named)
-    if options.onnxruntime_table is not None:
-        check_folder(Path(options.onnxruntime_table), inputs, TABLE_FILES)
     with writing(outputs, inputs, force=options.force):
         ready, part = _ready(source, frames, options, listener)
         gc.collect()  # 150 MB of VAD-tiny as it was read; graphs are cycles
@@ -144,10 +129,6 @@ def calibrate(
                 assert part is not None
                 ranges = _measured(ready, part, output, options, listener)
             ranges.save(output)
-            if options.tensorrt_cache is not None:
-                write_tensorrt_cache(ranges, Path(options.tensorrt_cache))
-            if options.onnxruntime_table is not None:
-                write_onnxruntime_table(ranges, Path(options.onnxruntime_table))
             # what an imported cache has no range for stays in float
             cache = Path(options.imported or "")
             if missing:

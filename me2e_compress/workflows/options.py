@@ -233,10 +233,6 @@ class CalibrateOptions(WriteOptions, GraphOptions):
     """number of frames, drawn in whole scenes"""
     imported: Annotated[File | None, Parameter(name="--import")] = None
     """what another tool measured; frames then judge its scales alone"""
-    tensorrt_cache: File | None = None
-    """write a TensorRT cache too"""
-    onnxruntime_table: File | None = None
-    """write onnxruntime's table too: a folder"""
     threads: int = 0
     """of onnxruntime; 0 takes all"""
 

@@ -1,5 +1,4 @@
 import dataclasses
-import struct
 from pathlib import Path
 
 import numpy as np
@@ -7,76 +6,42 @@ import onnx_ir as ir
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from onnxruntime.quantization.CalTableFlatBuffers.TrtTable import TrtTable
 
-from me2e_compress.calibration.exchange import (
-    read_cache,
-    taken_from,
-    write_onnxruntime_table,
-    write_tensorrt_cache,
-)
-from me2e_compress.calibration.observers import scale_of
+from me2e_compress.calibration.exchange import read_cache, taken_from
+from me2e_compress.calibration.observers import QUANT_MAX, scale_of
 from me2e_compress.calibration.ranges import IMPORTED, Ranges
 from me2e_compress.errors import FramesError, RecipeError
 from me2e_compress.graph import digest, provenance
 from me2e_compress.graph.provenance import Provenance
+from tests.frames import tensorrt_cache
 from tests.profiles import scaled
 
 NAMES = ("/head/MatMul output", "a: b", "image")
 
 
-def ranges(method: str = "max-min") -> Ranges:
+def ranges() -> Ranges:
     ends = {NAMES[0]: (-3.5, 1.25), NAMES[1]: (0.0, 7.0), NAMES[2]: (-1e-3, 0.0)}
-    return Ranges(ends, method, 4, "digest", "frames")
-
-
-@pytest.mark.parametrize(
-    ("method", "head"),
-    [
-        ("max-min", "TRT-101000-MinMaxCalibration"),
-        ("mse", "TRT-101000-EntropyCalibration2"),
-    ],
-)
-def test_the_cache_is_as_tensorrt_writes_it_and_goes_out_as_it_came_in(
-    tmp_path: Path, method: str, head: str
-) -> None:
-    write_tensorrt_cache(ranges(method), tmp_path / "c")
-    first, *lines = (tmp_path / "c").read_text().splitlines()
-
-    assert first == head
-    assert lines[0] == f"{NAMES[0]}: {struct.pack('>f', 3.5 / 127).hex()}"
-    read_cache(tmp_path / "c").save(tmp_path / "r.json")
-    write_tensorrt_cache(Ranges.load(tmp_path / "r.json"), tmp_path / "again")
-    assert (tmp_path / "again").read_bytes() == (tmp_path / "c").read_bytes()
+    return Ranges(ends, "max-min", 4, "digest", "frames")
 
 
 @settings(max_examples=scaled(20))
-@given(reach=st.floats(1e-30, 1e30))
-def test_scales_survive_the_way_through_a_cache(
-    tmp_path_factory: pytest.TempPathFactory, reach: float
+@given(scale=st.floats(2.0**-100, 2.0**100, width=32))
+def test_a_scale_of_tensorrt_is_read_to_the_bit(
+    tmp_path_factory: pytest.TempPathFactory, scale: float
 ) -> None:
     path = tmp_path_factory.mktemp("cache") / "c"
-    write_tensorrt_cache(Ranges({"t": (0, reach)}, "mse", 1, "m", "f"), path)
+    path.write_text(tensorrt_cache({NAMES[1]: (0.0, scale * QUANT_MAX)}))
 
-    found = read_cache(path)
-
-    assert scale_of(*found.tensors["t"]) == scale_of(0, reach)
+    assert scale_of(*read_cache(path).tensors[NAMES[1]]) == np.float32(scale)
 
 
-def test_the_table_of_onnxruntime_holds_the_magnitudes(tmp_path: Path) -> None:
-    write_onnxruntime_table(ranges(), tmp_path / "table")
-    content = (tmp_path / "table" / "calibration.flatbuffers").read_bytes()
+def test_the_table_of_onnxruntime_holds_magnitudes(tmp_path: Path) -> None:
+    (tmp_path / "calibration.cache").write_text(f"{NAMES[0]} 3.5\n{NAMES[1]} 7.0\n")
 
-    table = TrtTable.GetRootAsTrtTable(content, 0)
-    held = {}
-    for at in range(table.DictLength()):
-        entry = table.Dict(at)
-        assert entry is not None
-        held[(entry.Key() or b"").decode()] = float(entry.Value() or b"nan")
-    assert held == pytest.approx(dict(zip(NAMES, (3.5, 7, 1e-3), strict=True)))
-    found = read_cache(tmp_path / "table" / "calibration.cache")
-    assert found.tensors[NAMES[0]] == (-3.5, 3.5)
-    assert [each.name for each in (tmp_path / "table").iterdir() if each.is_dir()] == []
+    assert read_cache(tmp_path / "calibration.cache").tensors == {
+        NAMES[0]: (-3.5, 3.5),
+        NAMES[1]: (-7.0, 7.0),
+    }
 
 
 @pytest.mark.parametrize(
@@ -107,7 +72,7 @@ def test_a_cache_that_does_not_fit_is_refused(
 
 
 def test_imported_ranges_fit_any_method_but_one_graph(tmp_path: Path) -> None:
-    write_tensorrt_cache(ranges(), tmp_path / "c")
+    (tmp_path / "c").write_text(tensorrt_cache(ranges().tensors))
     found = dataclasses.replace(read_cache(tmp_path / "c"), model="digest")
 
     found.check(model="digest", tensors=NAMES, method="percentile", source="others")

@@ -10,7 +10,7 @@ import pytest
 from me2e_compress import graph
 from tests.command import Cli
 from tests.docs.pages import ROOT
-from tests.frames import record
+from tests.frames import record, tensorrt_cache
 from tests.nets import MAP_TEXT, conv_attention, image
 
 MAP = "--map map.toml"
@@ -28,17 +28,25 @@ def folder(dense: Path) -> Path:
     return dense
 
 
-def test_another_tools_cache_comes_and_goes(cli: Cli, folder: Path) -> None:
-    cli.done(f"{RANGES} --tensorrt-cache c --onnxruntime-table table -o r.json")
-    ours = json.loads((folder / "r.json").read_text())
+def write_cache(folder: Path) -> str:
+    """Write the cache of a TensorRT that measured the ranges in r.json; return it."""
+    ranges = json.loads((folder / "r.json").read_text())["tensors"]
+    (folder / "c").write_text(tensorrt_cache(ranges))
+    return (folder / "c").read_text()
 
-    for foreign in ("c", "table/calibration.cache"):
-        cli.done(f"calibrate dense.onnx --import {foreign} {MAP} -o back.json")
-        back = json.loads((folder / "back.json").read_text())
-        assert back["method"] == "imported"
-        for name, (low, high) in ours["tensors"].items():
-            reach = max(-low, high)
-            assert back["tensors"][name] == pytest.approx((-reach, reach))
+
+def test_another_tools_cache_comes_in(cli: Cli, folder: Path) -> None:
+    cli.done(f"{RANGES} -o r.json")
+    write_cache(folder)
+
+    cli.done(f"calibrate dense.onnx --import c {MAP} -o back.json")
+    ours, back = (
+        json.loads((folder / f"{at}.json").read_text()) for at in ("r", "back")
+    )
+    assert back["method"] == "imported"
+    for name, (low, high) in ours["tensors"].items():
+        reach = max(-low, high)
+        assert back["tensors"][name] == pytest.approx((-reach, reach))
     for line in ("sensitivity", "search --max-mb 1"):
         cli.done(f"{line} dense.onnx frames --ranges back.json {MAP} -o r.toml")
 
@@ -47,8 +55,8 @@ def test_a_cache_of_tensorrt_10_becomes_an_explicit_graph(
     cli: Cli, tmp_path: Path
 ) -> None:
     write_net(tmp_path)
-    cli.done(f"calibrate m.onnx frames {MAP} --tensorrt-cache c -o r.json")
-    head, *scales = (tmp_path / "c").read_text().splitlines()
+    cli.done(f"calibrate m.onnx frames {MAP} -o r.json")
+    head, *scales = write_cache(tmp_path).splitlines()
     kept = [line for line in scales if not line.startswith("p: ")]
     (tmp_path / "c").write_text("\n".join([head, *kept]))
 
@@ -76,7 +84,9 @@ def test_the_commands_of_the_page_lead_from_a_cache_to_int8(
     cli: Cli, tmp_path: Path
 ) -> None:
     write_net(tmp_path)
-    cli.done(f"calibrate m.onnx frames {MAP} --tensorrt-cache trt10.cache -o r.json")
+    cli.done(f"calibrate m.onnx frames {MAP} -o r.json")
+    write_cache(tmp_path)
+    (tmp_path / "c").rename(tmp_path / "trt10.cache")
     (tmp_path / "m.onnx").rename(tmp_path / "vad.onnx")
     page = (ROOT / "docs" / "quantization.md").read_text(encoding="utf-8")
     lines = (
@@ -97,8 +107,8 @@ def test_the_commands_of_the_page_lead_from_a_cache_to_int8(
 def test_scales_of_a_cache_are_held_against_two_frames(
     cli: Cli, folder: Path, factor: float, kind: str
 ) -> None:
-    cli.done(f"{RANGES} --tensorrt-cache c -o r.json")
-    cache = (folder / "c").read_text().splitlines()
+    cli.done(f"{RANGES} -o r.json")
+    cache = write_cache(folder).splitlines()
     name, _, text = cache[1].rpartition(": ")
     (scale,) = struct.unpack("!f", bytes.fromhex(text))
     cache[1] = f"{name}: {struct.pack('!f', scale * factor).hex()}"

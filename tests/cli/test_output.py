@@ -65,18 +65,6 @@ REFUSED = {
     **{f"{line} -o dense.onnx": "dense.onnx is a file: name a folder"
        for line in (f"frames {M}", f"evaluate {M}", "study study.toml")},
     "study study.toml -o frames": "frames is the input: choose another folder",
-    **{
-        f"calibrate {F} -o ranges.json {words}": said
-        for words, said in {
-            "--tensorrt-cache dense.onnx": "dense.onnx is the input",
-            "--tensorrt-cache no/c": "no/c: no such folder no",
-            "--tensorrt-cache ranges.json": "ranges.json is named for two outputs",
-            "--onnxruntime-table dense.onnx": "dense.onnx is a file",
-            "--onnxruntime-table frames": "frames is the input: choose another folder",
-        }.items()
-    },
-    f"calibrate {M} --import table/calibration.cache --onnxruntime-table table -o n":
-        "table/calibration.cache is the input",
 }  # fmt: skip
 STUDY = """
 title = "one"
@@ -100,8 +88,6 @@ def folder(dense: Path) -> Path:
             (dense / name).write_text("the user's\n")
     (dense / "r.toml").write_text('[[pass]]\nname = "fold-constants"\n')
     (dense / "study.toml").write_text(STUDY)
-    (dense / "table").mkdir()
-    (dense / "table" / "calibration.cache").write_text("the user's\n")
     (dense / "link.onnx").symlink_to(dense / "dense.onnx")
     model = graph.load(dense / M)
     big = np.random.default_rng(0).normal(size=(1, 4096)).astype(np.float32)

@@ -86,8 +86,7 @@ def write_good(folder: Path, command: Command) -> None:
     for name, text in {"map": MAP, "overrides": OVERRIDES, "adapter": ADAPTER}.items():
         (folder / f"{name}.toml").write_text(text)
     recorded = (model, folder / "frames", "-o")
-    cache = ("--tensorrt-cache", folder / "trt.cache")
-    assert command("calibrate", *recorded, folder / "ranges.json", *cache) == 0
+    assert command("calibrate", *recorded, folder / "ranges.json") == 0
     assert command("plan", model, "-o", folder / "plan.json") == 0
     assert command("profile", *recorded, folder / "trace.json") == 0
     int8 = ("--frames", folder / "frames", "--scheme", "full", "--rules", "paper")

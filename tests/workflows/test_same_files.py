@@ -50,18 +50,12 @@ CASES: dict[str, tuple[str, Call]] = {
         ),
     ),
     "calibrate": (
-        "calibrate dense.onnx frames -o r.json --map map.toml --method mse"
-        " --tensorrt-cache c.cache --onnxruntime-table table",
+        "calibrate dense.onnx frames -o r.json --map map.toml --method mse",
         lambda: me2e.calibrate(
             "dense.onnx",
             "frames",
             "r.json",
-            me2e.CalibrateOptions(
-                method="mse",
-                module_map=MAP,
-                tensorrt_cache="c.cache",
-                onnxruntime_table="table",
-            ),
+            me2e.CalibrateOptions(method="mse", module_map=MAP),
         ),
     ),
     "plan": (
