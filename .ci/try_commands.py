@@ -52,7 +52,6 @@ USES = (
     "frames highway -n 4 -o frames",
     "plan highway --scheme full",
     f"calibrate highway {FRAMES} -o ranges.json",
-    "ranges ranges.json",
     f"compress highway -r feature-ext --frames {FRAMES} -o small.onnx",
     "lint small.onnx",
     f"sensitivity highway {FRAMES} -o sensitive.toml",

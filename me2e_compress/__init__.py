@@ -33,9 +33,7 @@ if TYPE_CHECKING:  # what a type checker sees; at run time names load when asked
     from me2e_compress.study import run_study as run_study
     from me2e_compress.study.report.page import write_study as write_study
     from me2e_compress.workflows.calibrate import CalibrateResult as CalibrateResult
-    from me2e_compress.workflows.calibrate import RangesResult as RangesResult
     from me2e_compress.workflows.calibrate import calibrate as calibrate
-    from me2e_compress.workflows.calibrate import ranges as ranges
     from me2e_compress.workflows.compare import CompareResult as CompareResult
     from me2e_compress.workflows.compare import (
         FirstDifferenceResult as FirstDifferenceResult,
@@ -98,7 +96,7 @@ _ROOMS = {
     "passes": "Context PASSES Pass PassResult",
     "study": "StudyResult load_study run_study",
     "study.report.page": "write_study",
-    "workflows.calibrate": "CalibrateResult RangesResult calibrate ranges",
+    "workflows.calibrate": "CalibrateResult calibrate",
     "workflows.compare": (
         "CompareResult FirstDifferenceResult compare first_difference"
     ),

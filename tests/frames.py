@@ -25,8 +25,8 @@ def record(
 
 def tensorrt_cache(tensors: Mapping[str, Sequence[float]]) -> str:
     """Write bounds, by tensor, as TensorRT 10 writes its calibration cache."""
-    scales = {name: max(-low, high) / 127 for name, (low, high) in tensors.items()}
-    lines = (
-        f"{name}: {struct.pack('!f', each).hex()}" for name, each in scales.items()
-    )
-    return "\n".join(["TRT-101000-MinMaxCalibration", *lines, ""])
+    lines = ["TRT-101000-MinMaxCalibration"]
+    for name, (low, high) in tensors.items():
+        scale = max(-low, high) / 127
+        lines.append(f"{name}: {struct.pack('!f', scale).hex()}")
+    return "\n".join([*lines, ""])

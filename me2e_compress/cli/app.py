@@ -61,7 +61,7 @@ def _shown(default: object) -> str | None:
 _PANELS = {
     "Start here": "demo doctor list",
     "Graphs and frames": "export inspect join split frames",
-    "Compress": "plan calibrate ranges compress lint sensitivity search",
+    "Compress": "plan calibrate compress lint sensitivity search",
     "Compare and measure": "compare profile",
     "Drive": "evaluate score study routes",
 }

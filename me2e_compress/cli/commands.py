@@ -209,19 +209,6 @@ def calibrate(
     show_of(workflow, model, frames, output, options)
 
 
-def ranges(ranges: Path, /) -> None:
-    """Say which saved ranges deserve a look, and what to record instead.
-
-    Ranges are held against the root mean square of their own tensor.
-
-    Args:
-        ranges: saved RANGES.json, or a TensorRT or an onnxruntime cache
-    """
-    from me2e_compress.workflows.calibrate import ranges as workflow
-
-    show(workflow(ranges))
-
-
 def compress(
     model: str,
     /,

@@ -12,11 +12,11 @@ from me2e_compress.calibration.observers import OBSERVERS
 from me2e_compress.calibration.ranges import Ranges, rms_of
 from me2e_compress.calibration.review import RangeFinding, not_in, review
 from me2e_compress.calibration.sample import draw
-from me2e_compress.display import counted, number, table
+from me2e_compress.display import counted
 from me2e_compress.errors import FramesError
 from me2e_compress.manager import recipe
 from me2e_compress.quantization.decision import keep_readers, overrides_text
-from me2e_compress.registry import documents, drafts
+from me2e_compress.registry import drafts
 from me2e_compress.runtime.atomic import write_bytes
 from me2e_compress.workflows.checks import (
     model_path,
@@ -207,76 +207,5 @@ def _imported(
     return ranges, [name for name in tensors if name not in ranges.tensors]
 
 
-_SHOWN = 10
-"""Rows of the table; ``--json`` has all tensors."""
-
-
-@dataclasses.dataclass(frozen=True, repr=False)
-class RangesResult(Result):
-    """Saved ranges, and what of them deserves a look."""
-
-    path: Path
-    ranges: Ranges
-    findings: tuple[RangeFinding, ...]
-
-    def shown(self) -> Shown:
-        """Return the tensors that are furthest off, and what is wrong or may be."""
-        headline = f"{self.path}: {self.ranges.headline}"
-        cells = [
-            [str(name), *(_cell(value) for value in values)]
-            for name, *values in (row.values() for row in self._rows()[:_SHOWN])
-        ]
-        named = ["tensor", "low", "high", "rms", "range / rms"]
-        return Shown(
-            headline,
-            [table("Ranges, the furthest off first", named, cells)],
-            [headline, *_said(self.findings, "note")],
-            _said(self.findings, "warning"),
-        )
-
-    def _rows(self) -> list[dict[str, object]]:
-        """Return one row per tensor; what is not known is None."""
-        crests = self.ranges.crests
-        found = sorted(
-            self.ranges.tensors.items(), key=lambda item: -crests.get(item[0], 0.0)
-        )
-        return [
-            {
-                "tensor": name,
-                "low": low,
-                "high": high,
-                "rms": self.ranges.rms.get(name),
-                "crest": crests.get(name),
-            }
-            for name, (low, high) in found
-        ]
-
-    def to_json(self) -> object:
-        """Return what was found, and every tensor."""
-        return {"findings": self.findings, "tensors": self._rows()}
-
-
 def _said(findings: Sequence[RangeFinding], severity: str) -> tuple[str, ...]:
     return tuple(str(each) for each in findings if each.severity == severity)
-
-
-def _cell(value: object) -> str:
-    return number(value if isinstance(value, float) else None, ".4g")
-
-
-def ranges(path: str | Path) -> RangesResult:
-    """Say which saved ranges deserve a look, and what to record instead.
-
-    The file is ranges that ``calibrate`` saved, a TensorRT calibration cache, or an
-    onnxruntime ``calibration.cache``.
-
-    Raises:
-        FramesError: The file does not exist, or contradicts itself.
-    """
-    path = Path(path)
-    if not path.is_file():
-        raise FramesError(f"{path}: no such ranges file or calibration cache")
-    with documents.reading(path, FramesError, "not ranges"):
-        is_json = documents.content(path)[:64].lstrip().startswith(b"{")
-    found = Ranges.load(path) if is_json else read_cache(path)
-    return RangesResult(path, found, review(found))

@@ -1,4 +1,4 @@
-"""``calibrate`` and ``ranges``: ranges are saved, and held against others."""
+"""``calibrate``: ranges are saved, and held against another tool's."""
 
 import json
 import struct
@@ -40,9 +40,8 @@ def test_another_tools_cache_comes_in(cli: Cli, folder: Path) -> None:
     write_cache(folder)
 
     cli.done(f"calibrate dense.onnx --import c {MAP} -o back.json")
-    ours, back = (
-        json.loads((folder / f"{at}.json").read_text()) for at in ("r", "back")
-    )
+    ours = json.loads((folder / "r.json").read_text())
+    back = json.loads((folder / "back.json").read_text())
     assert back["method"] == "imported"
     for name, (low, high) in ours["tensors"].items():
         reach = max(-low, high)
@@ -116,30 +115,11 @@ def test_scales_of_a_cache_are_held_against_two_frames(
 
     unseen = cli.document(f"calibrate dense.onnx --import c {MAP} -o back.json")
     seen = cli.document(f"calibrate dense.onnx scenes --import c {MAP} -o back.json")
-    later = cli.document("ranges back.json")
 
-    assert unseen["findings"] == cli.document("ranges c")["findings"] == []
-    for found in (seen, later):
-        (finding,) = found["findings"]
-        assert (finding["kind"], finding["names"]) == (kind, [name])
-        assert found["status"] == "warning"
-
-
-def test_ranges_are_shown_worst_first(cli: Cli, folder: Path) -> None:
-    cli.done(f"{RANGES} -n 2 -o few.json")
-    cli.done(f"{RANGES} -n 2 -o again.json")
-    few, again = ((folder / f"{name}.json").read_bytes() for name in ("few", "again"))
-    assert few == again
-
-    said = cli.done("ranges few.json").words
-    assert "few.json: " in said
-    assert "2 frames in 1 scene. Frames of one scene look alike" in said
-    rows = cli.document("ranges few.json")["tensors"]
-    off = [each["crest"] or 0.0 for each in rows]
-    assert off == sorted(off, reverse=True)
-    assert {each["tensor"] for each in rows} == {
-        *json.loads((folder / "few.json").read_text())["tensors"]
-    }
+    assert unseen["findings"] == []
+    (finding,) = seen["findings"]
+    assert (finding["kind"], finding["names"]) == (kind, [name])
+    assert seen["status"] == "warning"
 
 
 def write_net(folder: Path) -> None:

@@ -76,5 +76,5 @@ def test_what_a_command_writes_is_its_output() -> None:
     writers = {each.command for each in FOUND if each.name == "--output"}
 
     assert writers == set(COMMANDS) - {
-        *("doctor", "list", "inspect", "lint", "compare", "ranges", "score")
+        *("doctor", "list", "inspect", "lint", "compare", "score")
     }
