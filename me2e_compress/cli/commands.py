@@ -167,7 +167,6 @@ def plan(
     /,
     *,
     output: Output | None = None,
-    against: Path | None = None,
     options: PlanOptions | None = None,
 ) -> None:
     """Show which nodes become int8, which stay float, by which rule, and why.
@@ -177,11 +176,10 @@ def plan(
     Args:
         model: the ONNX file, or highway; float or with a plan
         output: the plan as JSON
-        against: a plan or model: compare; float: no overrides
     """
     from me2e_compress.workflows.plan import plan as workflow
 
-    result = workflow(model, output, against, options)
+    result = workflow(model, output, options)
     show(result, result.shown(every=is_verbose()).tables)
 
 

@@ -159,10 +159,6 @@ def _notes(plan: QuantPlan, target: str) -> tuple[str, ...]:
             for reason, names in kept.items()
             for line in _first(names, f"{len(names)} stay float on {target}, {reason}")
         ),
-        *_first(
-            [f"{each.node}: {each.borderline}" for each in plan.borderline],
-            "close decisions",
-        ),
     )
 
 

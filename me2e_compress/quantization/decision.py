@@ -1,10 +1,10 @@
-"""The plan: a decision for every node; on disk, in a model, and side by side."""
+"""The plan: a decision for every node; on disk and in a model."""
 
 import dataclasses
 import fnmatch
 import json
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Literal, Self
 
@@ -48,7 +48,6 @@ class Decision:
         weight: which input is stored as int8; None if none is.
         axis: axis of the weight's per-channel scales; None for one scale in all, as a
             batch of matrices has.
-        borderline: what was close about it; empty if nothing was.
     """
 
     node: str
@@ -62,7 +61,6 @@ class Decision:
     activations: tuple[int, ...] = ()
     weight: int | None = None
     axis: int | None = None
-    borderline: str = ""
 
     @property
     def could_be_int8(self) -> bool:
@@ -135,11 +133,6 @@ class QuantPlan:
         return tuple(each for each in self.chosen if each.output not in left)
 
     @property
-    def borderline(self) -> tuple[Decision, ...]:
-        """The nodes whose decision was close."""
-        return tuple(each for each in self.decisions if each.borderline)
-
-    @property
     def headline(self) -> str:
         """Count int8, by rule."""
         counts = ", ".join(f"{rule} {count}" for rule, count in self.counts().items())
@@ -209,33 +202,6 @@ def plan_of(model: ir.Model) -> QuantPlan | None:
         return pydantic.TypeAdapter(QuantPlan).validate_json(
             provenance.decompressed(text)
         )
-
-
-@dataclasses.dataclass(frozen=True)
-class PlanDifference:
-    """One node that two plans decide differently; None in a plan without it."""
-
-    old: Decision | None
-    new: Decision | None
-
-    def __str__(self) -> str:
-        either = self.new or self.old
-        name = "" if either is None else either.node or either.output
-        return f"{name}: {_short(self.old)} -> {_short(self.new)}"
-
-
-def differences(old: QuantPlan, new: QuantPlan) -> Iterator[PlanDifference]:
-    """Compare two plans node by node: dtype and rule, in the order of the second."""
-    before = {each.output: each for each in old.decisions}
-    after = {each.output: each for each in new.decisions}
-    for output in (*after, *(name for name in before if name not in after)):
-        left, right = before.get(output), after.get(output)
-        if _short(left) != _short(right):
-            yield PlanDifference(left, right)
-
-
-def _short(decision: Decision | None) -> str:
-    return "none" if decision is None else f"{decision.dtype} ({decision.rule})"
 
 
 # Overrides: a TOML file of exceptions to a plan, which the user decides.

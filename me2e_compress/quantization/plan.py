@@ -163,10 +163,6 @@ def sharing_costs(plan: QuantPlan, ranges: Ranges) -> tuple[SharingCost, ...]:
     return tuple(costs)
 
 
-_EGO = "encodes the ego status {}, sensitive to int8; rules safe keep it float"
-"""The remark on an int8 layer of rules that do not ask for ``ego-input``."""
-
-
 def make_plan(
     model: ir.Model,
     scheme: QuantScheme,
@@ -250,22 +246,18 @@ def _decide(
     if node.graph is not main:
         return decision(rule="body", reason="in the body of an If, Loop or Scan")
     # the first rule that objects decides, unless the user has and it is not firm
-    remarks = (rule.borderline(node, facts) for rule in rules)
-    close = next((remark for remark in remarks if remark), "")
     pin = pins.get(node)
     for rule in rules:
         objection = rule.objection(node, facts)
         if objection is None or (pin is not None and not rule.firm):
             continue
-        return decision(rule=rule.name, reason=objection, borderline=close)
+        return decision(rule=rule.name, reason=objection)
     # the user's float, else int8
     if pin is not None and pin.dtype == FLOAT:
-        return decision(rule="override", reason=pin.why, borderline=close)
+        return decision(rule="override", reason=pin.why)
     rule_id, reason, layout = _int8(node, facts)
     if pin is not None:
         rule_id, reason = "override", pin.why
-    elif node in facts.ego_layers:
-        close = f"ego-input: {_EGO.format(facts.ego_layers[node])}"
     # Kernels apply the scales of output channels to the result of one product: that of
     # a MatMul by a batch of matrices, or by a vector, has one scale in all.
     activations, weight = layout
@@ -278,7 +270,6 @@ def _decide(
         activations=activations,
         weight=weight,
         axis=axis,
-        borderline=close,
     )
 
 

@@ -19,9 +19,7 @@ from me2e_compress.passes.freeze_inputs import advice
 from me2e_compress.passes.lower_int8 import LowerInt8
 from me2e_compress.passes.quantize_int8 import QuantizeInt8
 from me2e_compress.quantization.decision import (
-    PlanDifference,
     QuantPlan,
-    differences,
     load_plan,
     plan_of,
     save_plan,
@@ -125,27 +123,21 @@ class PreparedGraph:
 
 @dataclasses.dataclass(frozen=True, repr=False)
 class PlanResult(Result):
-    """A plan, and how it differs from another.
+    """A plan.
 
     Attributes:
         plan: the decision for every node.
-        changes: nodes that another plan decides differently; None without another plan.
         hint: what the graph lacks for more to be known, else empty.
     """
 
     plan: QuantPlan
-    changes: tuple[PlanDifference, ...] | None = None
     hint: str = ""
 
     def shown(self, every: bool = False) -> Shown:
-        """Return how many nodes of each module became what by which rule, or changes.
+        """Return how many nodes of each module became what by which rule.
 
         With `every` a row a node that could be int8, and what was decided together.
         """
-        if self.changes is not None:
-            headline = f"{len(self.changes)} differences"
-            said = filter(None, (self.hint, headline))
-            return Shown(headline, (), (*map(str, self.changes), *said))
         lines = filter(None, (self.hint, self.plan.headline))
         tables = list(self.plan.tables())
         if not every:
@@ -154,8 +146,7 @@ class PlanResult(Result):
         for each in self.plan.decisions:
             if each.could_be_int8:
                 where = f" of {each.module}" if each.module else ""
-                close = f" ({each.borderline})" if each.borderline else ""
-                why = f"{each.dtype} by {each.rule}, {each.reason}{close}"
+                why = f"{each.dtype} by {each.rule}, {each.reason}"
                 rows.append((each.node or each.output, f"{each.op}{where}: {why}"))
         what = ("node", "what, by which rule, why")
         tables.append(table("Decisions", what, rows, words=2))
@@ -169,24 +160,20 @@ class PlanResult(Result):
         return Shown(self.plan.headline, tables, lines)
 
     def to_json(self) -> object:
-        """Return the plan, or the differences from another."""
-        if self.changes is None:
-            return dataclasses.asdict(self.plan)
-        return {"differences": self.changes}
+        """Return the plan."""
+        return dataclasses.asdict(self.plan)
 
 
 def plan(
     model: str | Path,
     output: str | Path | None = None,
-    against: str | Path | None = None,
     options: PlanOptions | None = None,
 ) -> PlanResult:
     """Decide for every node whether it becomes int8, as ``compress`` will.
 
     The model is an ONNX file, the name of one that ships, or a saved plan; a file that
     carries its plan is not planned again. The plan is written as JSON if `output` is
-    given, and compared with another model or plan, `against`, without overrides for a
-    float model.
+    given.
 
     Raises:
         GraphError: The model does not exist, or the output would harm an input.
@@ -195,40 +182,26 @@ def plan(
         PreconditionError: The graph is quantized and carries no plan.
     """
     options = options or PlanOptions()
-    files = [model_path(model), *([] if against is None else [model_path(against)])]
+    source = model_path(model)
     written = None if output is None else Path(output)
-    inputs = (*files, options.overrides, options.module_map)
+    inputs = (source, options.overrides, options.module_map)
     with writing([written], inputs, force=options.force):
         # a file is a plan, carries one, or is a float graph to plan
-        read = [_read(path) for path in files]
-        # options that would change nothing, as all plans are made already
-        names = ("scheme", "rules", "target", "overrides")
-        given = [name for name in names if getattr(options, name)]
-        only = read[:1] if "overrides" in given else read
-        if given and all(isinstance(each, QuantPlan) for each in only):
-            option = "overrides" if "overrides" in given else given[0]
-            raise RecipeError(
-                f"--{option} is for a plan that is yet to be made, and {files[0]} has"
-                " its own: give the float model"
-            )
-        # overrides apply to the first plan only: the other shows what they change
-        plain = QuantizeInt8(
-            scheme=options.scheme or "full",
-            rules=options.rules or DEFAULT_RULES,
-            target=options.target or DEFAULT_TARGET,
-        )
-        overrides = None if options.overrides is None else Path(options.overrides)
-        chosen = dataclasses.replace(plain, overrides=overrides)
-        made = _made(files[0], read[0], chosen, options)
+        read = _read(source)
+        if isinstance(read, QuantPlan):
+            # options that would change nothing
+            names = ("overrides", "scheme", "rules", "target")
+            if option := next((each for each in names if getattr(options, each)), None):
+                raise RecipeError(
+                    f"--{option} is for a plan that is yet to be made, and {source} has"
+                    " its own: give the float model"
+                )
+            result = PlanResult(read)
+        else:
+            result = _planned(source, read, options)
         if written is not None:
-            save_plan(made, written)
-        if len(files) == 1:
-            if isinstance(read[0], QuantPlan):
-                return PlanResult(made)
-            hints = filter(None, (lacking_shapes(read[0]), advice(read[0])))
-            return PlanResult(made, hint="; ".join(hints))
-        other = _made(files[1], read[1], plain, options)
-        return PlanResult(made, tuple(differences(other, made)))
+            save_plan(result.plan, written)
+    return result
 
 
 def _read(path: Path) -> QuantPlan | ir.Model:
@@ -239,14 +212,15 @@ def _read(path: Path) -> QuantPlan | ir.Model:
     return plan_of(model) or model
 
 
-def _made(
-    file: Path,
-    read: QuantPlan | ir.Model,
-    quantizer: QuantizeInt8,
-    options: PlanOptions,
-) -> QuantPlan:
-    """Return a plan as it is, or plan a float graph after the exact passes."""
-    if isinstance(read, QuantPlan):
-        return read
-    ready = PreparedGraph.of(file, read, options.module_map)
-    return quantizer.plan(ready.model, Context(ready.modules))
+def _planned(file: Path, model: ir.Model, options: PlanOptions) -> PlanResult:
+    """Plan a float graph after the exact passes."""
+    quantizer = QuantizeInt8(
+        scheme=options.scheme or "full",
+        rules=options.rules or DEFAULT_RULES,
+        target=options.target or DEFAULT_TARGET,
+        overrides=None if options.overrides is None else Path(options.overrides),
+    )
+    ready = PreparedGraph.of(file, model, options.module_map)
+    made = quantizer.plan(ready.model, Context(ready.modules))
+    hints = filter(None, (lacking_shapes(model), advice(model)))
+    return PlanResult(made, "; ".join(hints))

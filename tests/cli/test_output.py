@@ -36,7 +36,6 @@ READERS = [
     f"compress {INT8} --overrides o.toml",
     f"compress {M} -r r.toml",
     f"plan {M} --overrides o.toml",
-    f"plan {M} --against other.onnx",
     f"search {F} --max-mb 1 --ranges ranges.json",
     f"sensitivity {F} --adapter a.toml",
 ]

@@ -103,7 +103,6 @@ OTHERS = {
     "compare dense.onnx frames --outputs frames": "the dump is of another graph",
     "frames vad-huge -o out": "vad-huge: no such file; models that ship",
     "plan latin.json": r"latin\.json: not a plan",
-    "plan dense.onnx --against none.onnx": "none.onnx: no such file; models",
     "inspect open.onnx --set-dim n": "write NAME=SIZE, e.g. batch=1",
     "inspect open.onnx --set-dim n=x": "write NAME=SIZE, e.g. batch=1",
     "inspect open.onnx --set-dim n=0": "n=0 must be 1 or more",

@@ -84,8 +84,7 @@ def frame_cases(_: Path) -> Iterator[Case]:
 
 
 JSON = {
-    "plan": ("plan.json", f"plan {M} --against bad.json"),
-    "plan-alone": ("plan.json", "plan bad.json -v"),
+    "plan": ("plan.json", "plan bad.json -v"),
     "ranges": (
         "ranges.json",
         f"compress {M} --scheme full --ranges bad.json --frames {F} -o out.onnx",

@@ -5,7 +5,6 @@ import pytest
 
 from me2e_compress.errors import RecipeError
 from me2e_compress.quantization.decision import Decision
-from me2e_compress.quantization.plan import make_plan
 from me2e_compress.quantization.rules import RULE_SETS
 from me2e_compress.quantization.scheme import QuantScheme
 from tests.nets import MODULES, by_output, net, planned
@@ -320,45 +319,3 @@ def test_layers_that_see_the_status_alone_stay_float(
 ) -> None:
     assert rules(32, "safe")[output] == rule, why
     assert rules(1, "safe")["e"] == "layer"  # without sensors there is no status
-
-
-def test_other_rules_flag_it() -> None:
-    found = decisions(32, "paper")
-
-    flagged = {name: each for name, each in found.items() if each.borderline}
-    assert set(flagged) == {"e", "f"}
-    assert all(each.dtype == "int8" for each in flagged.values())
-    assert "ego-input: encodes the ego status can_bus" in flagged["e"].borderline
-    assert "rules safe keep it float" in flagged["e"].borderline
-
-
-# What is close about an attention that a rule keeps, or does not keep, in float.
-
-
-@pytest.mark.parametrize(
-    ("queries", "keys", "remark"),
-    [
-        (512, 300, "close to the limit of 512"),
-        (300, 530, "close to the limit of 512"),
-        (576, 576, "close to the limit of 512"),
-        (448, 448, "close to the limit of 512"),
-        (901, 300, "one within the limit of 512, one beyond"),
-        (512, 577, "one within the limit of 512, one beyond"),
-        (513, 577, ""),
-        (447, 447, ""),
-        (300, 300, ""),
-        (900, 900, ""),
-    ],
-)
-def test_borderline_attention_is_reported(queries: int, keys: int, remark: str) -> None:
-    text = (
-        f"a (float[{queries},32] q, float[32,{keys}] k, float[{keys},32] v)"
-        f" => (float[{queries},32] y)"
-        " { s = MatMul(q, k) p = Softmax(s) y = MatMul(p, v) }"
-    )
-    plan = make_plan(net(text, {}), HEAD, RULE_SETS.parse("safe"))
-
-    assert [remark in each.borderline for each in plan.decisions] == [
-        True, not remark, True,
-    ]  # fmt: skip
-    assert len(plan.borderline) == (2 if remark else 0)

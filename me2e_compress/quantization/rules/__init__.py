@@ -191,10 +191,6 @@ class Rule(abc.ABC):
         """
         return {}
 
-    def borderline(self, node: ir.Node, facts: RuleFacts) -> str | None:
-        """Return what is close about a node, if anything, on either side."""
-        return None
-
     def __str__(self) -> str:
         """Return its text, as rule sets name it."""
         return RULES.text(self)

@@ -133,23 +133,6 @@ class AttentionLength(Rule):
             return None
         return f"attention of {queries} queries and {keys} keys, more than {self.limit}"
 
-    def borderline(self, node: ir.Node, facts: RuleFacts) -> str | None:
-        """Return what is close about a node: a reader may want to decide it otherwise.
-
-        Close is within an eighth of the limit; or only one of queries and keys beyond
-        it, so that tools which look at one of the two decide otherwise.
-        """
-        attention = facts.attention.get(node)
-        if attention is None or attention.queries is None or attention.keys is None:
-            return None
-        sizes = f"{attention.queries} queries, {attention.keys} keys"
-        longest = max(attention.queries, attention.keys)
-        if abs(longest - self.limit) <= self.limit // 8:
-            return f"{sizes}: close to the limit of {self.limit}"
-        if min(attention.queries, attention.keys) <= self.limit < longest:
-            return f"{sizes}: one within the limit of {self.limit}, one beyond"
-        return None
-
 
 LEAST_READ = 2**16
 """Weights of a product of one row that int8 reads no faster: overheads are as long."""
