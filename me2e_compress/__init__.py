@@ -60,7 +60,6 @@ if TYPE_CHECKING:  # what a type checker sees; at run time names load when asked
     from me2e_compress.workflows.options import CalibrateOptions as CalibrateOptions
     from me2e_compress.workflows.options import CompareOptions as CompareOptions
     from me2e_compress.workflows.options import CompressOptions as CompressOptions
-    from me2e_compress.workflows.options import EerOptions as EerOptions
     from me2e_compress.workflows.options import EvaluateOptions as EvaluateOptions
     from me2e_compress.workflows.options import FramesOptions as FramesOptions
     from me2e_compress.workflows.options import GraphOptions as GraphOptions
@@ -108,7 +107,7 @@ _ROOMS = {
     "workflows.inspect": "InspectResult inspect",
     "workflows.lint": "LintResult lint",
     "workflows.options": (
-        "CalibrateOptions CompareOptions CompressOptions EerOptions "
+        "CalibrateOptions CompareOptions CompressOptions "
         "EvaluateOptions FramesOptions GraphOptions InspectOptions LintOptions "
         "PlanOptions ProfileOptions SearchOptions SensitivityOptions WriteOptions"
     ),

@@ -8,8 +8,8 @@ from me2e_compress.errors import OptionError
 from me2e_compress.extras import need_extra
 from me2e_compress.metrics import BUDGET_MS
 from me2e_compress.workflows.options import (
-    EerOptions,
     EvaluateOptions,
+    Joules,
     RoutesOptions,
     WorkerOptions,
     WriteOptions,
@@ -60,7 +60,7 @@ def evaluate(
 def score(
     *results: Path,
     metrics: Path | None = None,
-    eer: EerOptions | None = None,
+    joules: Joules | None = None,
     budget_ms: float = BUDGET_MS,
 ) -> None:
     """Print driving score, success rate, efficiency, comfort and abilities.
@@ -71,6 +71,7 @@ def score(
     Args:
         results: folders of results, ours or Bench2Drive's
         metrics: a folder of metric_info.json apart from RESULTS
+        joules: NAME=JOULES or NAME=FILE: of an inference; gives EER_AV
         budget_ms: what a decision may take; 20 Hz: 50
     """
     from me2e_compress.workflows.score import score as workflow
@@ -82,7 +83,7 @@ def score(
             *results,
             listener=listener,
             real_metrics=metrics,
-            eer=eer,
+            joules=joules,
             budget_ms=budget_ms,
         )
     show(result)

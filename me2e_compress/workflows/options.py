@@ -443,21 +443,3 @@ class RoutesOptions(WriteOptions):
         check_count("--seed", self.seed)
         check_count("--variants", self.variants, least=1)
         check_count("--workers", self.workers, least=1)
-
-
-@Parameter(name="*")
-@dataclasses.dataclass(frozen=True)
-class EerOptions:
-    """The inputs of EER_AV besides the episodes."""
-
-    energy: Joules = dataclasses.field(default_factory=dict)
-    """NAME=JOULES or NAME=FILE: of an inference; gives EER_AV"""
-    weights: File | None = None
-    """file of weights: of EER_AV, as --save-weights wrote them"""
-    save_weights: File | None = None
-    """JSON of the weights of EER_AV"""
-
-    @property
-    def asked(self) -> bool:
-        """Whether there is anything to do."""
-        return bool(self.energy or self.weights or self.save_weights)

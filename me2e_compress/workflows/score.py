@@ -25,7 +25,7 @@ from me2e_compress.metrics.scores import (
     Scores,
     leaderboard_scores,
 )
-from me2e_compress.workflows.options import EerOptions, check_budget
+from me2e_compress.workflows.options import Joules, check_budget
 from me2e_compress.workflows.result import SILENT, Listener, Result, Shown
 from me2e_compress.workflows.score_eer import EerScores, estimate_cells, score_eer
 
@@ -258,14 +258,15 @@ def score(
     *results: str | Path,
     listener: Listener = SILENT,
     real_metrics: str | Path | None = None,
-    eer: EerOptions | None = None,
+    joules: Joules | None = None,
     budget_ms: float = BUDGET_MS,
 ) -> ScoreResult:
     """Score the episodes in folders that ``evaluate`` or real Bench2Drive runs left.
 
-    The listener is told of damaged files, which are left out; `eer` holds the folders'
-    joules, for EER_AV of all of them together; `real_metrics` a folder of recordings of
-    real runs (``metric_info.json``) that do not lie below their results.
+    The listener is told of damaged files, which are left out. With `joules`, a number
+    or a file by folder, EER_AV of all folders together is scored too. `real_metrics` is
+    a folder of recordings of real runs (``metric_info.json``) that do not lie below
+    their results.
 
     Raises:
         EvaluationError: A folder holds no results, EER_AV cannot compare the folders,
@@ -305,7 +306,7 @@ def score(
         for name, episodes in driven.items()
         if (found := charged(episodes, budget_ms, measured.get(name))) is not None
     }
-    return ScoreResult(scores, runs, score_eer(driven, eer or EerOptions()), late)
+    return ScoreResult(scores, runs, score_eer(driven, joules or {}), late)
 
 
 def _episodes(folder: ResultsFolder, listener: Listener) -> tuple[Episode, ...]:

@@ -3,9 +3,7 @@
 import dataclasses
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any, Literal
-
-from pydantic import ConfigDict, Field, TypeAdapter, with_config
+from typing import Any
 
 from me2e_compress.display import (
     Table,
@@ -19,7 +17,6 @@ from me2e_compress.errors import EvaluationError
 from me2e_compress.metrics.eer import (
     MEASURES,
     EerResult,
-    EerScale,
     RouteMeasures,
     eer,
     route_measures,
@@ -27,68 +24,8 @@ from me2e_compress.metrics.eer import (
 from me2e_compress.metrics.episode import Episode
 from me2e_compress.metrics.measure import Estimate
 from me2e_compress.metrics.route_summary import RouteSummary
-from me2e_compress.registry import documents, drafts
-from me2e_compress.runtime.atomic import write_json
 from me2e_compress.runtime.energy import EnergyResult
-from me2e_compress.workflows.options import EerOptions, Joules
-
-_STRICT = ConfigDict(allow_inf_nan=False, extra="forbid")
-_Four = Annotated[dict[str, float], Field(min_length=4, max_length=4)]
-
-
-@with_config(_STRICT)
-@dataclasses.dataclass(frozen=True)
-class SavedWeights:
-    """A scale by the names of the measures; its joules are measured."""
-
-    energy: Literal["measured"]
-    normalization: Literal["min-max"]
-    weights: _Four
-    offset: _Four
-    span: _Four
-
-    @classmethod
-    def of(cls, scale: EerScale) -> "SavedWeights":
-        """Build the saved form of a scale."""
-        columns = (scale.weights, scale.offset, scale.span)
-        named = [dict(zip(MEASURES, each, strict=True)) for each in columns]
-        return cls("measured", "min-max", *named)
-
-    @classmethod
-    def load(cls, path: Path) -> "SavedWeights":
-        """Read a file that `save` wrote."""
-        with documents.reading(path, EvaluationError, "no file of weights"):
-            found = _FILE.validate_python(documents.from_json(documents.content(path)))
-        # the form alone does not say which names there must be, or their signs
-        for column in (found.weights, found.offset, found.span):
-            if set(column) != set(MEASURES):
-                names = ", ".join(MEASURES)
-                raise EvaluationError(f"{path}: it must name {names}")
-        if min(found.span.values()) <= 0.0 or min(found.weights.values()) < 0.0:
-            raise EvaluationError(f"{path}: a span or a weight is not positive")
-        return found
-
-    def scale(self) -> EerScale:
-        """Return the scale as `metrics.eer` takes it."""
-        weights, offset, span = (
-            (each[MEASURES[0]], each[MEASURES[1]], each[MEASURES[2]], each[MEASURES[3]])
-            for each in (self.weights, self.offset, self.span)
-        )
-        return EerScale(weights, offset, span)
-
-
-def save_weights(path: Path, result: EerResult) -> None:
-    """Write the scale that a result was made by."""
-    if result.scale is None:
-        reason = next(iter(result.scores.values())).measure.reason
-        raise EvaluationError(f"{path}: there are no weights to save: {reason}")
-    saved = SavedWeights.of(result.scale)
-    with drafts.written(path, EvaluationError):
-        write_json(path, dataclasses.asdict(saved), indent=1)
-
-
-_FILE = TypeAdapter(SavedWeights)
-
+from me2e_compress.workflows.options import Joules
 
 UNITS = ("%", "%", "ratio", "J")
 
@@ -138,37 +75,35 @@ class EerScores:
     def to_json(self) -> dict[str, Any]:
         """Return scores, scale and routes left out."""
         found = self.found
+        columns = {} if found.scale is None else dataclasses.asdict(found.scale)
+        scale = {
+            n: dict(zip(MEASURES, each, strict=True)) for n, each in columns.items()
+        }
         return {
             "scores": {n: each.to_json() for n, each in found.scores.items()},
-            "scale": found.scale and dataclasses.asdict(SavedWeights.of(found.scale)),
+            "scale": scale or None,
             "left_out": dict(found.left_out),
         }
 
 
 def score_eer(
-    folders: Mapping[str, Sequence[Episode]], options: EerOptions
+    folders: Mapping[str, Sequence[Episode]], joules: Joules
 ) -> EerScores | None:
-    """Return EER_AV of folders that hold the same routes; None if not asked for.
+    """Return EER_AV of folders that hold the same routes; None without any joules.
 
     Raises:
-        EvaluationError: Routes differ, joules are of no folder, or weights are not
-            usable.
+        EvaluationError: Routes differ, or joules are of no folder.
         EnergyError: A file of joules is not usable.
     """
-    if not options.asked:
+    if not joules:
         return None
-    scale = None
-    if options.weights is not None:
-        scale = SavedWeights.load(Path(options.weights)).scale()
     paired, others = paired_drives(folders)
-    variants = _variants(paired, options.energy)
+    variants = _variants(paired, joules)
     types = [episode.scenario for episode in next(iter(paired.values()), ())]
-    found = eer(variants, scale, types=types)
+    found = eer(variants, types=types)
     if others:
         left_out = {UNPAIRED: others, **found.left_out}
         found = dataclasses.replace(found, left_out=left_out)
-    if options.save_weights is not None:
-        save_weights(Path(options.save_weights), found)
     return EerScores(found)
 
 

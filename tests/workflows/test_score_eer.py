@@ -1,7 +1,6 @@
 """EER_AV of folders: whose joules, whose weights, and what cannot be compared."""
 
 import dataclasses
-import json
 import re
 from pathlib import Path
 
@@ -18,7 +17,7 @@ from me2e_compress.metrics.episode import (
 )
 from me2e_compress.runtime.energy import EnergyResult
 from me2e_compress.simulator.routes import ROAD_VERSION, VERSION
-from me2e_compress.workflows.options import EerOptions
+from me2e_compress.workflows.options import Joules
 from me2e_compress.workflows.score_eer import score_eer
 from tests.command import Cli
 from tests.metrics.drives import cruise, drive, infraction
@@ -46,7 +45,7 @@ FOLDERS = {
 
 
 def test_every_folder_has_a_score_by_its_own_joules() -> None:
-    found = score_eer(FOLDERS, EerOptions({"fast": 2.0, "runs/slow": 3.0}))
+    found = score_eer(FOLDERS, {"fast": 2.0, "runs/slow": 3.0})
 
     assert found is not None
     scale = found.found.scale
@@ -61,51 +60,16 @@ def test_joules_come_from_a_file(tmp_path: Path) -> None:
     file = tmp_path / "energy.json"
     EnergyResult(6.0, 3, 2.0, low=1.5, high=2.5).save(file)
 
-    found = score_eer(FOLDERS, EerOptions({"fast": file, "slow": 3.0}))
-    given = score_eer(FOLDERS, EerOptions({"fast": 2.0, "slow": 3.0}))
+    found = score_eer(FOLDERS, {"fast": file, "slow": 3.0})
+    given = score_eer(FOLDERS, {"fast": 2.0, "slow": 3.0})
 
     assert found is not None
     assert given is not None
     assert found.to_json() == given.to_json()
-    assert score_eer(FOLDERS, EerOptions()) is None
+    assert score_eer(FOLDERS, {}) is None
     file.write_text("{}")
     with pytest.raises(EnergyError, match=r"energy\.json: not an energy file"):
-        score_eer(FOLDERS, EerOptions({"fast": file}))
-
-
-def test_weights_are_saved_and_used_again(tmp_path: Path) -> None:
-    joules, file = {"fast": 2.0, "slow": 3.0}, tmp_path / "weights.json"
-    first = score_eer(FOLDERS, EerOptions(joules, save_weights=file))
-    alone = {"runs/slow": FOLDERS["runs/slow"]}
-    again = score_eer(alone, EerOptions({"slow": 3.0}, weights=file))
-
-    assert first is not None
-    assert again is not None
-    there, here = (each.found.scores["runs/slow"] for each in (first, again))
-    assert here.value == pytest.approx(there.value)
-
-
-@pytest.mark.parametrize(
-    ("key", "value", "said"),
-    [
-        ("span", {"energy": 0.0}, "a span or a weight is not positive"),
-        ("weights", {"joy": 1.0}, "weights: Dictionary should have at most 4"),
-        ("energy", "modelled", "energy: Input should be 'measured'"),
-        ("normalization", "z-score", "normalization: Input should be 'min-max'"),
-    ],
-)
-def test_spoiled_weights_are_one_line(
-    tmp_path: Path, key: str, value: object, said: str
-) -> None:
-    file = tmp_path / "weights.json"
-    joules = {"fast": 2.0, "slow": 3.0}
-    score_eer(FOLDERS, EerOptions(joules, save_weights=file))
-    record = json.loads(file.read_text())
-    spoiled = {**record[key], **value} if isinstance(value, dict) else value
-    file.write_text(json.dumps({**record, key: spoiled}))
-
-    with pytest.raises(EvaluationError, match=re.escape(said)):
-        score_eer(FOLDERS, EerOptions(joules, weights=file))
+        score_eer(FOLDERS, {"fast": file})
 
 
 def test_what_one_real_run_lacks_is_left_out_of_all() -> None:
@@ -116,7 +80,7 @@ def test_what_one_real_run_lacks_is_left_out_of_all() -> None:
     }
     real["runs/slow"].append(dataclasses.replace(real["runs/slow"][0], route="c"))
 
-    found = score_eer(real, EerOptions({"fast": 2.0, "slow": 3.0}))
+    found = score_eer(real, {"fast": 2.0, "slow": 3.0})
 
     assert found is not None
     assert found.found.left_out == {"a drive in each": 1}
@@ -124,30 +88,29 @@ def test_what_one_real_run_lacks_is_left_out_of_all() -> None:
 
 
 @pytest.mark.parametrize(
-    ("options", "said"),
+    ("joules", "said"),
     [
-        (EerOptions({"other": 2.0}), "energy of other: 0 folders of that name"),
-        (EerOptions({"fast": -1.0}), "energy of fast: -1.0 is not a number of joules"),
-        (EerOptions({"fast": float("nan")}), "nan is not a number of joules"),
-        (EerOptions(weights="no.json"), "no.json: No such file"),
+        ({"other": 2.0}, "energy of other: 0 folders of that name"),
+        ({"fast": -1.0}, "energy of fast: -1.0 is not a number of joules"),
+        ({"fast": float("nan")}, "nan is not a number of joules"),
     ],
 )
-def test_what_cannot_be_used_is_named(options: EerOptions, said: str) -> None:
+def test_what_cannot_be_used_is_named(joules: Joules, said: str) -> None:
     with pytest.raises(EvaluationError, match=re.escape(said)):
-        score_eer(FOLDERS, options)
+        score_eer(FOLDERS, joules)
 
 
 def test_other_routes_cannot_be_compared() -> None:
     mixed = {**FOLDERS, "runs/short": FOLDERS["runs/fast"][:1]}
 
     with pytest.raises(EvaluationError, match="runs/short: route b is in one of"):
-        score_eer(mixed, EerOptions({"fast": 2.0}))
+        score_eer(mixed, {"fast": 2.0})
 
 
 def test_joules_by_name() -> None:
     words = ["score", "runs", "--joules", "a=1.5", "--joules", "runs/b=e=2.json"]
     _, bound, _ = app.parse_args(words)
-    found = bound.arguments["eer"].energy
+    found = bound.arguments["joules"]
 
     assert found == {"a": 1.5, "runs/b=e": "2.json"}
 
