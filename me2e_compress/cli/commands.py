@@ -105,8 +105,6 @@ def export(stack: str, /, *, output: Output, writing: WriteOptions = WRITING) ->
 def inspect(model: str, /, *, options: InspectOptions | None = None) -> None:
     """Show what a graph holds: interface, and nodes, parameters, MACs by module.
 
-    With --trace also each module's share of the time of a frame.
-
     Args:
         model: the ONNX file, or highway; not changed
     """

@@ -1,4 +1,4 @@
-"""Inspect a graph: interface; nodes, parameters, MACs and time by module."""
+"""Inspect a graph: interface; nodes, parameters and MACs by module."""
 
 import dataclasses
 from collections import Counter
@@ -12,7 +12,7 @@ import pydantic
 from me2e_compress import graph
 from me2e_compress.display import giga, megabytes, number, table
 from me2e_compress.driving.adapter.outputs import adapted
-from me2e_compress.errors import EvaluationError, GraphError
+from me2e_compress.errors import GraphError
 from me2e_compress.graph import provenance
 from me2e_compress.graph.modules.assign import Item, assign, itemise
 from me2e_compress.graph.modules.module_map import ModuleMap
@@ -30,7 +30,6 @@ from me2e_compress.passes import Context
 from me2e_compress.passes.fix_shapes import FixShapes, open_dimensions
 from me2e_compress.passes.freeze_inputs import advice
 from me2e_compress.registry.documents import MalformedError, from_json
-from me2e_compress.runtime.latency_trace import LatencyTrace, shares
 from me2e_compress.shipped.drivers import SHIPPED
 from me2e_compress.workflows.checks import lacking_shapes, load_map, model_path
 from me2e_compress.workflows.options import InspectOptions
@@ -56,7 +55,6 @@ class InspectResult(Result):
         hint: what the graph lacks; empty if nothing.
         recurrent: outputs that are fed back, by input.
         weights: the checkpoint that its metadata names; or empty.
-        latency_of: what the shares of time are of; empty if not measured.
     """
 
     file: str
@@ -76,7 +74,6 @@ class InspectResult(Result):
     hint: str = ""
     recurrent: dict[str, str] = dataclasses.field(default_factory=dict)
     weights: str = ""
-    latency_of: str = ""
 
     def shown(self) -> Shown:
         """Return the interface, the modules, what is lacking and the checkpoint."""
@@ -97,20 +94,16 @@ class InspectResult(Result):
                 megabytes(item.weight_bytes),
                 giga(item.macs, item.unknown_macs_nodes, ".3f"),
                 _activations(item),
-                *self._share(item),
             )
             for item in self.modules
         ]
-        # notes below the tables: placement, total MACs, time, recurrence
+        # notes below the tables: placement, total MACs, recurrence
         rules = ", ".join(f"{count} by {rule}" for rule, count in self.rules.items())
         note = f"nodes placed: {rules}\nGMACs in all: {self._total_macs()}"
-        if self.latency_of:
-            note += f"\nshare of a frame's time: {self.latency_of}"
         pairs = [f"{to} as {name}" for name, to in self.recurrent.items()]
         back = f"fed back: {', '.join(pairs)}" if pairs else ""
         counts = ("nodes", "parameters", "MB", "GMACs", "activations MB")
-        # the column of time is only there if it was measured
-        columns = ("module", *counts, *(("time",) if self.latency_of else ()))
+        columns = ("module", *counts)
         return Shown(
             headline,
             (
@@ -119,12 +112,6 @@ class InspectResult(Result):
             ),
             filter(None, (self.hint, headline, self.weights)),
         )
-
-    def _share(self, item: Item) -> tuple[str, ...]:
-        if not self.latency_of:
-            return ()
-        share = item.latency_share
-        return ("-" if share is None else f"{share:.1%}",)
 
     def _total_macs(self) -> str:
         total = giga(self.macs, 0, ".3f")
@@ -150,23 +137,17 @@ def _activations(item: Item) -> str:
 
 
 def _with_costs(
-    items: Iterable[Item],
-    costs: Mapping[str, Item],
-    folded: ir.Model,
-    trace: LatencyTrace | None,
+    items: Iterable[Item], costs: Mapping[str, Item], folded: ir.Model
 ) -> tuple[Item, ...]:
-    """Return items with MACs, bytes that nodes write, and shares of a frame's time.
+    """Return items with MACs, and bytes that nodes write.
 
-    The graph `folded` is imported, with shapes inferred. Time between nodes, or of
-    nodes without a module, counts for no module: the shares need not add up to 1.
+    The graph `folded` is imported, with shapes inferred.
     """
     known, unknown = Counter[str](), Counter[str]()
     for node in folded.graph:
         size, module = activation_bytes(node), provenance.module_of(node)
         known[module] += size or 0
         unknown[module] += size is None
-    timed = () if trace is None else shares(trace.modules_us)
-    times = {each.name: each.share for each in timed}
     # bytes are None where no node of a module tells them
     return tuple(
         dataclasses.replace(
@@ -177,22 +158,9 @@ def _with_costs(
             if known[item.module] or not unknown[item.module]
             else None,
             unknown_activation_nodes=unknown[item.module],
-            latency_share=times.get(item.module),
         )
         for item in items
     )
-
-
-def trace_of(path: str | Path, model: Path) -> LatencyTrace:
-    """Read a trace; it must be by module, and of this very model."""
-    trace = LatencyTrace.load(Path(path))
-    if trace.model_sha256 != graph.sha256_of(model):
-        raise EvaluationError(f"{path}: a trace of another model than {model.name}")
-    if not trace.modules_us:
-        raise EvaluationError(
-            f"{path}: has no times by module: profile {model.name} with --by-module"
-        )
-    return trace
 
 
 RECORD = "me2e.weights"
@@ -245,10 +213,8 @@ def inspect(model: str | Path, options: InspectOptions | None = None) -> Inspect
         GraphError: The model does not exist.
         PreconditionError: No input has such a dimension.
         ModuleMapError: The map does not exist.
-        EvaluationError: The trace is of another model, or not by module.
     """
     options, path = options or InspectOptions(), model_path(model)
-    taken = None if options.trace is None else trace_of(options.trace, path)
     loaded = graph.load(path)
     adapted(loaded, options.adapter, options.module_map)
     modules = load_map(options.module_map, loaded)
@@ -261,7 +227,7 @@ def inspect(model: str | Path, options: InspectOptions | None = None) -> Inspect
     # MACs and activations need shapes, and folded shape arithmetic
     folded = _folded(loaded, modules)
     costs = {item.module: item for item in _costs(folded, modules)}
-    items = _with_costs(items, costs, folded, taken)
+    items = _with_costs(items, costs, folded)
     # say what is unknown, and why
     count, fed_back, wrong = macs_counter(folded), dict[str, str](), ""
     uncounted = [node for node in folded.graph.all_nodes() if count(node) is None]
@@ -292,7 +258,6 @@ def inspect(model: str | Path, options: InspectOptions | None = None) -> Inspect
         "; ".join(filter(None, hints)),
         fed_back,
         weights=named_weights(loaded.metadata_props),
-        latency_of="" if taken is None else taken.headline,
     )
 
 

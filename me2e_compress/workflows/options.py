@@ -188,8 +188,6 @@ class InspectOptions(MapOptions, AdapterOptions):
 
     dims: Sizes = dataclasses.field(default_factory=dict)
     """size of an open dimension: batch=1; once for each"""
-    trace: File | None = None
-    """latencies by module, of profile --by-module"""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -1,13 +1,11 @@
-"""``inspect``: modules, costs, shares of time, and what a file says of itself."""
+"""``inspect``: modules, costs, and what a file says of itself."""
 
-import dataclasses
 from pathlib import Path
 
 import onnx_ir as ir
 import pytest
 
 from me2e_compress import graph
-from me2e_compress.runtime.latency_trace import LatencyTrace
 from tests.command import Cli
 from tests.graph.test_opset import written
 from tests.nets import conv_attention, save_text
@@ -28,7 +26,6 @@ def test_nodes_are_counted_by_module(cli: Cli, files: Path) -> None:
     parts = modules(cli)
     assert parts["backbone"]["activation_bytes"] == 16
     assert parts["backbone"]["unknown_activation_nodes"] == 0
-    assert {each["latency_share"] for each in parts.values()} == {None}  # not made up
 
 
 @pytest.mark.parametrize(
@@ -91,46 +88,6 @@ def test_a_plugin_s_macs_are_unknown_and_a_sum_is_a_lower_bound(
     assert costs == known
     assert (found["macs"], found["unknown_macs_nodes"]) == (2_000_000_000, 1)
     assert "at least 2.000, 1 node not counted" in cli.done(IN).out
-
-
-@pytest.fixture
-def trace(files: Path) -> LatencyTrace:
-    """One of in.onnx, which is saved as t.json."""
-    made = LatencyTrace(
-        graph.sha256_of(files / "in.onnx"),
-        "a machine",
-        (40, 60),
-        modules_us={"backbone": (30, 30), "occ": (20, 10), "(between nodes)": (5, 5)},
-    )
-    made.save(files / "t.json")
-    return made
-
-
-@pytest.mark.usefixtures("trace")
-def test_shares_of_the_time_come_from_a_trace(cli: Cli, files: Path) -> None:
-    found = modules(cli, f"{IN} --trace t.json")
-
-    assert found["backbone"]["latency_share"] == pytest.approx(0.6)
-    assert found["occ"]["latency_share"] == pytest.approx(0.3)
-    assert found["planner"]["latency_share"] is None
-    shown = cli.done(f"{IN} --trace t.json").words
-    assert "60.0%" in shown
-    assert "share of a frame's time: 2 inferences on a machine" in shown
-
-
-@pytest.mark.parametrize(
-    ("change", "said"),
-    [
-        ({"model_sha256": "0"}, "a trace of another model than in.onnx"),
-        ({"modules_us": {}}, "no times by module: profile in.onnx with --by-module"),
-    ],
-)
-def test_a_trace_that_does_not_fit_is_one_line(
-    cli: Cli, files: Path, trace: LatencyTrace, change: dict[str, object], said: str
-) -> None:
-    dataclasses.replace(trace, **change).save(files / "t.json")  # type: ignore[arg-type]
-
-    assert said in cli.refused("inspect in.onnx --trace t.json")
 
 
 def test_open_dimensions_are_shown_with_what_they_cost_until_they_have_a_size(

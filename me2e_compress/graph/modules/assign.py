@@ -380,7 +380,6 @@ class Item:
         unknown_macs_nodes: number of its nodes that are not in ``macs``.
         activation_bytes: that its nodes write in a frame; bounded like ``macs``.
         unknown_activation_nodes: number of its nodes that are not in these.
-        latency_share: share of a frame's time; 0 to 1, None if nobody measured.
     """
 
     module: str
@@ -391,7 +390,6 @@ class Item:
     unknown_macs_nodes: int | None
     activation_bytes: int | None = None
     unknown_activation_nodes: int | None = None
-    latency_share: float | None = None
 
 
 def itemise(
