@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable
 
 import onnx_ir as ir
 
-from me2e_compress.graph.nodes import VIEWS, input_at, is_plugin, nodes_in, nodes_inside
+from me2e_compress.graph.nodes import input_at, is_plugin, nodes_in, nodes_inside
 from me2e_compress.graph.shapes import knowledge, static_shape
 
 Counter = Callable[[ir.Node], int | None]
@@ -268,13 +268,6 @@ def weight_bytes(model: ir.Model) -> int:
     )
 
 
-# What nodes write in a frame: the bytes of activations as they lie in memory.
-
-
-_WRITE_NOTHING = VIEWS | {"Constant", "DequantizeLinear"}
-"""They hand on what lies there, or are part of what reads them."""
-
-
 def value_bytes(value: ir.Value) -> int | None:
     """Return the bytes of a value; None where its shape or type is open, or of text."""
     if value.const_value is not None:
@@ -290,35 +283,3 @@ def total_bytes(values: Iterable[ir.Value]) -> int | None:
     sizes = [value_bytes(value) for value in values]
     known = [size for size in sizes if size is not None]
     return sum(known) if len(known) == len(sizes) else None
-
-
-def as_written(value: ir.Value) -> ir.Value:
-    """Return what lies in memory of what a node gives.
-
-    That are the integers, where nothing but a QuantizeLinear reads it: runtimes do both
-    at once.
-    """
-    readers = [use.node for use in value.uses()]
-    if readers and all(each.op_type == "QuantizeLinear" for each in readers):
-        return readers[0].outputs[0]
-    return value
-
-
-def activation_bytes(node: ir.Node) -> int | None:
-    """Return the bytes that a node writes in a frame.
-
-    Reshapes and the like write none; nor does a DequantizeLinear, and a QuantizeLinear
-    only where the maker of what it reads wrote floats.
-
-    Returns:
-        None where the shape of something is open.
-    """
-    if node.op_type in _WRITE_NOTHING:
-        return 0
-    source = node.inputs[0] if node.op_type == "QuantizeLinear" else None
-    before = None if source is None else source.producer()
-    if source is not None and before is not None:
-        written = as_written(source) is node.outputs[0]
-        if written and before.op_type not in _WRITE_NOTHING:
-            return 0
-    return total_bytes(as_written(value) for value in node.outputs if value.name)

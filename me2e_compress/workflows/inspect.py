@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -19,12 +19,7 @@ from me2e_compress.graph.modules.module_map import ModuleMap
 from me2e_compress.graph.nodes import is_read
 from me2e_compress.graph.opset import read_as
 from me2e_compress.graph.recurrence import recurrent_inputs
-from me2e_compress.graph.summary import (
-    Port,
-    activation_bytes,
-    macs_counter,
-    why_uncounted,
-)
+from me2e_compress.graph.summary import Port, macs_counter, why_uncounted
 from me2e_compress.manager import PassManager, recipe
 from me2e_compress.passes import Context
 from me2e_compress.passes.fix_shapes import FixShapes, open_dimensions
@@ -93,7 +88,6 @@ class InspectResult(Result):
                 number(item.parameters),
                 megabytes(item.weight_bytes),
                 giga(item.macs, item.unknown_macs_nodes, ".3f"),
-                _activations(item),
             )
             for item in self.modules
         ]
@@ -102,8 +96,7 @@ class InspectResult(Result):
         note = f"nodes placed: {rules}\nGMACs in all: {self._total_macs()}"
         pairs = [f"{to} as {name}" for name, to in self.recurrent.items()]
         back = f"fed back: {', '.join(pairs)}" if pairs else ""
-        counts = ("nodes", "parameters", "MB", "GMACs", "activations MB")
-        columns = ("module", *counts)
+        columns = ("module", "nodes", "parameters", "MB", "GMACs")
         return Shown(
             headline,
             (
@@ -127,40 +120,6 @@ class InspectResult(Result):
         return (
             f"{known}{number(self.unknown_macs_nodes)} {nodes} not counted: {why}{ways}"
         )
-
-
-def _activations(item: Item) -> str:
-    if item.activation_bytes is None:
-        return "-"
-    least = "at least " if item.unknown_activation_nodes else ""
-    return f"{least}{megabytes(item.activation_bytes)}"
-
-
-def _with_costs(
-    items: Iterable[Item], costs: Mapping[str, Item], folded: ir.Model
-) -> tuple[Item, ...]:
-    """Return items with MACs, and bytes that nodes write.
-
-    The graph `folded` is imported, with shapes inferred.
-    """
-    known, unknown = Counter[str](), Counter[str]()
-    for node in folded.graph:
-        size, module = activation_bytes(node), provenance.module_of(node)
-        known[module] += size or 0
-        unknown[module] += size is None
-    # bytes are None where no node of a module tells them
-    return tuple(
-        dataclasses.replace(
-            item,
-            macs=costs.get(item.module, item).macs,
-            unknown_macs_nodes=costs.get(item.module, item).unknown_macs_nodes,
-            activation_bytes=known[item.module]
-            if known[item.module] or not unknown[item.module]
-            else None,
-            unknown_activation_nodes=unknown[item.module],
-        )
-        for item in items
-    )
 
 
 RECORD = "me2e.weights"
@@ -203,6 +162,13 @@ def named_weights(metadata: Mapping[str, str]) -> str:
     return record.line()
 
 
+def _with_macs(item: Item, costs: Mapping[str, Item]) -> Item:
+    """Return a module of the file with the MACs of the folded graph."""
+    cost = costs.get(item.module, item)
+    unknown = cost.unknown_macs_nodes
+    return dataclasses.replace(item, macs=cost.macs, unknown_macs_nodes=unknown)
+
+
 _SHAPES = "import-normalize,fold-constants{through_compute=false}"
 
 
@@ -224,10 +190,10 @@ def inspect(model: str | Path, options: InspectOptions | None = None) -> Inspect
     placed = assign(loaded, modules)
     inputs, outputs = graph.interface(loaded)
     items = itemise(loaded, modules, placed.module_of)
-    # MACs and activations need shapes, and folded shape arithmetic
+    # MACs need shapes, and folded shape arithmetic
     folded = _folded(loaded, modules)
     costs = {item.module: item for item in _costs(folded, modules)}
-    items = _with_costs(items, costs, folded)
+    items = tuple(_with_macs(item, costs) for item in items)
     # say what is unknown, and why
     count, fed_back, wrong = macs_counter(folded), dict[str, str](), ""
     uncounted = [node for node in folded.graph.all_nodes() if count(node) is None]

@@ -378,8 +378,6 @@ class Item:
         macs: multiply-accumulates, those known: a lower bound if
             others are unknown, and then None instead of 0.
         unknown_macs_nodes: number of its nodes that are not in ``macs``.
-        activation_bytes: that its nodes write in a frame; bounded like ``macs``.
-        unknown_activation_nodes: number of its nodes that are not in these.
     """
 
     module: str
@@ -388,8 +386,6 @@ class Item:
     weight_bytes: int
     macs: int | None
     unknown_macs_nodes: int | None
-    activation_bytes: int | None = None
-    unknown_activation_nodes: int | None = None
 
 
 def itemise(
