@@ -25,7 +25,7 @@ from me2e_compress.metrics.scores import (
     Scores,
     leaderboard_scores,
 )
-from me2e_compress.workflows.options import Joules, check_budget
+from me2e_compress.workflows.options import check_budget
 from me2e_compress.workflows.result import SILENT, Listener, Result, Shown
 from me2e_compress.workflows.score_eer import EerScores, estimate_cells, score_eer
 
@@ -258,7 +258,7 @@ def score(
     *results: str | Path,
     listener: Listener = SILENT,
     real_metrics: str | Path | None = None,
-    joules: Joules | None = None,
+    joules: Mapping[str, str | Path | float] | None = None,
     budget_ms: float = BUDGET_MS,
 ) -> ScoreResult:
     """Score the episodes in folders that ``evaluate`` or real Bench2Drive runs left.
