@@ -27,6 +27,7 @@ from me2e_compress.operators.deformable_attention import DeformableAttention
 from me2e_compress.registry.drafts import PRODUCER
 from me2e_compress.shipped.drivers import write
 from me2e_compress.workflows.checks import writing
+from me2e_compress.workflows.inspect import WEIGHTS
 from me2e_compress.workflows.options import check_count
 from models.construct import construct, draw
 from models.dialect import in_dialect
@@ -100,7 +101,7 @@ def export(
     made = build(
         stack, opset=opset, seed=seed, heads=heads, fused=fused, weights=weights
     )
-    said = {} if weights is None else weights.record.metadata()
+    said = {WEIGHTS: "random"} if weights is None else weights.record.metadata()
     return save(trace(spec, made, opset), {**spec.metadata(), **said}, path)
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from me2e_compress.errors import GraphError
-from me2e_compress.workflows.inspect import RECORD, WeightsRecord
+from me2e_compress.workflows.inspect import WEIGHTS
 from models.construct import construct
 from models.published_names import PUBLISHED, Mismatch, NameMatch
 from models.stacks import Stack, find
@@ -19,16 +19,22 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class ReadWeights(WeightsRecord):
+class ReadWeights:
     """The checkpoint of a stack's weights, and what was not used of it.
 
     Attributes:
+        file: its name.
         averaged: whether its moving averages were taken.
         converted: number of tensors made float32, by old type.
         unread: names of omitted tensors; driving does not use them.
         averages: number of moving averages that were not used.
     """
 
+    file: str
+    sha256: str
+    epoch: int | None = None
+    iteration: int | None = None
+    averaged: bool = False
     converted: Mapping[str, int] = field(default_factory=dict)
     unread: Sequence[str] = ()
     averages: int = 0
@@ -36,11 +42,14 @@ class ReadWeights(WeightsRecord):
     def metadata(self) -> dict[str, str]:
         """Return the ONNX metadata property that names the checkpoint."""
         keys = ("file", "sha256", "epoch", "iteration", "averaged")
-        return {RECORD: json.dumps({key: getattr(self, key) for key in keys})}
+        return {WEIGHTS: json.dumps({key: getattr(self, key) for key in keys})}
 
     def lines(self) -> tuple[str, ...]:
         """Return the lines of a report."""
-        said = [self.line()]
+        counts = {"epoch": self.epoch, "iteration": self.iteration}
+        stated = [f"{key} {n}" for key, n in counts.items() if n is not None]
+        words = [f"weights: {self.file}", *stated, f"sha256 {self.sha256}"]
+        said = [", ".join(words)]
         for type_, count in self.converted.items():
             said.append(f"{count} tensors of {type_} converted to float32")
         # What was not used

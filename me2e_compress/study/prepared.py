@@ -25,7 +25,7 @@ from me2e_compress.targets.onnxruntime import slow_here
 from me2e_compress.version import __version__
 from me2e_compress.workflows.checks import try_first
 from me2e_compress.workflows.compress import beside, compress
-from me2e_compress.workflows.inspect import named_weights
+from me2e_compress.workflows.inspect import WEIGHTS
 from me2e_compress.workflows.options import CompressOptions
 from me2e_compress.workflows.result import Listener
 
@@ -99,7 +99,7 @@ def prepare_variant(
     if not variant.passes:
         origin = _reported_beside(model) or origin
     loaded = graph.load(model)
-    weights = named_weights(loaded.metadata_props)
+    weights = loaded.metadata_props.get(WEIGHTS, "")
     said = adapted(loaded, variant.adapter, variant.module_map)
     if slow := slow_here(loaded, study.provider):
         listener.on_warning(f"variant {variant.name}: {slow}")

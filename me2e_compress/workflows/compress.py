@@ -36,7 +36,7 @@ from me2e_compress.workflows.checks import (
     try_first,
     writing,
 )
-from me2e_compress.workflows.inspect import named_weights
+from me2e_compress.workflows.inspect import WEIGHTS
 from me2e_compress.workflows.int8_outcome import Int8Outcome
 from me2e_compress.workflows.lint import LintResult, lint_written
 from me2e_compress.workflows.measured_loss import (
@@ -90,8 +90,8 @@ class CompressResult(Result):
 
     @property
     def weights(self) -> str:
-        """The checkpoint that the graph was made from; empty if not known."""
-        return named_weights(self.report.model.metadata_props)
+        """What the metadata says of the graph's checkpoint; empty if nothing."""
+        return self.report.model.metadata_props.get(WEIGHTS, "")
 
     @property
     def size(self) -> str:
@@ -106,6 +106,7 @@ class CompressResult(Result):
         that the target refuses the graph or computes it otherwise.
         """
         headline = f"{self.output}: {self.size}; report: {self.report_path}"
+        weights = self.weights and f"weights: {self.weights}"
         time = f"took {self.seconds:.0f} CPU s"
         measured = None if self.loss is None else self.loss.table()
         if self.loss is not None and self.loss.fidelity is not None:
@@ -118,7 +119,7 @@ class CompressResult(Result):
         return Shown(
             headline,
             (*self.report.tables(), *filter(None, [measured])),
-            filter(None, (*self.verdict(), self.slower, time, headline, self.weights)),
+            filter(None, (*self.verdict(), self.slower, time, headline, weights)),
             (
                 *(() if self.loss is None else self.loss.alerts()),
                 *filter(None, ["" if self.int8 is None else self.int8.empty]),

@@ -3,11 +3,9 @@
 import dataclasses
 from collections import Counter
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 
 import onnx_ir as ir
-import pydantic
 
 from me2e_compress import graph
 from me2e_compress.display import giga, megabytes, number, table
@@ -24,11 +22,12 @@ from me2e_compress.manager import PassManager, recipe
 from me2e_compress.passes import Context
 from me2e_compress.passes.fix_shapes import FixShapes, open_dimensions
 from me2e_compress.passes.freeze_inputs import advice
-from me2e_compress.registry.documents import MalformedError, from_json
-from me2e_compress.shipped.drivers import SHIPPED
 from me2e_compress.workflows.checks import lacking_shapes, load_map, model_path
 from me2e_compress.workflows.options import InspectOptions
 from me2e_compress.workflows.result import Result, Shown
+
+WEIGHTS = "me2e.weights"
+"""Metadata key of what an exporter says of the checkpoint that it took."""
 
 _SHOWN = 8
 """Number of reasons for unknown MACs that are named."""
@@ -49,7 +48,7 @@ class InspectResult(Result):
         lowered: what was changed for onnxruntime; empty if nothing.
         hint: what the graph lacks; empty if nothing.
         recurrent: outputs that are fed back, by input.
-        weights: the checkpoint that its metadata names; or empty.
+        weights: what its metadata says of its checkpoint; or empty.
     """
 
     file: str
@@ -96,6 +95,7 @@ class InspectResult(Result):
         note = f"nodes placed: {rules}\nGMACs in all: {self._total_macs()}"
         pairs = [f"{to} as {name}" for name, to in self.recurrent.items()]
         back = f"fed back: {', '.join(pairs)}" if pairs else ""
+        weights = self.weights and f"weights: {self.weights}"
         columns = ("module", "nodes", "parameters", "MB", "GMACs")
         return Shown(
             headline,
@@ -103,7 +103,7 @@ class InspectResult(Result):
                 table("Interface", ("", "name", "type", "shape"), ports, back, words=4),
                 table(f"Modules (map {self.map})", columns, rows, note),
             ),
-            filter(None, (self.hint, headline, self.weights)),
+            filter(None, (self.hint, headline, weights)),
         )
 
     def _total_macs(self) -> str:
@@ -120,46 +120,6 @@ class InspectResult(Result):
         return (
             f"{known}{number(self.unknown_macs_nodes)} {nodes} not counted: {why}{ways}"
         )
-
-
-RECORD = "me2e.weights"
-"""Metadata key of the checkpoint that a graph was made from."""
-
-
-@dataclass(frozen=True)
-class WeightsRecord:
-    """The checkpoint of a graph's weights.
-
-    Attributes:
-        averaged: whether its moving averages were taken.
-    """
-
-    file: str
-    sha256: str
-    epoch: int | None = None
-    iteration: int | None = None
-    averaged: bool = False
-
-    def line(self) -> str:
-        """Return the line of a report."""
-        counts = {"epoch": self.epoch, "iteration": self.iteration}
-        stated = [f"{key} {n}" for key, n in counts.items() if n is not None]
-        return ", ".join([f"weights: {self.file}", *stated, f"sha256 {self.sha256}"])
-
-
-def named_weights(metadata: Mapping[str, str]) -> str:
-    """Return the line that names a graph's checkpoint or random weights, if known."""
-    text = metadata.get(RECORD)
-    if text is None:
-        stack = metadata.get("me2e.stack")
-        if stack is None or stack in SHIPPED:
-            return ""
-        return f"weights: random, as {stack} is exported: no {RECORD} names others"
-    try:
-        record = pydantic.TypeAdapter(WeightsRecord).validate_python(from_json(text))
-    except (MalformedError, pydantic.ValidationError):
-        return f"metadata {RECORD} is malformed"
-    return record.line()
 
 
 def _with_macs(item: Item, costs: Mapping[str, Item]) -> Item:
@@ -223,7 +183,7 @@ def inspect(model: str | Path, options: InspectOptions | None = None) -> Inspect
         read_as(loaded),
         "; ".join(filter(None, hints)),
         fed_back,
-        weights=named_weights(loaded.metadata_props),
+        weights=loaded.metadata_props.get(WEIGHTS, ""),
     )
 
 

@@ -10,7 +10,6 @@ import pytest
 import torch
 
 from me2e_compress.errors import GraphError
-from me2e_compress.workflows.inspect import named_weights
 from models.export import trace
 from models.published_names import PUBLISHED, NameMatch
 from models.published_weights import (
@@ -70,21 +69,6 @@ def test_the_graph_answers_as_the_original(tmp_path: Path, trained: Tcp) -> None
     }
     name = "perception.layer1.0.bn1.running_var"
     np.testing.assert_array_equal(held[name], trained.state_dict()[name])
-
-
-@pytest.mark.parametrize(
-    ("metadata", "line"),
-    [
-        ({}, ""),
-        ({"me2e.stack": "highway"}, ""),
-        ({"me2e.stack": "tcp"}, "weights: random, as tcp is exported"),
-    ],
-)
-def test_a_file_without_a_record_is_random_if_export_made_it(
-    metadata: dict[str, str], line: str
-) -> None:
-    assert named_weights(metadata).startswith(line)
-    assert bool(named_weights(metadata)) == bool(line)
 
 
 def test_the_record_names_the_file_and_what_only_training_reads(

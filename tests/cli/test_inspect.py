@@ -21,19 +21,11 @@ def test_nodes_are_counted_by_module(cli: Cli, files: Path) -> None:
     assert "3 by scope" in cli.done(IN).out
 
 
-@pytest.mark.parametrize(
-    ("text", "line"),
-    [
-        ('{"file": "vad.pth", "sha256": "ab", "epoch": 60}', "weights: vad.pth, epoch"),
-        ('{"file": 1}', "metadata me2e.weights is malformed"),
-        ("", "metadata me2e.weights is malformed"),
-    ],
-)
-def test_the_checkpoint_is_named(cli: Cli, files: Path, text: str, line: str) -> None:
+def test_the_checkpoint_is_named(cli: Cli, files: Path) -> None:
     model = graph.load(files / "in.onnx")
-    model.metadata_props["me2e.weights"] = text
+    model.metadata_props["me2e.weights"] = "vad.pth, epoch 60"
     graph.save(model, files / "in.onnx")
-    assert line in cli.done(IN).out
+    assert "weights: vad.pth, epoch 60" in cli.done(IN).out
 
 
 @pytest.mark.parametrize(

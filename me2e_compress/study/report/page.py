@@ -86,7 +86,7 @@ def study_page(
         if prepared.pipeline:
             made_of = f"{made_of} → {prepared.pipeline}"
         if prepared.weights:
-            made_of = f"{made_of}; {prepared.weights}"
+            made_of = f"{made_of}; weights: {prepared.weights}"
         variants.append((prepared.variant.name, made_of, prepared.sha256))
     timing = outcome.study.timing
     load = "" if outcome.load is None else f"; while it was timed, {outcome.load}"
