@@ -362,7 +362,7 @@ def profile(
             refuse_both(frames, options)
             budget_ms, force = options.budget_ms, options.force
             result = import_profile(
-                model, [imported], output, budget_ms=budget_ms, force=force
+                model, imported, output, budget_ms=budget_ms, force=force
             )
         elif frames is None:
             raise EvaluationError("profile: give recorded FRAMES, or --import FILE")

@@ -1,7 +1,6 @@
 """Latencies of a model, and its energy: measured alone and warm, or imported."""
 
 import dataclasses
-from collections.abc import Sequence
 from pathlib import Path
 
 from me2e_compress import graph
@@ -15,7 +14,7 @@ from me2e_compress.runtime.breakdown import break_down
 from me2e_compress.runtime.energy import EnergyResult
 from me2e_compress.runtime.energy.energy_counter import check_counter
 from me2e_compress.runtime.energy.meter import measure_energy
-from me2e_compress.runtime.imported_latency import read_imports
+from me2e_compress.runtime.imported_latency import read_import
 from me2e_compress.runtime.latency_trace import (
     LatencyTrace,
     Microseconds,
@@ -45,7 +44,6 @@ class ProfileResult(Result):
     Attributes:
         operators_us: microseconds of each operator, in inferences under a profiler.
         energy: joules, or why there are none; None if not asked for.
-        told: other readings, in words, such as the power of a device.
         slow_here: why the file is slow on this CPU, whose form is not its own.
     """
 
@@ -56,7 +54,6 @@ class ProfileResult(Result):
     energy: EnergyResult | None = None
     energy_output: Path | None = None
     budget_ms: float = BUDGET_MS
-    told: tuple[str, ...] = ()
     slow_here: str | None = None
 
     @property
@@ -89,7 +86,7 @@ class ProfileResult(Result):
             note = "; ".join(filter(None, (every.note, more)))
             few = dataclasses.replace(every, rows=every.rows[:_SHOWN], note=note)
             tables.append(few)
-        lines = [*self.told, *([] if energy is None else [energy.headline])]
+        lines = [] if energy is None else [energy.headline]
         count, needed = len(self.trace.samples_us), 100 * BEYOND_P99
         if count < needed:
             remedy = "" if load is None else f" (--samples {needed})"
@@ -194,39 +191,27 @@ def profile(
 
 def import_profile(
     model: str | Path,
-    files: Sequence[str | Path],
+    file: str | Path,
     output: str | Path | None = None,
     *,
     budget_ms: float = BUDGET_MS,
     force: bool = False,
 ) -> ProfileResult:
-    """Read what other tools measured; nothing is run.
+    """Read what another tool measured; nothing is run.
 
-    `files` are times and profile of trtexec, the log of tegrastats, traces, or folders
-    of them. `output` is a trace of this very model file, which ``evaluate`` can charge.
+    `file` holds times or a profile of trtexec, or a trace. `output` is a trace of this
+    very model file, which ``evaluate`` can charge.
 
     Raises:
         GraphError: The model does not exist, or the output would harm an input.
-        EvaluationError: A file is missing or malformed, or none has a latency.
+        EvaluationError: The file is missing or malformed.
     """
     check_budget(budget_ms)
-    if not files:
-        raise EvaluationError("--import: there is no file")
     source, written = model_path(model), None if output is None else Path(output)
-    # a folder stands for all of its files
-    read = list[Path]()
-    for path in map(Path, files):
-        inside = [path]
-        if path.is_dir():
-            inside = [each for each in sorted(path.iterdir()) if each.is_file()]
-        if not inside:
-            raise EvaluationError(f"{path}: there is no file in it")
-        read += inside
-    with writing([written], (source, *read), force=force):
-        found = read_imports(read)
+    with writing([written], (source, file), force=force):
+        found = read_import(Path(file))
         # the trace belongs to the very file that was measured
-        machine = found.machine or " and ".join(found.sources)
-        trace = LatencyTrace(graph.sha256_of(source), machine, found.samples_us)
+        trace = LatencyTrace(graph.sha256_of(source), found.machine, found.samples_us)
         if written is not None:
             trace.save(written)
     return ProfileResult(
@@ -235,7 +220,6 @@ def import_profile(
         written,
         operators_us=found.layers_us,
         budget_ms=budget_ms,
-        told=found.power,
     )
 
 
