@@ -308,15 +308,15 @@ def channel_axes(shape: tuple[int, ...]) -> tuple[int, ...]:
     last two of ``[batch, n, channels]``, which some heads transpose, the second of
     pictures; the second or the last of ``[batch, layers, n, channels]``.
     """
-    rank = len(shape)
+    rank, axes = len(shape), tuple[int, ...]()
     if rank == 3:
         axes = (1 if shape[1] < shape[2] else 2,)
     elif rank == 2 or (rank > 3 and 1 in shape[1:-1]):
         axes = (rank - 1,)
     elif rank == 4 and max(shape[2:]) <= _OF_PICTURES * min(shape[2:]):
         axes = (1,)
-    else:
-        axes = (1, rank - 1) if rank > 3 else ()
+    elif rank > 3:
+        axes = (1, rank - 1)
     return tuple(axis for axis in axes if 1 < shape[axis] <= _CHANNELS)
 
 

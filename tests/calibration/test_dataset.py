@@ -210,7 +210,7 @@ def recording(folder: Path, count: int, scenes: tuple[int, ...]) -> CalibrationS
 def test_held_out_frames_are_spread(
     tmp_path: Path, count: int, run: int, measured: list[int], begin: list[int]
 ) -> None:
-    seen, kept = hold_out(recording(tmp_path, count, range(0, count, 4)), 16, run)
+    seen, kept = hold_out(recording(tmp_path, count, (*range(0, count, 4),)), 16, run)
 
     assert [frame.index for frame in kept] == measured
     assert [frame.index for frame in kept if frame.starts_scene] == begin

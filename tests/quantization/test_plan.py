@@ -11,8 +11,6 @@ from me2e_compress.passes import Context
 from me2e_compress.passes.quantize_int8 import QuantizeInt8
 from me2e_compress.quantization.decision import (
     Decision,
-    Overrides,
-    differences,
     load_plan,
     plan_of,
     save_plan,
@@ -276,32 +274,6 @@ def test_a_saved_plan_reads_back_the_same_and_a_model_carries_it(
 
     assert load_plan(tmp_path / "plan.json") == plan
     assert plan_of(graph.load(tmp_path / "m.onnx")) == plan
-
-
-def test_differences_name_what_changed_and_by_which_rule() -> None:
-    model = conv_attention()
-    overrides = Overrides.parse('[[override]]\nop = "Conv"\ndtype = "float"')
-    old = make_plan(model, FULL, PAPER)
-    new = make_plan(model, FULL, PaperRules(attention_limit=8), overrides)
-
-    assert [str(each) for each in differences(old, new)] == [
-        "/backbone/Conv: int8 (layer) -> float (override)",
-        "/head/QK: int8 (attention) -> float (attention-length)",
-        "/head/AV: int8 (attention) -> float (attention-length)",
-    ]
-    assert not list(differences(old, old))
-
-
-def test_nodes_that_only_one_plan_has_are_differences() -> None:
-    model = conv_attention()
-    old = make_plan(model, FULL, PAPER)
-    model.graph[0].outputs[0].name = "renamed"
-    new = make_plan(model, FULL, PAPER)
-
-    assert [str(each) for each in differences(old, new)] == [
-        "/backbone/Conv: none -> int8 (layer)",
-        "/backbone/Conv: int8 (layer) -> none",
-    ]
 
 
 @pytest.mark.parametrize(

@@ -81,7 +81,7 @@ def test_a_preview_is_named_so_in_every_title_and_the_headline(page: str) -> Non
 
 def test_the_checkpoint_stands_where_a_variant_was_made(found: StudyResult) -> None:
     first, *others = found.variants
-    of_file = replace(first.prepared, weights="weights: a.pth")
+    of_file = replace(first.prepared, weights="a.pth")
     first = replace(first, prepared=of_file)
     named = replace(found, variants=(first, *others))
 
@@ -199,9 +199,10 @@ def test_the_line_of_the_docs_reads_a_folder_of_records(
 ) -> None:
     pandas = pytest.importorskip("pandas")
     text = Path("docs/study.md").read_text("utf-8")
-    (line,) = re.findall(r"^pd\.concat.*$", text, re.MULTILINE)
+    (line,) = re.findall(r"^    (pandas\.concat.*)$", text, re.MULTILINE)
 
-    rows = eval(line.replace("out/", f"{folder}/"), {"pd": pandas, "Path": Path})
+    names = {"pandas": pandas, "Path": Path}
+    rows = eval(line.replace("OUT/", f"{folder}/"), names)
 
     means = rows.groupby(level=0).driving_score.mean().to_dict()
     assert means == {

@@ -61,7 +61,8 @@ def test_the_loss_that_is_told_is_that_of_the_nodes(
     assert made.loss is not None
     assert made.loss.fidelity is not None
     (told,) = made.loss.fidelity.outputs
-    measured = frames[-made.loss.fidelity.frames :]
+    measured = [frames[place] for place in (1, 4, 6)]
+    assert made.loss.fidelity.frames == len(measured)
     pairs = [
         tuple(as_written(tmp_path / name, frame) for name in ("in.onnx", "out.onnx"))
         for frame in measured
