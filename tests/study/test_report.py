@@ -23,6 +23,7 @@ from me2e_compress.study.cells import (
 from me2e_compress.study.report.figures import (
     ACCENT,
     MOST_DRIVES,
+    MUTED,
     answer,
     differences,
     road,
@@ -140,7 +141,9 @@ def test_of_many_drives_the_answer_has_one_condition(found: StudyResult) -> None
     assert ">slow: " not in answer(many)
     assert ">Driving score, 0 to 100</text>" in road(many)
     assert ">Driving score, 0 to 100</text>" not in road(found)
-    assert "Driving scores are those under ideal." in study_page(many).html()
+    page = study_page(many).html()
+    assert "Driving scores are those under ideal." in page
+    assert page.split("<details>")[0].count("<svg") == 1
 
 
 def test_what_is_sure_is_filled(found: StudyResult) -> None:
@@ -149,6 +152,7 @@ def test_what_is_sure_is_filled(found: StudyResult) -> None:
     assert f">{MINUS}25.4 ({MINUS}83.3 to +72.0)</text>" in drawn
     assert ">fast, slow</text>" in drawn
     assert f"fill: {ACCENT}" not in drawn
+    assert drawn.count(f"fill: #ffffff; stroke: {MUTED}") == 3 * len(found.drives) - 6
     (sure,) = (e for e in found.drives if (e.variant, e.condition) == ("fast", "slow"))
     assert sure.difference is not None
     gap = replace(sure.difference.driving_score, low=-50.0, high=-20.0)

@@ -29,8 +29,9 @@ PAGE_FONT = "Inter, 'Segoe UI', 'Helvetica Neue', Arial, sans-serif"
 """Text stays text: matplotlib measures one font, the page shows its own."""
 WIDTH_IN = 9.2
 """Width of the page's column."""
-ROW_IN, FRAME_IN = 0.42, 0.72
-"""Height of a row, and of titles and axes."""
+ROW_IN, LOW_ROW_IN, FRAME_IN = 0.42, 0.33, 0.72
+"""Height of a row, of one of many, and of titles and axes."""
+MANY_ROWS = 8
 MOST_DRIVES = 14
 """With more drives than this, the first figure has those of one condition alone."""
 LONGEST_NAME = 20
@@ -216,7 +217,7 @@ def _road(
 def _drawn(names: Mapping[str, float], rows: int, panels: Sequence[Panel]) -> Markup:
     """Draw panels side by side; names stand at their places of so many rows."""
     with styled():
-        height = FRAME_IN + ROW_IN * rows
+        height = FRAME_IN + rows * (ROW_IN if rows <= MANY_ROWS else LOW_ROW_IN)
         figure = Figure(figsize=(WIDTH_IN, height))
         figure.set_layout_engine("constrained", wspace=0.07)
         axes = figure.subplots(1, len(panels), sharey=True, squeeze=False)[0]

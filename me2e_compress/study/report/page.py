@@ -31,12 +31,16 @@ class Drawing:
 
 @dataclass(frozen=True)
 class Section:
-    """A heading with pictures; its tables, and files to link, are folded."""
+    """A heading with pictures; its tables, and files to link, are folded.
+
+    So are pictures that are too high to be open, if it is ``high``.
+    """
 
     title: str
     tables: tuple[Table, ...] = ()
     files: tuple[tuple[str, str], ...] = ()
     drawings: tuple[Drawing, ...] = ()
+    high: bool = False
 
 
 @dataclass(frozen=True)
@@ -134,8 +138,9 @@ def _sections(outcome: StudyResult) -> list[Section]:
             " empty: no difference is shown."
         )
         drawings["Differences"] = (Drawing(gaps, note),)
+    high = len(outcome.drives) > MOST_DRIVES
     return [
-        Section(titles.get(name, name), theirs, drawings=drawings.get(name, ()))
+        Section(titles.get(name, name), theirs, (), drawings.get(name, ()), high)
         for name, theirs in tables.items()
         if theirs
     ]

@@ -158,7 +158,7 @@ def test_a_preview_is_named_so_everywhere(result: PaperResult) -> None:
     page = paper_page(result, "python -m benchmarks.paper").html()
 
     assert all("(preview: 11 of 220 routes)" in each.title for each in result.tables())
-    titles = re.findall(r"<(?:title|h1|figcaption)>(.*?)<", page)
+    titles = re.findall(r"<(?:title|h1|summary)>((?!All|How).*?)<", page)
     assert len(titles) >= 8
     assert all("preview: 11 of 220 routes" in each for each in titles)
     assert not re.search(r"(?:src|href)=\"(?!data:|#)", page)
