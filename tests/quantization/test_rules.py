@@ -7,6 +7,8 @@ from me2e_compress.errors import RecipeError
 from me2e_compress.quantization.decision import Decision
 from me2e_compress.quantization.rules import RULE_SETS
 from me2e_compress.quantization.scheme import QuantScheme
+from me2e_compress.targets.onnxruntime import OnnxRuntime
+from me2e_compress.targets.tensorrt import TensorRT
 from tests.nets import MODULES, by_output, net, planned
 
 HEAD = QuantScheme.of(("head",), MODULES)
@@ -24,7 +26,7 @@ def test_rules_can_be_switched_off_one_by_one() -> None:
     assert [rule.name for rule in left.rules()] == [
         "operator", "module", "weight", "geometry", "ego-input", "attention-length",
         "attention-weights", "small-product", "narrow-convolution",
-        "cost",
+        "size", "cost",
     ]  # fmt: skip
 
 
@@ -46,6 +48,56 @@ def test_products_below_one_tile_stay_float(shape: tuple[int, int], rule: str) -
     plan = planned(net(text, {"w": np.ones(shape)}))
 
     assert by_output(plan)["y"].rule == rule
+
+
+@pytest.mark.parametrize(
+    ("depth", "more", "rule"),
+    [
+        (2048, 16, "layer"),
+        # too few weights of the model's, or at all; TensorRT reads none faster
+        (2048, 640, "gemv"),
+        (512, 16, "gemv"),
+    ],
+)
+def test_one_row_is_int8_for_onnxruntime_where_its_weights_are_many(
+    depth: int, more: int, rule: str
+) -> None:
+    text = OPSETS + (
+        f"p (float[1,{depth}] x, float[{depth},64] w, float[64,64,{more}] v)"
+        " => (float[1,64] y, float[64,64,1] z)"
+        " { y = MatMul(x, w) z = ReduceMax<axes=[2]>(v) }"
+    ).replace(': 17, "trt"', ': 13, "trt"')
+    model = net(text, {"w": np.ones((depth, 64)), "v": np.ones((64, 64, more))})
+
+    rules = {
+        target.name: by_output(make_plan(model, HEAD, costs=target.costs))["y"].rule
+        for target in (OnnxRuntime(), TensorRT())
+    }
+    assert rules == {"onnxruntime": rule, "tensorrt": "gemv"}
+
+
+@pytest.mark.parametrize(
+    ("made", "rule"),
+    [
+        ("t = MatMul(a, w) z = MatMul(b, w)", "layer"),  # stored once, read twice
+        ("t = MatMul(a, w) z = Gather(w, i)", "size"),
+        ("t = MatMul(a, w) z = MatMul(x, w)", "size"),  # of one row, in float
+        ("v = Transpose(w) t = MatMul(a, v) z = Relu(b)", "layer"),
+        ("v = Transpose(w) t = MatMul(a, v) z = Gather(w, i)", "size"),
+        ("v = Expand(s, d) t = MatMul(a, v) z = Relu(b)", "size"),
+    ],
+)
+def test_int8_that_would_make_the_file_larger_stays_float(made: str, rule: str) -> None:
+    text = (
+        OPSETS
+        + f"""
+    p (float[9,32] a, float[9,32] b, float[1,32] x, int64[4] i, float[32,32] w,
+       float[32,1] s) => (float[9,32] t, float[n,32] z) <int64[2] d = {{32, 32}}>
+    {{ {made} }}"""
+    )
+    model = net(text, {"w": np.ones((32, 32)), "s": np.ones((32, 1))})
+
+    assert by_output(make_plan(model, HEAD))["t"].rule == rule
 
 
 @pytest.mark.parametrize(
@@ -266,13 +318,13 @@ def test_what_turns_points_before_they_are_looked_up_is_a_position_too() -> None
 
 
 EGO_NET = """ego (float[3,18] can_bus, float[1,3,%d,32] image, float[3,32] memory,
-     float[18,32] a, float[32,32] b, float[32,64] c, float[64,32] d,
+     float[18,32] a, float[32,32] b, float[32,64] c, float[32,32] d,
      float[500,32] grid) => (float y, float z, float memory_out)
     <int64[2] rows = {3, 32}, int64[2] cells = {32, -1}> {
     e = MatMul(can_bus, a)
     r = Relu(e)
     f = MatMul(r, b)
-    m = MatMul(memory, b)
+    m = MatMul(memory, d)
     memory_out = Identity(m)
     pixels = Reshape(image, cells)
     s = MatMul(f, pixels)
@@ -288,7 +340,7 @@ EGO_SIZES = {
     "a": (18, 32),
     "b": (32, 32),
     "c": (32, 64),
-    "d": (64, 32),
+    "d": (32, 32),
     "grid": (500, 32),
 }
 

@@ -215,6 +215,7 @@ RULES: Registry[Rule] = Registry(
         "attention-weights": f"{_HERE}.rule_sets:AttentionWeights",
         "small-product": f"{_HERE}.rule_sets:SmallProduct",
         "narrow-convolution": f"{_HERE}.rule_sets:NarrowConvolution",
+        "size": f"{_HERE}.rule_sets:FileSize",
         "cost": f"{_HERE}.rule_sets:CostGate",
     },
 )

@@ -232,6 +232,66 @@ class CostGate(Rule):
 
 
 @dataclasses.dataclass(frozen=True)
+class FileSize(Rule):
+    """Int8 that would make the file larger stays float.
+
+    A weight that a float reader keeps would be stored twice, and a table that the graph
+    computes would be written out.
+    """
+
+    name: ClassVar[str] = "size"
+
+    def objection(self, node: ir.Node, facts: RuleFacts) -> str | None:
+        """Object to nothing: who reads a weight as float is decided by other rules."""
+        return None
+
+    def objections(
+        self, int8: Collection[ir.Node], facts: RuleFacts
+    ) -> Mapping[ir.Node, str]:
+        """Object to the layers whose integers take more than the floats that go."""
+        kept, found = dict.fromkeys(int8), dict[ir.Node, str]()
+        while True:
+            more = {node: why for node in kept if (why := self._why(node, kept, facts))}
+            if not more:
+                return found
+            found |= more
+            kept = {node: None for node in kept if node not in more}
+
+    def _why(
+        self, node: ir.Node, int8: Collection[ir.Node], facts: RuleFacts
+    ) -> str | None:
+        """Compare what the int8 weight of a layer takes with the floats that go."""
+        weight = node.inputs[1] if len(node.inputs) > 1 else None
+        shape = static_shape(weight)
+        if weight is None or weight not in facts.constants or shape is None:
+            return None
+        # the stored tensors that it is made of, and who else reads them
+        stored, others, pending = 0, dict[ir.Node, None](), [weight]
+        for value in pending:
+            if value.const_value is None:
+                made = value.producer()
+                pending += [] if made is None else filter(None, made.inputs)
+                continue
+            readers = [
+                use.node
+                for use in value.uses()
+                if not (use.node in int8 and use.idx == 1)
+                and not set(use.node.outputs) <= set(facts.constants)
+            ]
+            others.update(dict.fromkeys(readers))
+            stored += 0 if readers else value.const_value.nbytes
+        if stored >= math.prod(shape):
+            return None
+        if others:
+            names = ", ".join(str(reader.name) for reader in others)
+            return f"its weight stays for {names}: int8 would be stored beside it"
+        return (
+            f"its weight is computed from {stored:,} bytes, and would be"
+            f" {math.prod(shape):,} in the file"
+        )
+
+
+@dataclasses.dataclass(frozen=True)
 class SmallProduct(Rule):
     """A product whose inner or outer dimension is below one tile stays float.
 
@@ -387,5 +447,5 @@ class SafeRules(PaperRules):
             *(operator, module, weight),
             *(Geometry(), Coordinates(), EgoInput()),
             *(length, AttentionWeights(), MatrixVector(share=0.1)),
-            *(SmallProduct(), NarrowConvolution(), CostGate()),
+            *(SmallProduct(), NarrowConvolution(), FileSize(), CostGate()),
         )
