@@ -178,10 +178,12 @@ def _build(
     provider: Provider,
     without: Sequence[str] | None,
 ) -> ort.InferenceSession:
-    """Open a graph; on failure, retry without converting int8 to uint8.
+    """Open a graph; on failure, retry without what the optimizer makes of it.
 
-    From opset 21 on, that step of onnxruntime (1.31) leaves QuantizeLinear nodes whose
-    ``output_dtype`` is not that of their zero point, and then refuses them.
+    First without converting int8 to uint8: from opset 21 on, that step of onnxruntime
+    (1.31) leaves QuantizeLinear nodes whose ``output_dtype`` is not that of their zero
+    point, and then refuses them. Then as the nodes stand: 1.32 makes a MatMulNBits of
+    float16 products of int8 weights with float32 scales, and refuses that.
     """
     left_out = provider.left_out if without is None else without
     try:
@@ -193,11 +195,19 @@ def _build(
         options.get_session_config_entry(_INT8_STAYS)
     except RuntimeError:  # it is not set yet
         options.add_session_config_entry(_INT8_STAYS, "1")
-    try:
-        return _opened(source, options, provider, left_out)
-    except REFUSALS:
-        line = " ".join(str(refusal).split())
-        raise GraphError(f"onnxruntime cannot run this graph: {line}") from refusal
+    level = options.graph_optimization_level
+    # Who asks for one level, or for the rewritten graph, gets that
+    fixed = level != _LEVELS["all"] or options.optimized_model_filepath
+    plain = level if fixed else _LEVELS["none"]
+    for tried in (level, plain):
+        options.graph_optimization_level = tried
+        try:
+            return _opened(source, options, provider, left_out)
+        except REFUSALS:
+            pass
+    options.graph_optimization_level = level
+    line = " ".join(str(refusal).split())
+    raise GraphError(f"onnxruntime cannot run this graph: {line}") from refusal
 
 
 def _opened(

@@ -323,7 +323,14 @@ def try_first(
     if done.returncode not in _REFUSED:
         last = (done.stdout.split() or ["start"])[-1]
         raise GraphError(f"{name}: onnxruntime {_end(done.returncode)} at step {last}")
-    if "open" in done.stdout:
+    lines = done.stdout.splitlines()
+    if "plain" in lines and done.returncode == 0:
+        why = lines[lines.index("plain") - 1]
+        listener.on_warning(
+            f"{name}: only onnxruntime's optimizer refuses it ({why}): it is run"
+            " without optimizations, and has to be in a session of yours"
+        )
+    elif "open" in lines:
         with contextlib.suppress(OSError):  # a home that cannot be written to
             folder.mkdir(parents=True, exist_ok=True)
             write_bytes(verdict, step)

@@ -2,10 +2,12 @@
 
 INPUTS is an ``.npz``; where there is no such file, the graph is only opened. KERNELS
 are separated by commas; only for them does it import something of this package. It
-prints each step before taking it, so that the last one is known if it dies.
+prints each step before taking it, so that the last one is known if it dies. A graph
+that only onnxruntime's optimizer refuses is opened as it stands, behind the reason.
 """
 
 import ctypes
+import functools
 import sys
 from pathlib import Path
 
@@ -27,12 +29,20 @@ def main(model: str, inputs: str, kernels: str, *disabled: str) -> None:
 
         custom_ops.register_named(options, kernels.split(","))
     _say("open")
-    session = ort.InferenceSession(
+    open_it = functools.partial(
+        ort.InferenceSession,
         model,
         options,
         providers=["CPUExecutionProvider"],
         disabled_optimizers=list(disabled),
     )
+    try:
+        session = open_it()
+    except Exception as refusal:  # whatever it raises: it is tried once more
+        options.graph_optimization_level = ort.GraphOptimizationLevel.ORT_DISABLE_ALL
+        _say(" ".join(str(refusal).split()))
+        _say("plain")
+        session = open_it()
     if not Path(inputs).exists():
         return
     if trim := getattr(ctypes.CDLL(None), "malloc_trim", None):  # glibc's

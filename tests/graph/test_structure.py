@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import onnx
 import onnx_ir as ir
 import pytest
@@ -10,6 +11,7 @@ import pytest
 from me2e_compress import graph
 from me2e_compress.errors import GraphError
 from me2e_compress.graph.shapes import open_shape
+from me2e_compress.runtime.session import Session
 from tests.fuzz.graphs import FAULTS, branch_graph, seed_graph
 
 REFUSED = {
@@ -91,3 +93,28 @@ def test_a_plugin_takes_anything(tmp_path: Path) -> None:
     onnx.save(model, tmp_path / "m.onnx")
 
     assert graph.node_count(graph.load(tmp_path / "m.onnx")) == 10
+
+
+@pytest.mark.parametrize("kind", [onnx.TensorProto.INT2, onnx.TensorProto.UINT2])
+@pytest.mark.parametrize("field", ["raw_data", "int32_data"])
+def test_weights_of_two_bits_lie_four_in_a_byte(
+    tmp_path: Path, kind: int, field: str
+) -> None:
+    model = onnx.parser.parse_model("""<ir_version: 13, opset_import: ["" : 25]>
+        m (float[1,3] x, float s) => (float[1,3] y)
+        { w = DequantizeLinear(q, s) y = MatMul(x, w) }""")
+    weight = bytes([0b11_10_01_00, 0b00_01_10_11, 0b01])
+    tensor = model.graph.initializer.add(name="q", data_type=kind, dims=[3, 3])
+    tensor.MergeFrom(onnx.TensorProto(**{field: weight}))
+    path = tmp_path / "m.onnx"
+    path.write_bytes(model.SerializeToString())
+
+    sums = [4, 4, 5] if kind == onnx.TensorProto.UINT2 else [0, 0, -3]
+    feeds = {"x": np.ones((1, 3), np.float32), "s": np.ones((), np.float32)}
+    assert Session(graph.load(path)).run(feeds)["y"].tolist() == [sums]
+
+    tensor.ClearField(field)
+    tensor.MergeFrom(onnx.TensorProto(**{field: weight[:2]}))
+    path.write_bytes(model.SerializeToString())
+    with pytest.raises(GraphError, match=r"'q' has 2 (bytes|values), its shape says"):
+        graph.load(path)

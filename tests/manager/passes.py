@@ -105,14 +105,15 @@ def _remove_dead(model: ir.Model) -> int:
     return len(dead)
 
 
-def _swap_terms(model: ir.Model) -> int:
-    epsilon, sums = model.graph.initializers["e"], 0
+def _divide(model: ir.Model) -> int:
+    factor, products = model.graph.initializers["factor"], 0
     for node in model.graph:
-        if node.op_type == "Add" and node.inputs[0] is epsilon:
-            node.replace_input_with(0, node.inputs[1])
-            node.replace_input_with(1, epsilon)
-            sums += 1
-    return sums
+        if node.op_type == "Mul" and node.inputs[1] is factor:
+            node.op_type, products = "Div", products + 1
+            provenance.inherit(node, [node], by="divides")
+            inverse = 1 / ir.convenience.get_const_tensor(factor).numpy()
+            factor.const_value = ir.tensor(inverse, name="factor")
+    return products
 
 
 def _of_weights(
@@ -135,8 +136,8 @@ DROPS_RELU = Sample("drops-relu-of-sigmoid", _drop_relu)
 """Right: a sigmoid is never negative."""
 ROUNDS = Sample("rounds", _of_weights(lambda w: np.nextafter(w, np.float32(9e9))))
 """Right, but for the last place of every weight."""
-SWAPS_TERMS = Sample("swaps-terms", _swap_terms)
-"""Right: a sum is the same in the other order."""
+DIVIDES = Sample("divides", _divide)
+"""Right: by the inverse of a factor."""
 REMOVES_DEAD = Sample("remove-dead", _remove_dead)
 HALVES = Lossy("halves", _of_weights(lambda w: w / np.float32(2)))
 BREAKS = Sample("breaks", _break)

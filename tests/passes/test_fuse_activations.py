@@ -72,10 +72,17 @@ def test_gelu_needs_opset_20() -> None:
     assert "left 1: Gelu needs opset 20" in result.notes
 
 
-def test_swish_is_written_when_asked_for() -> None:
-    model = read(opset(24) + body("a = Sigmoid(x) y = Mul(x, a)"))
-    apply(FuseBasic(swish=True), model)
-    assert ops(model) == ["Swish"]
+@pytest.mark.parametrize(
+    ("version", "left"), [(24, ["Swish"]), (25, ["Sigmoid", "Mul"])]
+)
+def test_swish_is_written_when_asked_for_where_onnxruntime_has_it(
+    version: int, left: list[str]
+) -> None:
+    model = read(opset(version) + body("a = Sigmoid(x) y = Mul(x, a)"))
+    result = apply(FuseBasic(swish=True), model)
+    assert ops(model) == left
+    refused = "left 1: onnxruntime has no Swish in opset 25" in result.notes
+    assert refused == (version == 25)
 
 
 HARD_SWISH = "a = Add(x, three) b = Clip(a, zero, six) c = Div(b, k) y = Mul(x, c)"

@@ -108,6 +108,17 @@ COUNTED = "1 DequantizeLinear, 1 QuantizeLinear; "
             f"{VECTOR} <float s = {{0.5}}> {PAIR % ('', '')}",
             f"{COUNTED}uint8 with zero points 0; made by onnx.quantize",
         ),
+        (
+            f"{VECTOR} <float s = {{0.5}}, int8[2] q = {{-3, 4}}>"
+            " { w = DequantizeLinear(q, s) y = Add(x, w) }",
+            "1 DequantizeLinear; int8 with zero points 0; made by onnx.quantize",
+        ),
+        (
+            f"{VECTOR} <float s = {{0.5}}> {PAIR % ('', '')}".replace(
+                "QuantizeLinear(x", "QuantizeLinear<output_dtype=3>(x", 1
+            ),
+            f"{COUNTED}int8 with zero points 0; made by onnx.quantize",
+        ),
         (  # an integer operator of a runtime
             "m (float[2,2] x, int8[2,2] w, float s) => (float[2,2] y)"
             " { y = com.microsoft.DynamicQuantizeMatMul(x, w, s) }",

@@ -16,10 +16,11 @@ from me2e_compress.manager.recipe import parse
 from me2e_compress.passes import Context
 from me2e_compress.runtime.children import run_script
 from me2e_compress.runtime.frames import Array, Frame
+from me2e_compress.runtime.session import Session
 from me2e_compress.workflows import checks
 from me2e_compress.workflows.checks import try_first
 from me2e_compress.workflows.compress import compress
-from me2e_compress.workflows.result import SILENT
+from me2e_compress.workflows.result import SILENT, Listener
 from tests.nets import save_text
 from tests.stacks import write_stack
 
@@ -124,3 +125,28 @@ def test_seeded_inputs_are_run_apart_too(opened: Path, tmp_path: Path) -> None:
     )
     with pytest.raises(GraphError, match=r"import-normalize: onnxruntime dies of it"):
         manager.run(graph.load(model), Context(ModuleMap.whole()))
+
+
+HALF = """<ir_version: 10, opset_import: ["" : 23]>
+    half (float16[4,32] x) => (float16[4,16] y)
+    <int8[32,16] w = {{{}}}, float[2,16] s = {{{}}}> {{
+        ["/head/Scales"] h = DequantizeLinear<axis=0, block_size=16, output_dtype=10>(
+            w, s)
+        ["/head/MatMul"] y = MatMul(x, h)
+    }}""".format(", ".join(["3"] * 512), ", ".join(["0.125"] * 32))
+"""onnxruntime (1.32) makes a MatMulNBits of it, whose types it then refuses."""
+
+
+def test_what_only_the_optimizer_refuses_is_run_as_it_stands_and_told(
+    opened: Path, tmp_path: Path
+) -> None:
+    path = save_text(tmp_path / "half.onnx", HALF)
+    told = list[str]()
+    for _ in range(2):
+        try_first(path, "half.onnx", listener=Listener(on_warning=told.append))
+    assert len(told) == 2
+    assert told[0].startswith("half.onnx: only onnxruntime's optimizer refuses it (")
+    x = np.ones((4, 32), np.float16)
+    assert np.all(Session(path, int8_kernels=True).run({"x": x})["y"] == 12)
+    with pytest.raises(GraphError, match="MatMulNBits"):
+        Session(path, int8_kernels=True, optimize="extended")

@@ -414,8 +414,9 @@ def padded_pools(model: ir.Model) -> Iterator[LintFinding]:
                 "wrong",
                 "padded-pool",
                 name_of(node),
-                f"reads the zeros of Pad {pad.name!r}: onnxruntime's Pad fusion makes "
-                "them minus infinity; open it with disabled_optimizers=['Pad_Fusion']",
+                f"reads the zeros of Pad {pad.name!r}: the Pad fusion of onnxruntime"
+                " up to 1.31 makes them minus infinity; open it with"
+                " disabled_optimizers=['Pad_Fusion']",
             )
 
 
