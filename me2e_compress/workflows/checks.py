@@ -15,6 +15,7 @@ of this package: so it starts in 0.3 s, not in 1.6.
 import contextlib
 import errno
 import fcntl
+import functools
 import hashlib
 import os
 import signal
@@ -30,10 +31,12 @@ import platformdirs
 
 from me2e_compress import graph
 from me2e_compress.calibration.dataset import CalibrationSet, archive_of
+from me2e_compress.display import counted
 from me2e_compress.driving.adapter.outputs import adapted
 from me2e_compress.errors import FORMER, GraphError
 from me2e_compress.graph.modules.assign import map_of
 from me2e_compress.graph.modules.module_map import ModuleMap
+from me2e_compress.graph.nodes import is_standard
 from me2e_compress.graph.opset import read_as
 from me2e_compress.graph.shapes import unshaped_plugins
 from me2e_compress.operators.kernels.trampoline import why_not
@@ -42,7 +45,7 @@ from me2e_compress.runtime.atomic import write_bytes
 from me2e_compress.runtime.children import run_script
 from me2e_compress.runtime.frames import Frames
 from me2e_compress.runtime.providers import CPU, Provider
-from me2e_compress.runtime.runnable import compiled_or_expanded, unsupported
+from me2e_compress.runtime.runnable import compiled_or_expanded, is_fused, unsupported
 from me2e_compress.shipped.drivers import SHIPPED, is_copy, own_map, shipped
 from me2e_compress.workflows import opening_main
 from me2e_compress.workflows.options import GraphOptions
@@ -67,7 +70,7 @@ def model_path(text: str | Path, beside: Path = Path()) -> Path:
 def read_graph(
     path: Path, listener: Listener, adapter: Given = None, module_map: Given = None
 ) -> ir.Model:
-    """Read a graph; warn of another opset and of missing shapes.
+    """Read a graph; warn of another opset and of what is unseen.
 
     What an adapter and a map state becomes metadata of the graph; see :func:`adapted`.
     """
@@ -75,12 +78,49 @@ def read_graph(
     adapted(model, adapter, module_map or own_map(path))
     if said := read_as(model):
         listener.on_warning(f"{path}: {said}")
-    if lack := lacking_shapes(model):
-        listener.on_warning(f"{path}: {lack}")
+    if hint := unseen(model):
+        listener.on_warning(f"{path}: {hint}")
     return model
 
 
-def lacking_shapes(model: ir.Model) -> str:
+def unseen(model: ir.Model) -> str:
+    """Describe what passes do not see: shapes behind plugins, layers in functions."""
+    return "; ".join(filter(None, (_lacking_shapes(model), _in_functions(model))))
+
+
+def _in_functions(model: ir.Model) -> str:
+    """Count the layers in functions of the file, as often as they are called."""
+
+    @functools.cache
+    def layers(node: ir.Node) -> int:
+        body = model.functions.get(node.op_identifier())
+        inside = () if body is None else body.all_nodes()
+        return (node.op_type in _LAYERS and is_standard(node)) + sum(
+            map(layers, inside)
+        )
+
+    calls = {
+        node: layers(node)
+        for node in model.graph.all_nodes()
+        if node.op_identifier() in model.functions and not is_fused(node)
+    }
+    if not any(calls.values()):
+        return ""
+    names = ", ".join(dict.fromkeys(f"{e.domain}::{e.op_type}" for e in calls))
+    return (
+        f"{counted(sum(calls.values()), 'layer')} in functions of the file ({names}),"
+        f" which passes leave as they are; to write them out first: {_INLINE}"
+    )
+
+
+_LAYERS = ("Conv", "ConvTranspose", "Gemm", "MatMul")
+_INLINE = (
+    "python -c 'import onnx, onnx.inliner as i;"
+    ' onnx.save(i.inline_local_functions(onnx.load("M.onnx")), "inlined.onnx")\''
+)
+
+
+def _lacking_shapes(model: ir.Model) -> str:
     """Describe the plugins whose output shapes are unknown; empty if there are none."""
     if not unshaped_plugins(model):
         return ""

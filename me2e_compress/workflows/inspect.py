@@ -22,7 +22,7 @@ from me2e_compress.manager import PassManager, recipe
 from me2e_compress.passes import Context
 from me2e_compress.passes.fix_shapes import FixShapes, open_dimensions
 from me2e_compress.passes.freeze_inputs import advice
-from me2e_compress.workflows.checks import lacking_shapes, load_map, model_path
+from me2e_compress.workflows.checks import load_map, model_path, unseen
 from me2e_compress.workflows.options import InspectOptions
 from me2e_compress.workflows.result import Result, Shown
 
@@ -165,7 +165,7 @@ def inspect(model: str | Path, options: InspectOptions | None = None) -> Inspect
     idle = f"nothing reads input {', '.join(unread)}" if unread else ""
     total = sum(item.macs or 0 for item in costs.values())
     unknown = sum(item.unknown_macs_nodes or 0 for item in costs.values())
-    hints = lacking_shapes(loaded), wrong, idle, "" if wrong else advice(loaded)
+    hints = unseen(loaded), wrong, idle, "" if wrong else advice(loaded)
     return InspectResult(
         path.name,
         graph.file_bytes(path),

@@ -27,7 +27,7 @@ from me2e_compress.quantization.decision import (
 from me2e_compress.quantization.rules import DEFAULT_RULES, RULE_SETS
 from me2e_compress.targets import DEFAULT_TARGET, TARGETS
 from me2e_compress.targets.quantized import describe_quantized
-from me2e_compress.workflows.checks import lacking_shapes, load_map, model_path, writing
+from me2e_compress.workflows.checks import load_map, model_path, unseen, writing
 from me2e_compress.workflows.options import PlanOptions
 from me2e_compress.workflows.result import Result, Shown
 
@@ -222,5 +222,5 @@ def _planned(file: Path, model: ir.Model, options: PlanOptions) -> PlanResult:
     )
     ready = PreparedGraph.of(file, model, options.module_map)
     made = quantizer.plan(ready.model, Context(ready.modules))
-    hints = filter(None, (lacking_shapes(model), advice(model)))
+    hints = filter(None, (unseen(model), advice(model)))
     return PlanResult(made, "; ".join(hints))

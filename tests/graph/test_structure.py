@@ -95,8 +95,14 @@ def test_a_plugin_takes_anything(tmp_path: Path) -> None:
     assert graph.node_count(graph.load(tmp_path / "m.onnx")) == 10
 
 
+DATA: dict[str, Callable[[bytes], onnx.TensorProto]] = {
+    "raw_data": lambda data: onnx.TensorProto(raw_data=data),
+    "int32_data": lambda data: onnx.TensorProto(int32_data=data),
+}
+
+
 @pytest.mark.parametrize("kind", [onnx.TensorProto.INT2, onnx.TensorProto.UINT2])
-@pytest.mark.parametrize("field", ["raw_data", "int32_data"])
+@pytest.mark.parametrize("field", DATA)
 def test_weights_of_two_bits_lie_four_in_a_byte(
     tmp_path: Path, kind: int, field: str
 ) -> None:
@@ -105,7 +111,7 @@ def test_weights_of_two_bits_lie_four_in_a_byte(
         { w = DequantizeLinear(q, s) y = MatMul(x, w) }""")
     weight = bytes([0b11_10_01_00, 0b00_01_10_11, 0b01])
     tensor = model.graph.initializer.add(name="q", data_type=kind, dims=[3, 3])
-    tensor.MergeFrom(onnx.TensorProto(**{field: weight}))
+    tensor.MergeFrom(DATA[field](weight))
     path = tmp_path / "m.onnx"
     path.write_bytes(model.SerializeToString())
 
@@ -114,7 +120,7 @@ def test_weights_of_two_bits_lie_four_in_a_byte(
     assert Session(graph.load(path)).run(feeds)["y"].tolist() == [sums]
 
     tensor.ClearField(field)
-    tensor.MergeFrom(onnx.TensorProto(**{field: weight[:2]}))
+    tensor.MergeFrom(DATA[field](weight[:2]))
     path.write_bytes(model.SerializeToString())
     with pytest.raises(GraphError, match=r"'q' has 2 (bytes|values), its shape says"):
         graph.load(path)
