@@ -77,7 +77,6 @@ class Ina3221Reader(Reader):
 
     counter = "ina3221-integrated"
     counts = False
-    tells_power = True
 
     def __init__(self, channels: Sequence[Channel], sensors: Sequence[Path]) -> None:
         self._channels = channels

@@ -35,7 +35,7 @@ class WallReader(Reader):
     """Its power is integrated; it counts nothing itself."""
 
     counter, device, scope = "wall-meter", "this machine", "all of it, at the plug"
-    counts, tells_power, step_s = False, True, 0.5
+    counts, step_s = False, 0.5
 
     def __init__(self, file: Path) -> None:
         self._file = file

@@ -2,8 +2,8 @@
 
 import abc
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated, Self, TypeAlias
 
@@ -18,17 +18,8 @@ from me2e_compress.runtime.atomic import write_document
 # The interface of an open energy counter, or the reason why there is none.
 
 
-@dataclass(frozen=True)
-class DeviceState:
-    """The state of a device at one moment; unknown values are left out."""
-
-    temperature_c: float | None = None
-    clocks_mhz: Mapping[str, float] = field(default_factory=dict)
-    throttled: tuple[str, ...] = ()
-
-
 class Reader(abc.ABC):
-    """An open counter that counts energy, or reads power, or both.
+    """An open counter that counts energy, or else reads power.
 
     Attributes:
         counter: name of the counter, for the result.
@@ -36,7 +27,6 @@ class Reader(abc.ABC):
         scope: what is counted: a board, packages, rails.
         step_s: seconds between updates; 0.1, as GPUs have it, where nothing says so.
         counts: whether it counts energy; otherwise its power is integrated.
-        tells_power: whether it reads power.
     """
 
     counter: str
@@ -44,7 +34,6 @@ class Reader(abc.ABC):
     scope: str
     step_s: float = 0.1
     counts: bool = True
-    tells_power: bool = False
 
     def joules(self) -> float:
         """Return the energy since an arbitrary start; called only if ``counts``.
@@ -55,16 +44,16 @@ class Reader(abc.ABC):
         raise NotImplementedError
 
     def watts(self) -> float:
-        """Return the present power; called only if ``tells_power``.
+        """Return the present power; called unless it ``counts``.
 
         Raises:
             EnergyError: it cannot be read any more.
         """
         raise NotImplementedError
 
-    def state(self) -> DeviceState:
-        """Return the state of the device, as far as it is known."""
-        return DeviceState()
+    def throttled(self) -> tuple[str, ...]:
+        """Return why the device slows itself down, as far as it is known."""
+        return ()
 
     def close(self) -> None:
         """Release what was opened; the default does nothing."""
@@ -161,10 +150,6 @@ Finite: TypeAlias = Annotated[float, Field(allow_inf_nan=False)]
 NotNegative: TypeAlias = Annotated[float, Field(allow_inf_nan=False, ge=0)]
 Positive: TypeAlias = Annotated[float, Field(allow_inf_nan=False, gt=0)]
 
-FURTHEST_APART = 0.1
-"""Relative difference between counter and integrated power that is tolerated; a known
-bad case is 187 J beside 327 J (Zeus, issue 181)."""
-
 
 @dataclass(frozen=True, repr=False)
 class EnergyResult:
@@ -187,15 +172,12 @@ class EnergyResult:
         counter_step_s: seconds between its updates.
         idle_w: watts of the idle device; with the model loaded, mean of before and
             after.
-        temperature: degrees Celsius, before and after.
-        clocks: lowest and highest MHz of each clock.
         throttled: why the device slowed itself down in a window.
         device: name of the device.
         scope: what the counter covers: a board, packages, rails.
         reason: why nothing was measured; empty if it was.
         model_sha256: digest of the model that ran; None if unknown.
         window_j_per_frame: joules per frame of each window.
-        power_j_per_frame: by integrated power; beside the counter.
     """
 
     joules: NotNegative | None = None
@@ -209,15 +191,12 @@ class EnergyResult:
     counter: str | None = None
     counter_step_s: Positive | None = None
     idle_w: NotNegative | None = None
-    temperature: tuple[Finite, Finite] | None = None
-    clocks: Mapping[str, tuple[Finite, Finite]] = field(default_factory=dict)
     throttled: tuple[str, ...] = ()
     device: str = ""
     scope: str = ""
     reason: str = ""
     model_sha256: str | None = None
     window_j_per_frame: tuple[Finite, ...] = ()
-    power_j_per_frame: NotNegative | None = None
 
     def __post_init__(self) -> None:
         """Check that there is either a figure with its interval, or a reason."""
@@ -244,19 +223,10 @@ class EnergyResult:
 
     def alerts(self) -> tuple[str, ...]:
         """Return reasons to doubt the figure."""
-        found = list[str]()
-        if self.throttled:
-            slowed = ", ".join(self.throttled)
-            found.append(f"energy: the device slowed itself down: {slowed}")
-        # A counter that disagrees with integrated power is suspect.
-        if self.j_per_frame is not None and self.power_j_per_frame is not None:
-            apart = self.power_j_per_frame / self.j_per_frame - 1
-            if abs(apart) > FURTHEST_APART:
-                found.append(
-                    f"energy: integrated power says {self.power_j_per_frame:.4g} J a"
-                    f" frame, {apart:+.0%} from the counter: one of them is wrong"
-                )
-        return tuple(found)
+        if not self.throttled:
+            return ()
+        slowed = ", ".join(self.throttled)
+        return (f"energy: the device slowed itself down: {slowed}",)
 
     def tables(self) -> tuple[Table, ...]:
         """Return the table of figures; empty if nothing was measured."""
@@ -267,19 +237,11 @@ class EnergyResult:
         ]
         if self.net_j_per_frame is not None:
             rows.append(("net of idle", f"{self.net_j_per_frame:.4g}", "", ""))
-        if self.power_j_per_frame is not None:
-            rows.append(("by power", f"{self.power_j_per_frame:.4g}", "", ""))
         # Below the figures: how they were measured.
         long = f" of {self.window_s:.1f} s" if self.window_s else ""
         notes = [f"{self.frames} frames in {self.windows} windows{long}"]
         if self.idle_w is not None:
             notes.append(f"idle {self.idle_w:.4g} W")
-        if self.temperature is not None:
-            notes.append("{:.0f} to {:.0f} °C".format(*self.temperature))
-        notes += [
-            f"{name} {low:.0f} to {high:.0f} MHz"
-            for name, (low, high) in self.clocks.items()
-        ]
         columns = ("energy", "J/frame", "low 95 %", "high 95 %")
         title = f"{self.counter} of {self.device} ({self.scope})"
         return (table(title, columns, rows, "\n".join(notes)),)
@@ -301,27 +263,18 @@ def summarise(
     windows: Sequence[Window],
     by: tuple[str, str, str, float],
     idle_w: float | None,
-    *,
-    states: Sequence[DeviceState] = (),
-    power_j_per_frame: float | None = None,
+    throttled: Sequence[str] = (),
 ) -> EnergyResult:
     """Return the energy result of one model.
 
     ``by`` is the counter, the device, its scope, and the seconds between two updates;
-    ``idle_w`` is None where the idle device was not measured; ``states`` are those
-    before and after each window.
+    ``idle_w`` is None where the idle device was not measured; ``throttled`` is why the
+    device slowed itself down around any window.
     """
     counter, device, scope, step_s = by
     j_per_frame, low, high = estimate(windows, step_s)
     frames = sum(each.frames for each in windows)
     frame_s = sum(each.taken_s for each in windows) / frames
-    # Not every device reports temperatures or clocks.
-    warmth = [e.temperature_c for e in states if e.temperature_c is not None]
-    throttled = dict.fromkeys(reason for each in states for reason in each.throttled)
-    clocks = dict[str, list[float]]()
-    for state in states:
-        for name, mhz in state.clocks_mhz.items():
-            clocks.setdefault(name, []).append(mhz)
     return EnergyResult(
         joules=sum(each.joules for each in windows),
         frames=frames,
@@ -334,11 +287,8 @@ def summarise(
         counter=counter,
         counter_step_s=step_s,
         idle_w=idle_w,
-        temperature=(warmth[0], warmth[-1]) if warmth else None,
-        clocks={name: (min(each), max(each)) for name, each in clocks.items()},
-        throttled=tuple(throttled),
+        throttled=tuple(dict.fromkeys(throttled)),
         device=device,
         scope=scope,
         window_j_per_frame=tuple(each.joules / each.frames for each in windows),
-        power_j_per_frame=power_j_per_frame,
     )

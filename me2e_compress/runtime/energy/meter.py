@@ -3,7 +3,7 @@
 import contextlib
 import dataclasses
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager
 from functools import partial
 from itertools import chain, pairwise, repeat
@@ -23,7 +23,6 @@ from me2e_compress.runtime.energy.energy_counter import (
 )
 from me2e_compress.runtime.energy.energy_result import (
     Absent,
-    DeviceState,
     EnergyResult,
     Reader,
     Window,
@@ -53,14 +52,10 @@ class PowerSamples:
         """Sample the power once."""
         self._taken.append((self._clock(), self._reader.watts()))
 
-    def count(self, begin_s: float, end_s: float) -> int:
-        """Count the samples between two times."""
-        return sum(begin_s <= each <= end_s for each, _ in self._taken)
-
     def joules(self, begin_s: float, end_s: float) -> float:
         """Return the energy between two times; too few samples are an error."""
         times, watts = np.array(self._taken or [(0.0, 0.0)]).T
-        count = self.count(begin_s, end_s)
+        count = sum(begin_s <= each <= end_s for each, _ in self._taken)
         if count < FEWEST_SAMPLES:
             raise EnergyError(
                 f"{self._reader.counter} of {self._reader.device}: power was read"
@@ -136,14 +131,14 @@ class EnergyMeter:
     def measure(self, work: Mapping[str, Work]) -> dict[str, EnergyResult]:
         """Measure models in turn; ``work`` maps each name to what runs one frame."""
         windows: dict[str, list[Window]] = {name: [] for name in work}
-        states: dict[str, list[DeviceState]] = {name: [] for name in work}
+        slowed: dict[str, list[str]] = {name: [] for name in work}
         reader, schedule = self._reader, self._schedule
         turns = schedule.turns(list(work))
         rest = partial(self._sleep, schedule.idle_s)
         with (
-            self._every(SAMPLED_S, self._power.add)
-            if reader.tells_power
-            else contextlib.nullcontext()
+            contextlib.nullcontext()
+            if reader.counts
+            else self._every(SAMPLED_S, self._power.add)
         ):
             # Idle and warm up before the windows.
             idle = [self._window(0, rest)]
@@ -152,7 +147,7 @@ class EnergyMeter:
             for done, name in enumerate(turns):
                 self._on_window(done, len(turns), name)
                 frames = schedule.frames(frame_s[name])
-                windows[name].append(self._work(work[name], frames, states[name]))
+                windows[name].append(self._work(work[name], frames, slowed[name]))
             self._on_window(len(turns), len(turns), turns[-1])
             self._sleep(schedule.lead_in_s)
             idle.append(self._window(0, rest))
@@ -164,8 +159,7 @@ class EnergyMeter:
                 [self._integrated(each) for each in windows[name]],
                 (reader.counter, reader.device, reader.scope, reader.step_s),
                 idle_w,
-                states=states[name],
-                power_j_per_frame=self._by_power(windows[name]),
+                slowed[name],
             )
             for name in work
         }
@@ -176,15 +170,6 @@ class EnergyMeter:
             return window
         joules = self._power.joules(window.begin_s, window.end_s)
         return dataclasses.replace(window, joules=joules)
-
-    def _by_power(self, windows: Sequence[Window]) -> float | None:
-        """Return joules per frame by integrated power; None with too few samples."""
-        ends = [(each.begin_s, each.end_s) for each in windows]
-        fewest = min(self._power.count(*each) for each in ends)
-        if not self._reader.counts or fewest < FEWEST_SAMPLES:
-            return None
-        joules = sum(self._power.joules(*each) for each in ends)
-        return joules / sum(each.frames for each in windows)
 
     def _window(self, frames: int, wait: Callable[[], object]) -> Window:
         """Measure what happens meanwhile; its joules are 0 where power is integrated.
@@ -223,11 +208,11 @@ class EnergyMeter:
             times.append(self._clock())
         return [after - before for before, after in pairwise(times)]
 
-    def _work(self, run: Work, frames: int, states: list[DeviceState]) -> Window:
-        """Run one window at a random phase of the counter; add the states around it."""
+    def _work(self, run: Work, frames: int, slowed: list[str]) -> Window:
+        """Run one window at a random phase of the counter; add what slowed it."""
         # The lead-in follows the wait: caches must hold this model.
         self._sleep(float(self._random.uniform(0, self._reader.step_s)))
-        states.append(self._reader.state())
+        slowed += self._reader.throttled()
         self._lead_in(run)
 
         def work() -> None:
@@ -235,7 +220,7 @@ class EnergyMeter:
                 run()
 
         window = self._window(frames, work)
-        states.append(self._reader.state())
+        slowed += self._reader.throttled()
         return window
 
 

@@ -8,7 +8,7 @@ import pynvml
 
 from me2e_compress.errors import EnergyError
 from me2e_compress.runtime.energy.energy_counter import EnergyCounter
-from me2e_compress.runtime.energy.energy_result import Absent, DeviceState, Reader
+from me2e_compress.runtime.energy.energy_result import Absent, Reader
 
 T = TypeVar("T")
 
@@ -20,9 +20,6 @@ _SLOWED = {
     "nvmlClocksEventReasonSwThermalSlowdown": "thermal slowdown",
 }
 """NVML's reasons that reduce speed; idling and clocks set by a user do not count."""
-
-
-_CLOCKS = {"sm": pynvml.NVML_CLOCK_SM, "memory": pynvml.NVML_CLOCK_MEM}
 
 
 @dataclass(frozen=True)
@@ -66,17 +63,16 @@ class Nvml(EnergyCounter):
                 f"{_name(handle)} tells no energy: total energy: {energy};"
                 f" instant power: {power}"
             )
-        return NvmlReader(handle, not isinstance(energy, str), power)
+        return NvmlReader(handle, not isinstance(energy, str))
 
 
 class NvmlReader(Reader):
-    """An open GPU; ``power`` is in mW, or the error where it cannot be read."""
+    """An open GPU, which counts energy or else reads power."""
 
     scope = "the whole board"
 
-    def __init__(self, handle: Any, counts: bool, power: int | str) -> None:
+    def __init__(self, handle: Any, counts: bool) -> None:
         self._handle, self.counts = handle, counts
-        self.tells_power = not isinstance(power, str)
         self.counter = "nvml-total" if counts else "nvml-power-integrated"
         self.device = _name(handle)
 
@@ -88,24 +84,14 @@ class NvmlReader(Reader):
         """Return the instantaneous power, not the average of a second."""
         return self._ask(_instant_power) / 1e3
 
-    def state(self) -> DeviceState:
-        """Return the temperature, the clocks and the reasons for throttling."""
-        degrees = _number(
-            pynvml.nvmlDeviceGetTemperature, self._handle, pynvml.NVML_TEMPERATURE_GPU
+    def throttled(self) -> tuple[str, ...]:
+        """Return why the GPU runs slower, of a bit mask; empty if it does not say."""
+        mask = _answer(pynvml.nvmlDeviceGetCurrentClocksEventReasons, self._handle)
+        if isinstance(mask, str):
+            return ()
+        return tuple(
+            words for bit, words in _SLOWED.items() if mask & getattr(pynvml, bit)
         )
-        clocks = {
-            name: _number(pynvml.nvmlDeviceGetClockInfo, self._handle, kind)
-            for name, kind in _CLOCKS.items()
-        }
-        # A bit mask tells why the GPU runs slower.
-        mask = _number(pynvml.nvmlDeviceGetCurrentClocksEventReasons, self._handle)
-        slowed = tuple(
-            words
-            for bit, words in _SLOWED.items()
-            if mask is not None and int(mask) & getattr(pynvml, bit)
-        )
-        known = {name: mhz for name, mhz in clocks.items() if mhz is not None}
-        return DeviceState(degrees, known, slowed)
 
     def close(self) -> None:
         """Shut down NVML."""
@@ -124,12 +110,6 @@ def _answer(question: Callable[..., T], *arguments: Any) -> T | str:
         return question(*arguments)
     except pynvml.NVMLError as error:
         return str(error)
-
-
-def _number(question: Callable[..., int], *arguments: Any) -> float | None:
-    """Return NVML's answer as a number; None on an error."""
-    answer = _answer(question, *arguments)
-    return None if isinstance(answer, str) else float(answer)
 
 
 def _instant_power(handle: Any) -> int:

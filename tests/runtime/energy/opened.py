@@ -30,8 +30,6 @@ class Driver:
             "nvmlDeviceGetName": lambda handle: "A GPU",
             "nvmlDeviceGetTotalEnergyConsumption": lambda handle: self.answer("energy"),
             "nvmlDeviceGetFieldValues": lambda handle, fields: [self.field()],
-            "nvmlDeviceGetTemperature": lambda handle, sensor: 61,
-            "nvmlDeviceGetClockInfo": lambda handle, kind: self.answer("clock", 1_700),
             "nvmlDeviceGetCurrentClocksEventReasons": lambda handle: self.answer(
                 "slow"
             ),

@@ -3,7 +3,7 @@
 import contextlib
 from collections.abc import Callable, Iterator
 
-from me2e_compress.runtime.energy.energy_result import DeviceState, Reader
+from me2e_compress.runtime.energy.energy_result import Reader
 
 STEP_S = 0.1
 
@@ -21,14 +21,12 @@ class World(Reader):
 
     counter, device, scope, step_s = "simulated", "a device", "board", STEP_S
 
-    def __init__(
-        self, idle_w: float = 50.0, tells_power: bool = False, sensed: float = 1.0
-    ) -> None:
+    def __init__(self, idle_w: float = 50.0, sensed: float = 1.0) -> None:
         self.now, self.spent, self.idle_w = 0.03, 0.0, idle_w
         self._shown, self._seen, self._power = 0.0, 0.0, idle_w
         self._next, self._calls = STEP_S, list[tuple[float, Callable[[], None]]]()
-        self.tells_power, self.readings, self.sensed = tells_power, 0, sensed
-        self.power_factor, self.drift = 1.0, 0.0
+        self.readings, self.sensed = 0, sensed
+        self.drift = 0.0
         self.worked = list[tuple[str, float]]()
 
     def clock(self) -> float:
@@ -58,10 +56,10 @@ class World(Reader):
         return self._shown
 
     def watts(self) -> float:
-        return self._power * self.power_factor
+        return self._power
 
-    def state(self) -> DeviceState:
-        return DeviceState(40 + self.now / 60, {"sm": 1_000 + self.now})
+    def throttled(self) -> tuple[str, ...]:
+        return ("heat",) if self.now > 10 else ()
 
     def _pass(self, seconds: float, watts: float) -> None:
         self._power, start, end = watts, self.now, self.now + seconds
