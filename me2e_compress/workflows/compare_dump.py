@@ -1,29 +1,24 @@
 """Hold what an engine answered elsewhere against its graph, and split what was lost."""
 
 import dataclasses
-from collections.abc import Iterator
 from pathlib import Path
 
-import numpy as np
 import onnx_ir as ir
 
 from me2e_compress import graph
 from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.calibration.engine_dump import EngineDump
 from me2e_compress.display import counted, number, table
-from me2e_compress.errors import EvaluationError, GraphError
+from me2e_compress.errors import EvaluationError
 from me2e_compress.fidelity.engine_loss import EngineRun, OutputLoss, losses
 from me2e_compress.fidelity.first_difference import (
     FirstDifference,
     first_difference_of_engine,
 )
-from me2e_compress.registry import documents
 from me2e_compress.runtime.session import Session
-from me2e_compress.shipped.drivers import SHIPPED, shipped
 from me2e_compress.targets.quantized import describe_quantized
 from me2e_compress.workflows.checks import model_path, opened
 from me2e_compress.workflows.compare import headline_of, with_modules
-from me2e_compress.workflows.compress import beside
 from me2e_compress.workflows.options import CompareOptions
 from me2e_compress.workflows.result import SILENT, Listener, Result, Shown
 
@@ -39,8 +34,9 @@ class DumpResult(Result):
         graph: The graph that the engine was built from.
         dump: What it answered.
         float_graph: The float source; None if none is known, for `float_reason`.
-        state: Whose state the graph was fed: the engine's, our own run's, or none.
-        notes: What is no fault and worth knowing.
+        state: Whose state the graph was fed: the engine's own, that of our own run, or
+            none.
+        notes: What is not compared.
         inner: Where the engine's own tensors begin to differ from the graph's; None if
             the dump has outputs alone.
     """
@@ -104,9 +100,8 @@ def compare_dump(
 
     The graph's nodes run as they are written: int8 is simulated. It is fed the state
     that the engine gave, where the dump has it, so that each frame is judged by itself;
-    else that of its own run. ``float_graph`` None looks for the source that the report
-    beside the graph names. Below the share ``alive`` of the movement that it should
-    have, an output is dead.
+    else that of its own run. Quantization is measured where ``float_graph`` is given.
+    Below the share ``alive`` of the movement that it should have, an output is dead.
 
     Raises:
         GraphError: A model does not exist or run.
@@ -124,10 +119,14 @@ def compare_dump(
     provider = options.runs_on
     session = Session(path, optimize=False, release=True, provider=provider, said=said)
     run = EngineRun(session, recording, answered)
-    source, why = _float_source(path, loaded, float_graph)
-    original = None
-    if source is not None:
+    source, original, why = None, None, ""
+    if float_graph is not None:
+        source = model_path(float_graph)
         original = Session(source, release=True, provider=provider, said=said)
+    elif describe_quantized(loaded) is None:
+        why = f"{path.name} is not quantized"
+    else:
+        why = "--float names no source"
     total = len(recording)
     try:
         outputs = losses(
@@ -142,9 +141,8 @@ def compare_dump(
         named = with_modules(loaded)
         inner = first_difference_of_engine(named, run, provider)
     return DumpResult(
-        path, answered.path, source, why, total, _state(run), outputs,
-        (*notes, *_rounded(run)), inner,
-    )  # fmt: skip
+        path, answered.path, source, why, total, _state(run), outputs, notes, inner
+    )
 
 
 def _checked_names(dump: EngineDump, path: Path, loaded: ir.Model) -> tuple[str, ...]:
@@ -166,55 +164,9 @@ def _checked_names(dump: EngineDump, path: Path, loaded: ir.Model) -> tuple[str,
     return (f"not dumped: {', '.join(lacking)}",) if lacking else ()
 
 
-def _float_source(
-    path: Path, loaded: ir.Model, given: str | Path | None
-) -> tuple[Path | None, str]:
-    """Return the float source of a graph, or why none is known."""
-    if given is not None:
-        return model_path(given), ""
-    if describe_quantized(loaded) is None:
-        return None, f"{path.name} is not quantized"
-    report = beside(path, "report")
-    if not report.is_file():
-        return None, f"there is no {report.name}, and --float names no source"
-    with documents.reading(report, GraphError, "not a report"):
-        content = documents.from_json(documents.content(report))
-    record = content.get("source") if isinstance(content, dict) else None
-    named = record if isinstance(record, dict) else {}
-    file, digest = str(named.get("file", "")), named.get("sha256")
-    shipped_files = [shipped(each) for each in SHIPPED if f"{each}.onnx" == file]
-    for candidate in (path.with_name(file or "."), Path(file), *shipped_files):
-        if candidate.is_file() and graph.sha256_of(candidate) == digest:
-            return candidate, ""
-    return None, f"{file or 'the source'} of {report.name} is not here: give --float"
-
-
 def _state(run: EngineRun) -> str:
     pairs = run.session.recurrent
     own = [name for name, output in pairs.items() if output not in run.names]
     if not pairs:
         return "none"
-    if not own:
-        return "the engine's own, so each frame is judged by itself"
-    if len(own) == len(pairs):
-        return "of our own run, since the dump has none"
-    return f"the engine's own, but {', '.join(own)} of our own run"
-
-
-def _rounded(run: EngineRun) -> Iterator[str]:
-    """Say which outputs were rounded to fewer bits: no fault, but worth knowing."""
-    found = dict[str, list[str]]()
-    for name in run.names:
-        value = run.dump[0][name]
-        if value.dtype == np.float16:
-            found.setdefault("float16", []).append(name)
-        elif value.dtype == np.float32 and value.any():
-            bits = np.ascontiguousarray(value).view(np.uint32)
-            with np.errstate(over="ignore"):
-                half = value.astype(np.float16).astype(np.float32)
-            if np.array_equal(value, half):
-                found.setdefault("float16", []).append(name)
-            elif not (bits & 0xFFFF).any():  # that bfloat16 has not
-                found.setdefault("bfloat16", []).append(name)
-    for kind, names in found.items():
-        yield f"rounded to {kind}, no fault: {', '.join(names)}"
+    return f"of our own run: {', '.join(own)}" if own else "the engine's own"

@@ -9,7 +9,6 @@ import numpy as np
 import onnx_ir as ir
 import pytest
 
-from me2e_compress import graph
 from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.errors import EvaluationError, GraphError
 from me2e_compress.runtime.session import Session
@@ -65,7 +64,7 @@ def test_what_is_left_is_the_compilers(files: Path) -> None:
     assert found.headline.startswith(
         "compilation: the engine, or its host, does not answer as its graph does"
     )
-    assert found.state == "the engine's own, so each frame is judged by itself"
+    assert found.state == "the engine's own"
     for each in found.outputs:
         assert each.compilation_db == pytest.approx(30.0, abs=3)
         assert each.all_db == each.compilation_db
@@ -121,19 +120,9 @@ def test_quantization_is_what_the_graph_lost_to_its_source(tmp_path: Path) -> No
 
     unknown = compare_dump(small, dump, shown_at)
     given = compare_dump(small, dump, shown_at, float_graph=tmp_path / "source.onnx")
-    digest = graph.sha256_of(tmp_path / "source.onnx")
-    report = {"source": {"file": "source.onnx", "sha256": digest}}
-    (tmp_path / "small.report.json").write_text(json.dumps(report))
-    recorded = compare_dump(small, dump, shown_at)
-    report["source"]["sha256"] = "0" * 64  # of another file
-    (tmp_path / "small.report.json").write_text(json.dumps(report))
-    other = compare_dump(small, dump, shown_at)
 
-    assert other.float_graph is None
-    assert "is not here: give --float" in other.float_reason
     assert unknown.outputs[0].quantization_db is None
     assert "--float names no source" in unknown.float_reason
-    assert given.outputs == recorded.outputs
     lost = given.outputs[0]
     assert lost.compilation_db == np.inf
     assert lost.quantization_db == lost.all_db
@@ -145,7 +134,7 @@ def test_state_comes_from_our_own_run_where_the_dump_has_none(files: Path) -> No
     kept = [{k: v for k, v in e.items() if k != "prev_out"} for e in answered(files)]
     dumped(files, kept)
     found = found_in(files)
-    assert found.state == "of our own run, since the dump has none"
+    assert found.state == "of our own run: prev"
     assert found.headline.startswith("the engine answers as its graph does")
     assert found.notes[0] == "not dumped: prev_out"
 
@@ -160,13 +149,6 @@ def test_with_the_engines_state_errors_do_not_add_up(files: Path) -> None:
 
     assert min(plan.compilation_db, boxes.compilation_db) > 100
     assert state.compilation_db < 10
-
-
-def test_rounding_to_half_is_said(files: Path) -> None:
-    half = [{n: a.astype(np.float16) for n, a in e.items()} for e in answered(files)]
-    dumped(files, half)
-    found = found_in(files)
-    assert found.notes == ("rounded to float16, no fault: plan, boxes, prev_out",)
 
 
 def test_tensors_inside_the_graph_tell_where_it_begins(files: Path) -> None:
