@@ -28,6 +28,7 @@ FORMER = {
     "fold-constants growth": f"growth {_NOW} bytes_per_node",
     "command build": f"build {_NOW} trtexec --onnx=M.onnx --saveEngine=M.engine",
     "command ranges": f"ranges {_NOW} calibrate, which says what deserves a look",
+    "dump json": f"no .npz: JSON of other tools {_NOW} docs/engine-dumps.md",
     "--weight-only-gemv": f"--weight-only-gemv {_NOW} --rules 'safe{{without=[gemv]}}'",
     "--no-remedy": "--no-remedy is gone since 0.3.0: compress searches no nodes",
     "driving log nuscenes": f"nuscenes {_NOW} examples/driving_logs",

@@ -307,7 +307,7 @@ def compare(
         reference: graph to be true to
         candidate: the graph that is judged; not with --outputs
         frames: the recorded FRAMES
-        outputs: what an engine of the graph answered: DUMP/ or JSON
+        outputs: what an engine of the graph answered: DUMP/
         float_graph: the graph's float source, with --outputs
         first_difference: name the first module after which the second differs
     """

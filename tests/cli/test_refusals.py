@@ -99,7 +99,7 @@ SEARCH = {
 OTHERS = {
     "export vad-huge -o out.onnx": "vad-huge",
     "compare dense.onnx path.onnx frames": "no tensor in common",
-    "compare dense.onnx frames --outputs none": "none: no such folder or file",
+    "compare dense.onnx frames --outputs none": "none: no such folder",
     "compare dense.onnx frames --outputs frames": "the dump is of another graph",
     "frames vad-huge -o out": "vad-huge: no such file; models that ship",
     "plan latin.json": r"latin\.json: not a plan",
