@@ -1,7 +1,6 @@
 """Score existing results, of one folder or of several, of real runs too."""
 
 import dataclasses
-import math
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
@@ -31,7 +30,6 @@ from me2e_compress.workflows.score_eer import EerScores, estimate_cells, score_e
 
 STANDING = "the ego stood most of the time, which is comfortable: see comfort in motion"
 _NAMED = 5
-_TOLERANCE = 1e-6
 
 
 @dataclasses.dataclass(frozen=True)
@@ -54,10 +52,11 @@ class RealRun:
 
         Each figure is shown over the whole set, and over what was driven.
         """
-        collected = self.collected
+        collected, off_rate = self.collected, self.collected.off_rate
         counts = [
             ("evaluated", "", str(len(collected.episodes))),
             *((key, some_of(of), str(len(of))) for key, of in self._named().items()),
+            ("not at 20 Hz", some_of(tuple(off_rate)), str(len(off_rate))),
             ("unfinished files", "", str(len(collected.unfinished))),
             ("broken", some_of(tuple(collected.broken)), str(len(collected.broken))),
         ]
@@ -95,31 +94,12 @@ class RealRun:
         found = self.collected
         if found.route_set is None:
             yield f"{name}: its routes are of no set of Bench2Drive that is known"
-        # routes that do not count as they should
-        for what, routes in (
-            (f"of another set than {found.route_set}", found.foreign),
-            (
-                "driven more than once with different results, of which the lowest "
-                "driving score counts",
-                found.contradictory,
-            ),
-            (STANDING, self.stood),
-        ):
-            if routes:
-                yield f"{name}: {what}: {some_of(routes)}"
-        # damaged files, then statements that contradict the records
-        for where, reason in list(found.broken.items())[:_NAMED]:
-            yield f"{where}: {reason}: left out"
-        if len(found.broken) > _NAMED:
-            yield f"{name}: broken and left out, too: {len(found.broken) - _NAMED}"
-        yield from self._stated()
-        if found.off_rate:
-            route, interval_s = next(iter(found.off_rate.items()))
-            yield (
-                f"{name}: not recorded at 20 Hz, so that comfort does not compare with "
-                f"others': {len(found.off_rate)} of {len(found.episodes)}, {route} at "
-                f"{1 / interval_s:.3g} Hz"
-            )
+        doubtful = {*found.foreign, *found.contradictory, *self.stood, *found.off_rate}
+        routes = f"of {len(found.episodes)} routes do not count as they should"
+        files = "files or records are broken and left out"
+        for count, what in ((len(doubtful), routes), (len(found.broken), files)):
+            if count:
+                yield f"{name}: {count} {what}: see the table of records, or --json"
         yield from found.notes[:_NAMED]
 
     def to_json(self) -> dict[str, object]:
@@ -149,28 +129,6 @@ class RealRun:
         )
         named: dict[str, Sequence[str]] = {n: getattr(self.collected, n) for n in names}
         return {**named, "stood": self.stood}
-
-    def _stated(self) -> Iterator[str]:
-        """Yield where merged files contradict their own records."""
-        for path, file in self.collected.stated.items():
-            episodes = [each.episode for each in file.records]
-            again = leaderboard_scores(episodes)
-            score = again.given["driving_score"]
-            rate = again.computed["success_rate"]
-            # of the whole set, or of the routes that were driven (Dev10)
-            means = {
-                "driving score": (score.set, score.driven),
-                "success rate": tuple(
-                    None if mean is None else mean / 100.0
-                    for mean in (rate.set, rate.driven)
-                ),
-                "eval num": (float(len(episodes)),),
-            }
-            for key, said in file.stated.items():
-                known = [mean for mean in means[key] if mean is not None]
-                if not any(math.isclose(said, m, abs_tol=_TOLERANCE) for m in known):
-                    values = " or ".join(number(mean, "g") for mean in means[key])
-                    yield f"{path}: it says {key} {said:g}, its records say {values}"
 
 
 def score_real_run(path: Path, metric_folder: Path | None = None) -> RealRun:

@@ -18,7 +18,6 @@ from me2e_compress.evaluators.bench2drive.recordings import (
 from me2e_compress.evaluators.bench2drive.result_files import (
     DriveRecordings,
     FoundFiles,
-    ResultFile,
     RouteRecord,
     find_files,
 )
@@ -56,7 +55,6 @@ class CollectedResults:
         off_rate: Seconds between two steps, for routes not recorded at the simulator's
             rate.
         repetitions: How often the set was driven: a leaderboard's ``--repetitions``.
-        stated: Merged files that state scores of their own.
     """
 
     episodes: list[Episode] = field(default_factory=list)
@@ -72,7 +70,6 @@ class CollectedResults:
     unrecorded: list[str] = field(default_factory=list)
     off_rate: dict[str, float] = field(default_factory=dict)
     repetitions: int = 1
-    stated: dict[Path, ResultFile] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
 
     @classmethod
@@ -91,8 +88,6 @@ class CollectedResults:
                 by_route.setdefault(record.episode.route, []).append(record)
             if not file.records and not file.broken:
                 made.unfinished.append(file.path)
-            if file.stated:
-                made.stated[file.path] = file
         # one record of each route, in order
         records = [made._chosen(route, each) for route, each in by_route.items()]
         for record in records:

@@ -1,7 +1,6 @@
 """Results of a leaderboard: its records, and files found by content, not by name."""
 
 import codecs
-import math
 import os
 import re
 from collections import Counter
@@ -11,7 +10,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Annotated, Any
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from me2e_compress.errors import EvaluationError
 from me2e_compress.metrics.episode import (
@@ -233,14 +232,12 @@ _PICTURES = {".png", ".jpg", ".jpeg", ".gif", ".mp4", ".npz", ".npy", ".laz", ".
 class ResultFile:
     """One results file: a worker's checkpoint, or several merged.
 
-    ``broken`` says why records could not be read, by their index. ``stated`` are the
-    scores that a merged file states, NaN if not a number.
+    ``broken`` says why records could not be read, by their index.
     """
 
     path: Path
     records: tuple[RouteRecord, ...] = ()
     broken: dict[int, str] = field(default_factory=dict)
-    stated: dict[str, float] = field(default_factory=dict)
 
 
 @dataclass
@@ -342,22 +339,7 @@ def _read(path: Path) -> ResultFile:
             records.append(read_record(raw))
         except BrokenRecordError as error:
             broken[place] = str(error)
-    stated = checked.model_dump(
-        by_alias=True, exclude={"checkpoint"}, exclude_none=True
-    )
-    return ResultFile(path, tuple(records), broken, stated)
-
-
-def _number(value: object) -> float | None:
-    """Return NaN for anything but a number: the records are read all the same."""
-    if value is None:
-        return None
-    if isinstance(value, (int, float)) and abs(value) <= LARGEST:
-        return float(value)
-    return math.nan
-
-
-_Stated = Annotated[float | None, BeforeValidator(_number)]
+    return ResultFile(path, tuple(records), broken)
 
 
 class _Checkpoint(BaseModel):
@@ -367,9 +349,6 @@ class _Checkpoint(BaseModel):
 class _Document(BaseModel):
     model_config = ConfigDict(extra="ignore")
     checkpoint: _Checkpoint = Field(alias="_checkpoint")
-    driving_score: _Stated = Field(None, alias="driving score")
-    success_rate: _Stated = Field(None, alias="success rate")
-    eval_num: _Stated = Field(None, alias="eval num")
 
 
 class DriveRecordings:

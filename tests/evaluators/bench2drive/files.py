@@ -2,7 +2,7 @@
 
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -97,7 +97,7 @@ def checkpoint(*records: Json) -> Json:
     }
 
 
-def merged(*records: Json, said: Mapping[str, float] | None = None) -> Json:
+def merged(*records: Json) -> Json:
     bare = [{key: each[key] for key in each if key != "index"} for each in records]
     scores = [each["scores"]["score_composed"] for each in records]
     return {
@@ -105,7 +105,6 @@ def merged(*records: Json, said: Mapping[str, float] | None = None) -> Json:
         "driving score": sum(scores) / 220,
         "success rate": sum(each["status"] == "Completed" for each in records) / 220,
         "eval num": len(records),
-        **(said or {}),
     }
 
 
