@@ -13,18 +13,15 @@ folder of the recipe, one in a text to where you are.
 """
 
 import dataclasses
-import json
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from importlib import resources
 from pathlib import Path
 
 from me2e_compress.errors import RecipeError
 from me2e_compress.passes import PASSES, Pass
 from me2e_compress.registry import documents
-from me2e_compress.registry.registry import fields_of, is_written
-from me2e_compress.registry.text import chosen_fields
 
-__all__ = ["load", "parse", "shipped", "to_text", "to_toml"]
+__all__ = ["load", "parse", "shipped", "to_text"]
 
 
 def shipped() -> list[str]:
@@ -92,30 +89,3 @@ def parse(text: str) -> tuple[Pass, ...]:
 def to_text(passes: Iterable[Pass]) -> str:
     """Write passes as a pipeline; options at their default are left out."""
     return PASSES.text_all(passes)
-
-
-def to_toml(passes: Iterable[Pass]) -> str:
-    """Write passes as a recipe file; options at their default are left out."""
-    entries: list[str] = []
-    for current in passes:
-        lines = ["[[pass]]", f"name = {_value(current.name)}"]
-        for field in fields_of(type(current)):
-            value = getattr(current, field.name)
-            if value is not None and is_written(field, value):
-                lines.append(f"{field.name} = {_value(value)}")
-        entries.append("\n".join(lines) + "\n")
-    return "\n".join(entries)
-
-
-def _value(value: object) -> str:
-    """Write a value as TOML; a string as JSON, whose escapes TOML has too."""
-    if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        return _value(chosen_fields(value))
-    if isinstance(value, Mapping):
-        pairs = (f"{_value(str(key))} = {_value(each)}" for key, each in value.items())
-        return f"{{{', '.join(pairs)}}}"
-    if isinstance(value, tuple | list):
-        return f"[{', '.join(map(_value, value))}]"
-    if isinstance(value, bool | int | float):
-        return str(value).lower()
-    return json.dumps(str(value), ensure_ascii=False)

@@ -131,14 +131,13 @@ def test_an_edge_keeps_the_contract_of_passes() -> None:
     }
 
 
-def test_edges_have_text_and_toml() -> None:
+def test_edges_have_text() -> None:
     chosen = AblateModules(("occ",), edges=(KEYS, Edge("a", "b", "replace", "c", -2)))
 
-    text, toml = recipe.to_text([chosen]), recipe.to_toml([chosen])
+    text = recipe.to_text([chosen])
 
     assert recipe.parse(text) == (chosen,)
     assert '{source="map", reader="*.attn"}' in text
-    assert '{"source" = "map", "reader" = "*.attn"}' in toml
 
 
 @given(
