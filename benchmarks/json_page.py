@@ -105,7 +105,8 @@ def _is_object(title: str) -> bool:
 def _classes() -> dict[str, type]:
     """Find the classes by name: those of the forms, and all that their fields name."""
     public = (getattr(me2e_compress, name) for name in vars(me2e_compress)["__all__"])
-    results = (e for e in public if isinstance(e, type) and issubclass(e, Result))
+    given = (get_type_hints(e).get("return") for e in public if inspect.isfunction(e))
+    results = (e for e in given if isinstance(e, type) and issubclass(e, Result))
     found, waiting = dict[str, type](), list[Any]([*NAMED, *results])
     while waiting:
         each = waiting.pop()

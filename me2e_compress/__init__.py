@@ -22,40 +22,24 @@ if TYPE_CHECKING:  # what a type checker sees; at run time names load when asked
     from me2e_compress.graph.modules.module_map import ModuleMap as ModuleMap
     from me2e_compress.manager import PassManager as PassManager
     from me2e_compress.manager import Report as Report
-    from me2e_compress.manager import Step as Step
-    from me2e_compress.manager import Verification as Verification
     from me2e_compress.passes import PASSES as PASSES
     from me2e_compress.passes import Context as Context
     from me2e_compress.passes import Pass as Pass
     from me2e_compress.passes import PassResult as PassResult
-    from me2e_compress.study import StudyResult as StudyResult
     from me2e_compress.study import load_study as load_study
     from me2e_compress.study import run_study as run_study
     from me2e_compress.study.report.page import write_study as write_study
-    from me2e_compress.workflows.calibrate import CalibrateResult as CalibrateResult
     from me2e_compress.workflows.calibrate import calibrate as calibrate
-    from me2e_compress.workflows.compare import CompareResult as CompareResult
-    from me2e_compress.workflows.compare import (
-        FirstDifferenceResult as FirstDifferenceResult,
-    )
     from me2e_compress.workflows.compare import compare as compare
     from me2e_compress.workflows.compare import first_difference as first_difference
-    from me2e_compress.workflows.compare_dump import DumpResult as DumpResult
     from me2e_compress.workflows.compare_dump import compare_dump as compare_dump
-    from me2e_compress.workflows.compress import CompressResult as CompressResult
     from me2e_compress.workflows.compress import compress as compress
-    from me2e_compress.workflows.evaluate import EvaluateResult as EvaluateResult
-    from me2e_compress.workflows.evaluate import ModelCheck as ModelCheck
     from me2e_compress.workflows.evaluate import check_model as check_model
     from me2e_compress.workflows.evaluate import evaluate as evaluate
-    from me2e_compress.workflows.files import JoinResult as JoinResult
-    from me2e_compress.workflows.files import SplitResult as SplitResult
     from me2e_compress.workflows.files import join as join
     from me2e_compress.workflows.files import split as split
     from me2e_compress.workflows.frames import record_frames as record_frames
-    from me2e_compress.workflows.inspect import InspectResult as InspectResult
     from me2e_compress.workflows.inspect import inspect as inspect
-    from me2e_compress.workflows.lint import LintResult as LintResult
     from me2e_compress.workflows.lint import lint as lint
     from me2e_compress.workflows.options import CalibrateOptions as CalibrateOptions
     from me2e_compress.workflows.options import CompareOptions as CompareOptions
@@ -70,15 +54,10 @@ if TYPE_CHECKING:  # what a type checker sees; at run time names load when asked
     from me2e_compress.workflows.options import SearchOptions as SearchOptions
     from me2e_compress.workflows.options import SensitivityOptions as SensitivityOptions
     from me2e_compress.workflows.options import WriteOptions as WriteOptions
-    from me2e_compress.workflows.plan import PlanResult as PlanResult
     from me2e_compress.workflows.plan import plan as plan
-    from me2e_compress.workflows.profile import ProfileResult as ProfileResult
     from me2e_compress.workflows.profile import profile as profile
     from me2e_compress.workflows.result import Listener as Listener
-    from me2e_compress.workflows.score import ScoreResult as ScoreResult
     from me2e_compress.workflows.score import score as score
-    from me2e_compress.workflows.search import SearchResult as SearchResult
-    from me2e_compress.workflows.search import SensitivityResult as SensitivityResult
     from me2e_compress.workflows.search import (
         measure_sensitivity as measure_sensitivity,
     )
@@ -91,31 +70,29 @@ _ROOMS = {
     "calibration.dataset": "CalibrationSet",
     "errors": "Me2eError",
     "graph.modules.module_map": "ModuleMap",
-    "manager": "PassManager Report Step Verification",
+    "manager": "PassManager Report",
     "passes": "Context PASSES Pass PassResult",
-    "study": "StudyResult load_study run_study",
+    "study": "load_study run_study",
     "study.report.page": "write_study",
-    "workflows.calibrate": "CalibrateResult calibrate",
-    "workflows.compare": (
-        "CompareResult FirstDifferenceResult compare first_difference"
-    ),
-    "workflows.compare_dump": "DumpResult compare_dump",
-    "workflows.compress": "CompressResult compress",
-    "workflows.evaluate": "EvaluateResult ModelCheck check_model evaluate",
-    "workflows.files": "JoinResult SplitResult join split",
+    "workflows.calibrate": "calibrate",
+    "workflows.compare": "compare first_difference",
+    "workflows.compare_dump": "compare_dump",
+    "workflows.compress": "compress",
+    "workflows.evaluate": "check_model evaluate",
+    "workflows.files": "join split",
     "workflows.frames": "record_frames",
-    "workflows.inspect": "InspectResult inspect",
-    "workflows.lint": "LintResult lint",
+    "workflows.inspect": "inspect",
+    "workflows.lint": "lint",
     "workflows.options": (
         "CalibrateOptions CompareOptions CompressOptions "
         "EvaluateOptions FramesOptions GraphOptions InspectOptions LintOptions "
         "PlanOptions ProfileOptions SearchOptions SensitivityOptions WriteOptions"
     ),
-    "workflows.plan": "PlanResult plan",
-    "workflows.profile": "ProfileResult profile",
+    "workflows.plan": "plan",
+    "workflows.profile": "profile",
     "workflows.result": "Listener",
-    "workflows.score": "ScoreResult score",
-    "workflows.search": "SearchResult SensitivityResult measure_sensitivity search",
+    "workflows.score": "score",
+    "workflows.search": "measure_sensitivity search",
 }
 _HOMES = {name: room for room, names in _ROOMS.items() for name in names.split()}
 
