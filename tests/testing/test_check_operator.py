@@ -16,7 +16,7 @@ from me2e_compress.operators import (
     Operand,
     Operator,
 )
-from me2e_compress.operators.call import Attributes, AttributeValue
+from me2e_compress.operators.call import Attributes
 from me2e_compress.operators.dialect import Arrays, NdArray, Values, number, present
 from me2e_compress.testing import DrawnCall, check_operator
 
@@ -113,13 +113,6 @@ class Forgetful(Dialect):
         return {"gain": 3}
 
 
-class Lax(Dialect):
-    """Takes any attribute."""
-
-    def attributes_of(self, node: ir.Node) -> dict[str, AttributeValue]:
-        return {"gain": 2}
-
-
 class Counted(Dialect):
     """Says that it gives integers."""
 
@@ -157,7 +150,6 @@ class OtherOwn(Gain):
             spelt(Counted),
             "test, opset 13: the output is said to be INT32, it is float32",
         ),
-        (spelt(Lax), "test, opset 13: it takes an attribute"),
         (OtherLetters(), "gain: work has 'Q', which is no letter of an operand"),
         (LateBody(), "gain in the dialect me2e, opset 20: the body is off"),
         (OtherOwn(), "gain: the own form is 'test' in the domain 'some'"),
