@@ -21,34 +21,16 @@ LEAST_BYTES = 1024
 _FLOATS = (ir.DataType.FLOAT, ir.DataType.FLOAT16, ir.DataType.DOUBLE)
 
 
-@dataclasses.dataclass(frozen=True)
-class FloatWeight:
-    """A weight that stays float, with the first node that reads it.
+def float_bytes(model: ir.Model, plan: QuantPlan) -> dict[str, int]:
+    """Count the bytes of weights that a plan leaves in float, by rule; most first.
 
-    ``rule`` keeps it float, e.g. ``gemv``; ``target`` if the runtime does. ``module``
-    is empty if unknown.
+    The rule is that of the first node that reads the weight, or ``target``. A weight
+    that any node stores as int8 does not count, nor do biases of int8 layers and
+    constants below a kilobyte. The plan must include what the target leaves in float.
     """
-
-    name: str
-    bytes: int
-    node: str
-    op: str
-    module: str
-    rule: str
-    reason: str
-
-
-def float_weights(model: ir.Model, plan: QuantPlan) -> tuple[FloatWeight, ...]:
-    """List the weights that a plan leaves in float, the largest first.
-
-    A weight that any node stores as int8 is not among them, nor are biases of int8
-    layers and constants below a kilobyte. The plan must include what the target leaves
-    in float.
-    """
-    # decisions by node, and those that the target does not follow
     decided = {each.output: each for each in plan.decisions}
-    kept = {each.output: each.reason for each in plan.kept_float}
-    found, stored = dict[str, FloatWeight](), set[str]()
+    kept = {each.output for each in plan.kept_float}
+    left, stored = dict[str, tuple[str, int]](), set[str]()
     # float weights, and those that some other node stores as int8
     for node in model.graph:
         decision = decided.get(str(node.outputs[0].name)) if node.outputs else None
@@ -64,19 +46,14 @@ def float_weights(model: ir.Model, plan: QuantPlan) -> tuple[FloatWeight, ...]:
             if is_int8 and at == decision.weight:
                 stored.add(name)
             elif not is_int8:
-                reason = kept.get(decision.output)
-                left = FloatWeight(
-                    *(name, tensor.nbytes, decision.node, decision.op, decision.module),
-                    decision.rule if reason is None else "target",
-                    decision.reason if reason is None else reason,
-                )
-                found.setdefault(name, left)
-    weights = (each for name, each in found.items() if name not in stored)
-    return tuple(sorted(weights, key=lambda each: (-each.bytes, each.name)))
+                rule = "target" if decision.output in kept else decision.rule
+                left.setdefault(name, (rule, tensor.nbytes))
+    by_rule = Counter[str]()
+    for name, (rule, count) in left.items():
+        by_rule[rule] += 0 if name in stored else count
+    return {rule: count for rule, count in by_rule.most_common() if count}
 
 
-LISTED = 10
-"""Number of float weights that a report lists."""
 LEAST_SHOWN = 10_000
 """Bytes of float weights from which on a rule is named."""
 _FOR_TENSORRT = (
@@ -95,7 +72,6 @@ class Int8Outcome:
         layers: convolutions and matrix products; in all modules, None where
             the pass leaves no plan.
         kept: layers left float, by rule and reason; most first.
-        weights: the largest that stayed float; at most `LISTED`.
         float_bytes: weights that stayed float, by rule; most first.
         slow_here: that this CPU runs it slowly, and what is fast; None where it is not
             for TensorRT, or another provider runs it.
@@ -105,7 +81,6 @@ class Int8Outcome:
     nodes: int
     layers: int | None = None
     kept: Mapping[str, int] = dataclasses.field(default_factory=dict)
-    weights: tuple[FloatWeight, ...] = ()
     float_bytes: Mapping[str, int] = dataclasses.field(default_factory=dict)
     slow_here: str | None = None
 
@@ -126,17 +101,13 @@ class Int8Outcome:
         layers = [each for each in plan.decisions if each.op in WEIGHTED]
         placed = {each.output for each in plan.placed}
         left = [each for each in layers if each.output not in placed]
-        weights, by_rule = float_weights(quantizer.before, plan), Counter[str]()
-        for each in weights:
-            by_rule[each.rule] += each.bytes
         slow = plan.target == "tensorrt" and context.provider.native == CPU.native
         return cls(
             name,
             changes,
             len(layers),
             dict(Counter(f"{e.rule}: {e.reason}" for e in left).most_common()),
-            weights[:LISTED],
-            dict(by_rule.most_common()),
+            float_bytes(quantizer.before, plan),
             _FOR_TENSORRT if changes and slow else None,
         )
 
@@ -166,10 +137,4 @@ class Int8Outcome:
             found.append(f"{self.layers} convolutions and matrix products in the graph")
         most = list(self.kept.items())[:2]
         found += [f"{count} by rule {why}" for why, count in most]
-        if self.weights:
-            largest = self.weights[0]
-            found.append(
-                f"the largest weight is {largest.name} of {largest.op}"
-                f" {largest.node!r}, rule {largest.rule}: {largest.reason}"
-            )
         return "; ".join(found)

@@ -20,7 +20,7 @@ from me2e_compress.quantization.plan import make_plan, tensors_of
 from me2e_compress.quantization.rules import RuleSet
 from me2e_compress.quantization.rules.rule_sets import PaperRules, SafeRules
 from me2e_compress.quantization.scheme import QuantScheme
-from me2e_compress.workflows.int8_outcome import FloatWeight, float_weights
+from me2e_compress.workflows.int8_outcome import float_bytes
 from tests.calls import calls
 from tests.nets import FULL, MODULES, PAPER, conv_attention, net
 
@@ -339,19 +339,13 @@ def model() -> ir.Model:
     return net(TEXT, {name: np.ones(shape) for name, shape in shapes.items()})
 
 
-def left(model: ir.Model, modules: tuple[str, ...]) -> tuple[FloatWeight, ...]:
+def left(model: ir.Model, modules: tuple[str, ...]) -> dict[str, int]:
     quantizer = QuantizeInt8(modules=modules, rules="paper")
-    return float_weights(model, quantizer.plan(model, Context(MODULES)))
+    return float_bytes(model, quantizer.plan(model, Context(MODULES)))
 
 
-def test_the_largest_weights_that_stay_float_come_first_each_with_its_rule(
-    model: ir.Model,
-) -> None:
-    found = left(model, ("backbone", "head"))
+def test_bytes_of_weights_that_stay_float_are_counted_by_rule(model: ir.Model) -> None:
+    recurrent, table, layer = 2 * 4 * 256 * 64, 4 * 64 * 64, 4 * 32 * 64
 
-    assert [each.name for each in found] == ["recurrent", "step", "table"]
-    assert found[0].bytes == 4 * 256 * 64
-    assert (found[0].op, found[0].module, found[0].rule) == ("LSTM", "head", "operator")
-    assert found[0].reason == "LSTM is not a weighted layer"
-    (layer,) = [each for each in left(model, ("head",)) if each.name == "layer"]
-    assert (layer.rule, layer.node) == ("module", "/backbone/MatMul")
+    assert left(model, ("backbone", "head")) == {"operator": recurrent + table}
+    assert left(model, ("head",)) == {"operator": recurrent + table, "module": layer}
