@@ -31,6 +31,8 @@ import onnxruntime
 
 from benchmarks.processes import answer, last_line
 from benchmarks.real_frames import MAKERS, Frame, opened
+from me2e_compress import graph
+from me2e_compress.passes.freeze_inputs import deciding_inputs
 
 PACKAGES = (
     "rapidocr-onnxruntime==1.4.4",
@@ -169,6 +171,8 @@ def run_tool(tool: str, model: Path, frame: Frame, made: Path) -> str:
     """Let a tool write its file; return why it did not, or nothing."""
     made.unlink(missing_ok=True)
     if tool in OURS:
+        if names := deciding_inputs(graph.load(model)):
+            model = frozen(model, names, made)
         command = [sys.executable, "-c", COMMAND, "compress", model, *OURS[tool]]
         command += ["--frames", made.parent / "frames", "-o", made, "--force"]
         command += [
@@ -182,6 +186,17 @@ def run_tool(tool: str, model: Path, frame: Frame, made: Path) -> str:
     )
     made.with_suffix(".log").write_text(done.stdout + done.stderr)
     return "" if done.returncode == 0 else last_line(done) or f"exit {done.returncode}"
+
+
+def frozen(model: Path, names: tuple[str, ...], made: Path) -> Path:
+    """Make flags constants, as inspect advises; return the file."""
+    passes = f"import-normalize,freeze-inputs{{inputs=[{','.join(names)}]}}"
+    output = made.with_name("frozen.onnx")
+    command = [sys.executable, "-c", COMMAND, "compress", str(model), "--force"]
+    command += ["--passes", f"{passes},fold-constants", "-o", str(output)]
+    command += ["--frames", str(made.parent / "frames")]
+    done = subprocess.run(command, capture_output=True, check=False)
+    return output if done.returncode == 0 else model
 
 
 def open_sizes(model: Path, frame: Frame) -> list[str]:
@@ -232,14 +247,14 @@ def judged(
 def count_nodes(model: Path) -> int:
     """Count the nodes of a file, those of branches too, without constants."""
 
-    def walk(graph: onnx.GraphProto) -> int:
+    def walk(body: onnx.GraphProto) -> int:
         inner = [
             each.g
-            for node in graph.node
+            for node in body.node
             for each in node.attribute
             if each.HasField("g")
         ]
-        own = sum(node.op_type != "Constant" for node in graph.node)
+        own = sum(node.op_type != "Constant" for node in body.node)
         return own + sum(map(walk, inner))
 
     return walk(onnx.load(model).graph)

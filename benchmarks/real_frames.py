@@ -89,8 +89,8 @@ def speech(rng: np.random.Generator, samples: int) -> Array:
     knots = rng.choice([0.0, 0.3, 1.0], samples // 2400 + 2, p=(0.35, 0.25, 0.4))
     voice *= np.interp(np.arange(samples), np.arange(len(knots)) * 2400, knots)
     voice *= rng.uniform(0.05, 0.7) / (np.abs(voice).max() + 1e-9)
-    tilt = (1 + hertz / 800) ** rng.uniform(0, 1)
-    noise = np.fft.irfft(np.fft.rfft(rng.normal(size=samples)) / tilt, samples)
+    white = np.fft.rfft(rng.normal(size=samples))
+    noise = np.fft.irfft(white / (1 + hertz / 800) ** rng.uniform(0, 1), samples)
     noise *= 10 ** rng.uniform(-4, -1) / noise.std()
     return np.clip(voice + noise, -1, 1).astype(np.float32)
 

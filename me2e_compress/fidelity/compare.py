@@ -316,7 +316,7 @@ def channel_axes(shape: tuple[int, ...]) -> tuple[int, ...]:
     elif rank == 4 and max(shape[2:]) <= _OF_PICTURES * min(shape[2:]):
         axes = (1,)
     elif rank > 3:
-        axes = (1, rank - 1)
+        axes = 1, rank - 1
     return tuple(axis for axis in axes if 1 < shape[axis] <= _CHANNELS)
 
 

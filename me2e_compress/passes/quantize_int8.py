@@ -13,7 +13,7 @@ from me2e_compress.display import counted
 from me2e_compress.errors import PreconditionError
 from me2e_compress.passes.base import Context, Pass, PassResult
 from me2e_compress.quantization.decision import INT8, Overrides, QuantPlan, stamp_plan
-from me2e_compress.quantization.plan import make_plan, sharing_costs
+from me2e_compress.quantization.plan import make_plan
 from me2e_compress.quantization.rules import DEFAULT_RULES, RULE_SETS, RuleSet
 from me2e_compress.quantization.scheme import QuantScheme
 from me2e_compress.registry.registry import WRITTEN
@@ -103,7 +103,7 @@ class QuantizeInt8(Pass):
         # Place the quantizers and record the plan
         placed = target.place(model, plan, ranges)
         stamp_plan(placed, plan)
-        notes = (*_notes(plan, self.target), *_findings(plan, ranges))
+        notes = (*_notes(plan, self.target), *_findings(ranges))
         return PassResult(placed, len(plan.placed), notes)
 
     def plan(self, model: ir.Model, context: Context) -> QuantPlan:
@@ -162,18 +162,11 @@ def _notes(plan: QuantPlan, target: str) -> tuple[str, ...]:
     )
 
 
-def _findings(plan: QuantPlan, ranges: Ranges) -> tuple[str, ...]:
-    # Losses of tensors that share a scale, largest first
-    shared = [
-        f"{cost.group.name}: {len(cost.group.tensors)} tensors, {cost.tensor} loses"
-        f" {cost.loss_db:.1f} dB"
-        for cost in sorted(sharing_costs(plan, ranges), key=lambda cost: -cost.loss_db)
-    ]
+def _findings(ranges: Ranges) -> tuple[str, ...]:
     on = counted(ranges.frames, "frame")
     return (
         f"{counted(len(ranges.tensors), 'tensor')} calibrated on {on}",
         *map(str, review(ranges)),
-        *_first(shared, "scales shared by what a Concat joins"),
     )
 
 

@@ -6,7 +6,7 @@ import json
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Literal, Self
+from typing import Self
 
 import onnx_ir as ir
 import pydantic
@@ -70,17 +70,14 @@ class Decision:
 
 @dataclasses.dataclass(frozen=True)
 class ScaleGroup:
-    """Tensors, or readers of one, that are quantized together.
+    """Inputs and result of a Concat, which are on one scale where they can be.
 
     Attributes:
-        kind: ``shared-input`` or ``concat``. Several nodes read one tensor;
-            or the inputs and the result of a Concat are on one scale.
-        name: name of the tensor, or of the Concat.
+        name: name of the Concat.
         tensors: the activations on one scale.
         nodes: names of the nodes that read them in int8.
     """
 
-    kind: str
     name: str
     tensors: tuple[str, ...]
     nodes: tuple[str, ...]
@@ -106,7 +103,7 @@ class QuantPlan:
         scheme: the modules that are to be int8.
         decisions: one per node.
         rules: name of the rule set.
-        groups: what was decided together.
+        groups: what Concats join.
         kept_float: int8 nodes that stay float on the target; empty before the plan was
             carried out for one.
         balanced: whether weights are rounded so that their errors cancel.
@@ -214,10 +211,6 @@ def plan_of(model: ir.Model) -> QuantPlan | None:
 #    dtype = "float"               # or "int8"
 #    reason = "costs 3 dB"         # may be left out
 #
-#    [[concat]]
-#    nodes = "/neck/Concat*"       # scales of what these join stay apart
-#    scale = "own"
-#
 # Names are those of the nodes when they are quantized, or of the nodes of the source
 # file that they stand for. Where two overrides match a node, the later counts.
 
@@ -292,25 +285,10 @@ def overrides_text(overrides: Iterable[Override]) -> str:
     return "\n".join(entries)
 
 
-class ConcatScale(_Strict):
-    """Concats whose inputs keep scales of their own."""
-
-    nodes: str
-    scale: Literal["own"]
-
-    def matches(self, node: ir.Node, names: Sequence[str]) -> bool:
-        """Return whether it applies to a node of these names."""
-        return node.op_type == "Concat" and _named(names, self.nodes)
-
-    def __str__(self) -> str:
-        return f"concat {self.nodes!r}"
-
-
 class Overrides(_Strict):
     """A file of exceptions."""
 
     override: tuple[Override, ...] = ()
-    concat: tuple[ConcatScale, ...] = ()
 
     @classmethod
     def load(cls, path: Path) -> Self:
@@ -345,17 +323,12 @@ class Overrides(_Strict):
             origins = () if past is None else past.origins
             main[node] = (node.name or "", *origins)
         pinned: dict[ir.Node, Override] = {}
-        apart: set[ir.Node] = set()
-        rules: tuple[Override | ConcatScale, ...] = (*self.override, *self.concat)
-        for each in rules:
+        for each in self.override:
             nodes = [node for node, names in main.items() if each.matches(node, names)]
             if not nodes:
                 raise RecipeError(f"override {each} matches none of {len(main)} nodes")
-            if isinstance(each, Override):  # the last that matches a node wins
-                pinned.update(dict.fromkeys(nodes, each))
-            else:
-                apart.update(nodes)
-        return Pins(pinned, frozenset(apart))
+            pinned.update(dict.fromkeys(nodes, each))  # the last that matches wins
+        return Pins(pinned)
 
 
 NONE = Overrides()
@@ -363,13 +336,9 @@ NONE = Overrides()
 
 @dataclasses.dataclass(frozen=True)
 class Pins:
-    """Overrides bound to the nodes of one graph.
-
-    ``apart`` holds the Concats whose inputs keep scales of their own.
-    """
+    """Overrides bound to the nodes of one graph."""
 
     pinned: Mapping[ir.Node, Override]
-    apart: frozenset[ir.Node]
 
     def get(self, node: ir.Node) -> Override | None:
         """Return the user's decision for a node, if any."""

@@ -2,12 +2,10 @@
 
 import dataclasses
 import functools
-import math
 from collections.abc import Mapping, Sequence
 
 import onnx_ir as ir
 
-from me2e_compress.calibration.observers import scale_of
 from me2e_compress.calibration.ranges import Ranges
 from me2e_compress.graph import (
     CONVOLUTIONS,
@@ -43,18 +41,14 @@ from me2e_compress.quantization.scheme import QuantScheme
 # Find tensors whose scales are decided together.
 
 
-SHARED, CONCAT = "shared-input", "concat"
-
-
 def find_groups(
-    graph: ir.Graph, decided: Mapping[ir.Node, Decision], pins: Pins, *, concat: bool
+    graph: ir.Graph, decided: Mapping[ir.Node, Decision]
 ) -> tuple[ScaleGroup, ...]:
-    """List the tensors and readers that are decided together.
+    """List the tensors that Concats join, with their readers.
 
-    A tensor that several int8 nodes read has one pair: keeping one of its readers in
-    float saves nothing unless the others go too. With ``concat``, a Concat whose result
-    is read as int8 is put on one scale with those of its inputs that are read as int8
-    elsewhere: it then moves int8 as it is. Concats of Concats are one group.
+    A Concat whose result is read as int8 is put on one scale with those of its inputs
+    that are read as int8 elsewhere: it then moves int8 as it is. Concats of Concats are
+    one group.
     """
     # int8 readers of every tensor
     readers: dict[ir.Value, list[str]] = {}
@@ -63,20 +57,6 @@ def find_groups(
             value = node.inputs[index]
             if value is not None:
                 readers.setdefault(value, []).append(decision.node or decision.output)
-    found = [
-        ScaleGroup(SHARED, str(value.name), (str(value.name),), tuple(nodes))
-        for value, nodes in readers.items()
-        if len(nodes) > 1
-    ]
-    # scales that a Concat joins
-    if concat:
-        found += _concats(graph, readers, pins)
-    return tuple(found)
-
-
-def _concats(
-    graph: ir.Graph, readers: Mapping[ir.Value, list[str]], pins: Pins
-) -> list[ScaleGroup]:
     head_of: dict[ir.Value, ir.Node] = {}
     members: dict[ir.Node, list[ir.Value]] = {}
 
@@ -90,7 +70,7 @@ def _concats(
 
     # from the last Concat back, so that Concats of Concats join its group
     for node in reversed(graph):
-        if node.op_type != "Concat" or node in pins.apart:
+        if node.op_type != "Concat":
             continue
         result = node.outputs[0]
         if result in readers or result in head_of:
@@ -106,8 +86,8 @@ def _concats(
         tensors = tuple(str(value.name) for value in read)
         if len(tensors) > 1:
             name = head.name or tensors[0]
-            groups.append(ScaleGroup(CONCAT, name, tensors, tuple(nodes)))
-    return groups
+            groups.append(ScaleGroup(name, tensors, tuple(nodes)))
+    return tuple(groups)
 
 
 APART = 4.0
@@ -121,7 +101,7 @@ def share_scales(plan: QuantPlan, ranges: Ranges) -> Ranges:
     """
     widened = dict(ranges.tensors)
     for group in plan.groups:
-        if group.kind == CONCAT and all(name in widened for name in group.tensors):
+        if all(name in widened for name in group.tensors):
             reach = {name: max(map(abs, widened[name])) for name in group.tensors}
             near = max(reach.values()) / APART
             names = [name for name, size in reach.items() if size >= near or not size]
@@ -129,38 +109,6 @@ def share_scales(plan: QuantPlan, ranges: Ranges) -> Ranges:
             whole = min(low for low, _ in bounds), max(high for _, high in bounds)
             widened.update(dict.fromkeys(names, whole))
     return dataclasses.replace(ranges, tensors=widened)
-
-
-@dataclasses.dataclass(frozen=True)
-class SharingCost:
-    """The cost of one scale for a group.
-
-    ``tensor`` loses most; ``loss_db`` is how much its rounding noise rises, 0 if it had
-    the widest range.
-    """
-
-    group: ScaleGroup
-    tensor: str
-    loss_db: float
-
-
-def sharing_costs(plan: QuantPlan, ranges: Ranges) -> tuple[SharingCost, ...]:
-    """Return what each concat group costs: ``20 log10(shared step / own step)``."""
-    wide, own = share_scales(plan, ranges).tensors, ranges.tensors
-    costs = []
-    for group in plan.groups:
-        if group.kind != CONCAT or any(name not in own for name in group.tensors):
-            continue
-        # what is always zero has no step of its own, and loses nothing
-        losses = {
-            name: 20 * math.log10(float(scale_of(*wide[name])) / float(scale_of(*each)))
-            if (each := own[name]) != (0.0, 0.0)
-            else 0.0
-            for name in group.tensors
-        }
-        worst = max(losses, key=lambda name: losses[name])
-        costs.append(SharingCost(group, worst, losses[worst]))
-    return tuple(costs)
 
 
 def make_plan(
@@ -214,7 +162,7 @@ def make_plan(
     decided.update(_residuals(main, decided, facts, pins))
     pins.check(decided)
     decisions = tuple(decided.values())
-    groups = find_groups(main, decided, pins, concat=asked.share_concat)
+    groups = find_groups(main, decided) if asked.share_concat else ()
     text = RULE_SETS.text(asked)
     return QuantPlan(scheme, decisions, text, groups, balanced=asked.balance)
 

@@ -151,12 +151,12 @@ class PlanResult(Result):
         what = ("node", "what, by which rule, why")
         tables.append(table("Decisions", what, rows, words=2))
         groups = [
-            (group.name, group.kind, ", ".join(group.tensors), ", ".join(group.nodes))
+            (group.name, ", ".join(group.tensors), ", ".join(group.nodes))
             for group in self.plan.groups
         ]
         if groups:
-            columns = ("of", "kind", "tensors", "read by")
-            tables.append(table("Decided together", columns, groups, words=4))
+            columns = ("Concat", "tensors", "read by")
+            tables.append(table("On one scale", columns, groups, words=3))
         return Shown(self.plan.headline, tables, lines)
 
     def to_json(self) -> object:

@@ -66,28 +66,26 @@ def test_options_are_not_for_a_plan_that_is_made(
     assert f"{option} is for a plan that is yet to be made, and {file} has" in said
 
 
-def test_what_is_decided_together_is_listed(cli: Cli, tmp_path: Path) -> None:
+def test_what_a_concat_joins_is_listed(cli: Cli, tmp_path: Path) -> None:
     model = net(
-        "two (float[4,32] x, float[32,32] v, float[32,32] w)"
-        " => (float[4,32] k, float[4,32] q) { k = MatMul(x, v) q = MatMul(x, w) }",
-        {"v": np.eye(32), "w": np.ones((32, 32))},
+        "two (float[4,32] x, float[32,32] v, float[64,32] w) => (float[4,32] k,"
+        " float[4,32] q) { k = MatMul(x, v) c = Concat<axis=1>(x, k) q = MatMul(c, w) }",
+        {"v": np.eye(32), "w": np.ones((64, 32))},
     )
     graph.save(model, tmp_path / "two.onnx")
     (tmp_path / "map.toml").write_text(
         '[modules.head]\nrole = "prediction"\noptional = ["**"]\n'
     )
 
-    assert "shared-input" in cli.done(f"plan two.onnx {MAP} -v").out
+    assert "On one scale" in cli.done(f"plan two.onnx {MAP} -v").out
 
 
-def test_what_a_target_kept_is_told(cli: Cli, dense: Path) -> None:
+def test_what_a_target_kept_is_shown(cli: Cli, dense: Path) -> None:
     cli.done(MADE)
     made = load_plan(dense / "out.plan.json")
     kept = tuple(KeptFloat(each.node, each.output, "slow") for each in made.chosen)
-    bracketed = tuple(
-        dataclasses.replace(each, reason="[8,8]") for each in made.decisions
-    )
-    changed = dataclasses.replace(made, kept_float=kept, decisions=bracketed)
+    wide = tuple(dataclasses.replace(each, reason="[8,8]") for each in made.decisions)
+    changed = dataclasses.replace(made, kept_float=kept, decisions=wide)
     save_plan(changed, dense / "kept.plan.json")
 
     said = cli.done("plan kept.plan.json -v").words

@@ -76,7 +76,6 @@ COMPRESS = {
     f"{INT8} --overrides node.toml": r"/radar/\*'? matches none of 2 nodes",
     f"{INT8} --overrides module.toml": "radar'? matches none of 2 nodes",
     f"{INT8} --overrides reads.toml": "radar'? matches none of 2 nodes",
-    f"{INT8} --overrides concat.toml": r"/radar/\*'? matches none of 2 nodes",
 }
 CALIBRATE = {
     "": "ranges are never made up",
@@ -149,7 +148,6 @@ OVERRIDES = {
     "node": '[[override]]\nnodes = "/radar/*"\ndtype = "float"',
     "module": '[[override]]\nmodule = "radar"\ndtype = "float"',
     "reads": '[[override]]\nreads = "radar"\ndtype = "float"',
-    "concat": '[[concat]]\nnodes = "/radar/*"\nscale = "own"',
     "radar": '[modules.radar]\nrole = "feature"\npatterns = ["radar_net"]\n',
 }
 RANGES: Mapping[str, Mapping[str, Any]] = {

@@ -23,9 +23,6 @@ OVERRIDES = """
 nodes = "/head/L*"
 dtype = "float"
 reason = "costs 3 dB"
-[[concat]]
-nodes = "*"
-scale = "own"
 """
 RECIPE = """
 [[pass]]

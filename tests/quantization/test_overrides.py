@@ -78,7 +78,6 @@ def test_names_of_the_source_file_match_too() -> None:
             '[[override]]\nnodes = "/planner/*"\ndtype = "float"',
             r"override nodes '/planner/\*' matches none of 10 nodes",
         ),
-        ('[[concat]]\nnodes = "*"\nscale = "own"', r"override concat '\*' matches non"),
         (
             '[[override]]\nop = "Softmax"\ndtype = "int8"',
             "override op 'Softmax': /head/Softmax cannot be int8: Softmax in|is no",

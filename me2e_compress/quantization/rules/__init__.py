@@ -178,9 +178,9 @@ class Rule(abc.ABC):
     name: ClassVar[str]
     firm: ClassVar[bool] = False
 
-    @abc.abstractmethod
     def objection(self, node: ir.Node, facts: RuleFacts) -> str | None:
         """Return why this node stays in float; None if it need not."""
+        return None
 
     def objections(
         self, int8: Collection[ir.Node], facts: RuleFacts

@@ -216,10 +216,6 @@ class CostGate(Rule):
 
     name: ClassVar[str] = "cost"
 
-    def objection(self, node: ir.Node, facts: RuleFacts) -> str | None:
-        """Object to nothing: what a node costs depends on its neighbours."""
-        return None
-
     def objections(
         self, int8: Collection[ir.Node], facts: RuleFacts
     ) -> Mapping[ir.Node, str]:
@@ -240,10 +236,6 @@ class FileSize(Rule):
     """
 
     name: ClassVar[str] = "size"
-
-    def objection(self, node: ir.Node, facts: RuleFacts) -> str | None:
-        """Object to nothing: who reads a weight as float is decided by other rules."""
-        return None
 
     def objections(
         self, int8: Collection[ir.Node], facts: RuleFacts
