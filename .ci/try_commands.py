@@ -62,7 +62,6 @@ USES = (
     "evaluate small.onnx --check",
     "score real",
     "study study.toml -o study",
-    "routes --scenarios ParkingCutIn --variants 1 -o routes.json",
     "demo -o out",
     "join stack.toml -o one.onnx",
     "split one.onnx stack.toml -o files",

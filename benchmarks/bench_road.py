@@ -11,7 +11,7 @@ The first three look at the set that ships, another, or so many proposals of eac
 how many actors move within 80 m of the ego as a route begins (the median over routes),
 and how often blind drivers of five speeds and the scenario's others meet, by type; they
 also count types whose light shows a blind driver red or yellow, and those with a sign.
-Blind drivers decide ten times a second. ``--admission`` takes what ``routes --json``
+Blind drivers decide ten times a second. ``--admission`` takes what ``admit_routes``
 printed, and counts the proposals that were refused, by reason. The last compares
 kept drives of one set: the share of routes with a driving score of exactly 100, how
 many routes do not end alike for all, and both by type.
@@ -28,12 +28,10 @@ from pathlib import Path
 from statistics import fmean, median
 from typing import Self
 
+from me2e_compress.driving.latency import FixedLatency
+from me2e_compress.evaluators.contract import Drive
 from me2e_compress.evaluators.highway.blind import Blind
-from me2e_compress.evaluators.highway.generate import (
-    TEN_A_SECOND,
-    propose,
-    seed_of,
-)
+from me2e_compress.evaluators.highway.driven_frames import propose, seed_of
 from me2e_compress.evaluators.highway.runner import Listeners, drive
 from me2e_compress.metrics.measure import Estimate, mean_estimate
 from me2e_compress.metrics.route_summary import RouteSummary
@@ -96,9 +94,8 @@ def blind_drive(route: Route, speed_mps: float) -> BlindDrive:
     episode = drive(
         route,
         Blind(speed_mps),
-        TEN_A_SECOND,
+        Drive(FixedLatency(100_000)),
         Listeners(on_query=look),
-        lambda world: False,
     )
     kinds = [event.kind for event in worlds[-1].events]
     return BlindDrive(EventKind.TRIGGER in kinds, bool(episode.infractions), any(lit))
@@ -273,7 +270,7 @@ def main() -> None:
     parser.add_argument("--variants", type=int, default=5, help="driven of each type")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--workers", type=int, default=1)
-    parser.add_argument("--admission", type=Path, help="what routes --json printed")
+    parser.add_argument("--admission", type=Path, help="what admit_routes printed")
     parser.add_argument(
         "--compare", type=Path, nargs="+", help="routes.csv, or records"
     )

@@ -63,10 +63,10 @@ _PANELS = {
     "Graphs and frames": "export inspect join split frames",
     "Compress": "plan calibrate compress lint sensitivity search",
     "Compare and measure": "compare profile",
-    "Drive": "evaluate score study routes",
+    "Drive": "evaluate score study",
 }
 """Commands in the order in which ``--help`` lists them."""
-_DRIVING = ("evaluate", "study", "routes")
+_DRIVING = ("evaluate", "study")
 COMMANDS = {name: panel for panel, names in _PANELS.items() for name in names.split()}
 """The panel of every command."""
 

@@ -3,14 +3,13 @@
 from pathlib import Path
 
 from me2e_compress.cli.commands import WRITING, Output
-from me2e_compress.cli.console import is_json, listening, say, show, show_of, tell
+from me2e_compress.cli.console import is_json, listening, say, show, tell
 from me2e_compress.errors import OptionError
 from me2e_compress.extras import need_extra
 from me2e_compress.metrics import BUDGET_MS
 from me2e_compress.workflows.options import (
     EvaluateOptions,
     Joules,
-    RoutesOptions,
     WorkerOptions,
     WriteOptions,
 )
@@ -150,18 +149,3 @@ def study(
     show(found)
     if not is_json():
         say(f"wrote {files.report}, {files.tables} and {files.record}")
-
-
-def routes(
-    *,
-    output: Output,
-    options: RoutesOptions | None = None,
-) -> None:
-    """Make a fresh set of admitted routes.
-
-    Args:
-        output: the manifest to write
-    """
-    from me2e_compress.workflows.routes import make_routes
-
-    show_of(make_routes, output, options)

@@ -18,7 +18,6 @@ from cyclopts import Parameter, Token
 from me2e_compress.errors import EvaluationError, OptionError, RecipeError
 from me2e_compress.fidelity import ALIVE, SQNR_FLOOR_DB
 from me2e_compress.metrics import BUDGET_MS
-from me2e_compress.simulator.scenarios import VARIANTS
 
 if TYPE_CHECKING:  # onnxruntime takes a tenth of a second to import
     from me2e_compress.runtime.providers import Provider
@@ -424,20 +423,3 @@ class EvaluateOptions(WorkerOptions, GraphOptions, WriteOptions):
         check_count("--seed", self.seed)
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class RoutesOptions(WriteOptions):
-    """Which routes are made."""
-
-    seed: int = 0
-    """seed of everything random"""
-    variants: int = VARIANTS
-    """routes of each type"""
-    scenarios: str = "all"
-    """scenario types: all, or NAME,NAME"""
-    workers: int = 1
-    """processes at a time"""
-
-    def __post_init__(self) -> None:
-        check_count("--seed", self.seed)
-        check_count("--variants", self.variants, least=1)
-        check_count("--workers", self.workers, least=1)

@@ -18,9 +18,8 @@ from me2e_compress.simulator.routes import (
     load_routes,
     pick_routes,
 )
-from me2e_compress.workflows.options import RoutesOptions
 from me2e_compress.workflows.result import Listener
-from me2e_compress.workflows.routes import make_routes
+from models.driver.admission import make_routes
 from models.driver.curriculum import Trial
 from models.driver.episodes.collection import refuse_shipped
 
@@ -47,13 +46,7 @@ def routes_of(
     if not path.exists():
         types = what.scenarios or tuple(SCENARIO_ABILITIES)
         variants = -(-what.routes // len(types))
-        options = RoutesOptions(
-            seed=what.seed,
-            variants=variants,
-            scenarios=",".join(types),
-            workers=workers,
-        )
-        make_routes(path, options, Listener(lambda _, *told: on_done(*told[:2])))
+        make_routes(path, what.seed, types, variants, workers, on_done)
     found = load_routes(path)
     refuse_shipped("trial", what.seed, [(e.scenario, e.seed) for e in found])
     return pick_routes(found, str(what.routes))

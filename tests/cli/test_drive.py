@@ -8,11 +8,10 @@ import numpy as np
 import pynvml
 import pytest
 
-from me2e_compress.metrics.episode import Ending, InfractionKind
 from me2e_compress.registry.drafts import IN_JSON
 from me2e_compress.runtime.energy import EnergyResult
 from me2e_compress.runtime.latency_trace import LatencyTrace
-from me2e_compress.simulator.routes import load_routes, save_routes
+from me2e_compress.simulator.routes import save_routes
 from tests.command import Cli
 from tests.evaluators.highway.drivers import CROSSING, PARKED, straight_on
 from tests.frames import record
@@ -160,17 +159,6 @@ def test_no_counter_is_no_figure_and_one_that_stands_still_is_an_error(
     assert "energy recording: the counter stands still" in said
 
 
-def test_a_fresh_set_is_made_admitted_and_reported(cli: Cli, tmp_path: Path) -> None:
-    asked = f"--seed 4 --variants 2 --scenarios {STOP}"
-
-    report = cli.document(f"routes -o one.json {asked}")
-
-    assert report["admitted"] == 2
-    assert report["tried"] == 2 + len(report["scenarios"][0]["refusals"])
-    made = load_routes(tmp_path / "one.json")
-    assert [route.id for route in made] == [f"{STOP}_R2_0", f"{STOP}_R2_1"]
-
-
 def test_what_is_of_the_first_road_is_one_line(cli: Cli, tmp_path: Path) -> None:
     save_routes([route_of(STOP, 1)], tmp_path / "new.json")
     text = (tmp_path / "new.json").read_text()
@@ -199,37 +187,3 @@ def test_drives_of_another_road_are_refused(cli: Cli, tmp_path: Path) -> None:
     del manifest["road_version"]
     (tmp_path / "out" / "evaluation.json").write_text(json.dumps(manifest))
     assert "out: is of the first road, which is no more" in cli.refused("score out")
-
-
-def test_a_set_goes_on_where_it_was_killed(
-    cli: Cli, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    from me2e_compress.evaluators.highway import generate as room
-
-    asked = "routes -o set.json --seed 3 --variants 1 --scenarios"
-    admitted, made = room.admitted_routes, list[str]()
-
-    def killed(scenario: str, **options: int) -> room.ScenarioRoutes:
-        made.append(scenario)
-        if len(made) == 2:
-            raise KeyboardInterrupt
-        return admitted(scenario, **options)
-
-    hit, there = InfractionKind.COLLISION_VEHICLE, Ending.COMPLETED
-    blind = room.DryRun((hit,), Ending.COLLISION, True, False, 9.0)
-    expert = room.DryRun((), there, True, False, 20.0)
-    monkeypatch.setattr(
-        room, "examine", lambda route: room.Admission(route, expert, (blind,), expert)
-    )
-    monkeypatch.setattr(room, "admitted_routes", killed)
-    cli(f"{asked} Accident,ParkedObstacle")
-    assert not (tmp_path / "set.json").exists()
-
-    said = cli.refused(f"{asked.replace('3', '4', 1)} Accident")
-    assert "set.json.part: is a set that was begun with seed 3, not 4" in said
-    assert cli.document(f"{asked} Accident,ParkedObstacle")["admitted"] == 2
-    assert made == ["Accident", "ParkedObstacle", "ParkedObstacle"]
-    assert [path.name for path in tmp_path.iterdir()] == ["set.json"]
-    (tmp_path / "other.json.part").write_text("[]")
-    said = cli.refused("routes -o other.json --scenarios Accident")
-    assert "other.json.part: not a set that was begun: the file: " in said

@@ -11,9 +11,7 @@ import me2e_compress as me2e
 from me2e_compress.manager import recipe
 from me2e_compress.registry.drafts import IN_JSON
 from me2e_compress.workflows.files import export_stack
-from me2e_compress.workflows.options import RoutesOptions
 from me2e_compress.workflows.result import Result
-from me2e_compress.workflows.routes import make_routes
 from tests.command import Command
 
 Call = Callable[[], object]
@@ -109,12 +107,6 @@ CASES: dict[str, tuple[str, Call]] = {
             "blind",
             "results",
             me2e.EvaluateOptions(routes="ParkedObstacle_R2_0", latency="fps:4"),
-        ),
-    ),
-    "make_routes": (
-        f"routes -o routes.json --seed 4 --variants 1 --scenarios {STOP}",
-        lambda: make_routes(
-            "routes.json", RoutesOptions(seed=4, variants=1, scenarios=STOP)
         ),
     ),
 }

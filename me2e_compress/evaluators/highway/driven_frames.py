@@ -1,5 +1,6 @@
 """Calibration frames recorded from the model's view while the expert drives."""
 
+import zlib
 from collections.abc import Iterator
 from dataclasses import replace
 from itertools import islice
@@ -8,17 +9,22 @@ import numpy as np
 
 from me2e_compress.driving.onnx_policy import OnnxPolicy
 from me2e_compress.driving.realtime import DT_US
-from me2e_compress.errors import FramesError
+from me2e_compress.errors import EvaluationError, FramesError
 from me2e_compress.evaluators.highway.controller import AnchoredPlan
 from me2e_compress.evaluators.highway.expert.expert_policy import Expert
-from me2e_compress.evaluators.highway.generate import propose, seed_of
 from me2e_compress.evaluators.highway.observe import ObservationBuilder
 from me2e_compress.evaluators.highway.runner import EndingRules
 from me2e_compress.runtime.frames import Array, Frame
 from me2e_compress.simulator.camera_rig import CameraRig
 from me2e_compress.simulator.cameras.ground import paint_texture
 from me2e_compress.simulator.cameras.renderer import Cameras
-from me2e_compress.simulator.routes import EXPERT_S, Route, load_routes
+from me2e_compress.simulator.routes import (
+    EXPERT_S,
+    SCENARIO_ABILITIES,
+    Route,
+    load_routes,
+)
+from me2e_compress.simulator.scenarios.builders import stage_of
 from me2e_compress.simulator.world import World
 
 STEP_US = 500_000
@@ -86,6 +92,22 @@ def fresh_routes(seed: int) -> Iterator[Route]:
             if (scenario, drawn) not in judged:
                 yield propose(scenario, drawn, f"{scenario}_{attempt}")
         attempt += 1
+
+
+def propose(scenario: str, seed: int, name: str) -> Route:
+    """Return a route of one of the 44 types, with every parameter written out."""
+    known = SCENARIO_ABILITIES.get(scenario)
+    if known is None:
+        there = ", ".join(sorted(SCENARIO_ABILITIES))
+        raise EvaluationError(f"no scenario {scenario!r}; there are {there}")
+    route = Route(name, scenario, known[0], seed)
+    return replace(route, parameters=dict(stage_of(route).parameters))
+
+
+def seed_of(seed: int, scenario: str, attempt: int) -> int:
+    """Return the seed of the n-th proposal of a type, different for every type."""
+    words = [seed, zlib.crc32(scenario.encode()), attempt]
+    return int(np.random.SeedSequence(words).generate_state(1)[0])
 
 
 def _look(

@@ -58,7 +58,7 @@ class EpisodeRecorder:
     world: World
     frames: list[EgoFrame] = field(default_factory=list)
     decisions: list[InferenceRecord] = field(default_factory=list)
-    conflicts: ConflictRecorder | None = field(default_factory=ConflictRecorder)
+    conflicts: ConflictRecorder = field(default_factory=ConflictRecorder)
 
     def record(self, scene: Scene) -> None:
         """Record a frame if one is due."""
@@ -85,8 +85,7 @@ class EpisodeRecorder:
             traffic_speed_mps=fmean(near) if near else None,
         )
         self.frames.append(frame)
-        if self.conflicts is not None:
-            self.conflicts.record(scene)
+        self.conflicts.record(scene)
 
     def episode(self, ending: Ending, failure: str | None = None) -> Episode:
         """Return the episode of the world's route."""
@@ -111,7 +110,7 @@ class EpisodeRecorder:
             frames=tuple(self.frames),
             decisions=tuple(self.decisions),
             junction_m=junction_m(world.path),
-            conflicts=None if self.conflicts is None else self.conflicts.result(),
+            conflicts=self.conflicts.result(),
             first_collision=first,
         )
 

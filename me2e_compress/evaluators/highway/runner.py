@@ -112,12 +112,8 @@ def drive(
     policy: Policy,
     conditions: Drive,
     listeners: Listeners = Listeners(),
-    enough: Callable[[World], bool] | None = None,
 ) -> Episode:
     """Drive a route to its end and return the record.
-
-    With ``enough``, only until that is true of the world, which counts as timed out,
-    and without conflicts, which nobody asks of such a drive.
 
     At each decision the controller turns the policy's plan and the ego's state at that
     same frame into a control; throttle, steer and brake are converted as CARLA's car
@@ -126,7 +122,7 @@ def drive(
     Until the first one acts, the ego coasts straight. A policy that raises, or answers
     neither finite waypoints nor valid controls, ends the route as failed.
     """
-    return _Drive(route, policy, conditions, listeners, enough).run()
+    return _Drive(route, policy, conditions, listeners).run()
 
 
 class _Drive:
@@ -136,17 +132,13 @@ class _Drive:
         policy: Policy,
         conditions: Drive,
         listeners: Listeners,
-        enough: Callable[[World], bool] | None,
     ) -> None:
         self.route, self.policy, self.listeners = route, policy, listeners
         self.hosted = policy if isinstance(policy, HostedPolicy) else None
-        self.enough = enough
         self.world = world = World(
             route, dt_us=conditions.dt_us, drive_on=conditions.drive_on
         )
         self.recorder, self.rules = EpisodeRecorder(world), EndingRules()
-        if enough is not None:
-            self.recorder.conflicts = None
         coast, model = Control(0.0, 0.0), conditions.latency_model
         self.clock = control_clock(model, coast, conditions.dt_us)
         self.charge = conditions.latency.on_route(route.id)
@@ -177,8 +169,6 @@ class _Drive:
                 world.step(self.clock.advance())
                 scene = world.scene()
                 ending = self.rules.ending(world, scene.ego.speed_mps)
-                if ending is None and self.enough is not None and self.enough(world):
-                    ending = Ending.TIMEOUT
         except PolicyFailedError as failure:
             return self.recorder.episode(Ending.POLICY_FAILED, str(failure))
         # the last frame has no decision

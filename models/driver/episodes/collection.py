@@ -3,7 +3,7 @@
 from collections.abc import Iterable
 from dataclasses import dataclass
 
-from me2e_compress.evaluators.highway.generate import propose, seed_of
+from me2e_compress.evaluators.highway.driven_frames import propose, seed_of
 from me2e_compress.simulator.routes import SCENARIO_ABILITIES, Route, load_routes
 from models.driver.errors import TrainingError
 

@@ -17,7 +17,7 @@ import psutil
 import pytest
 
 from me2e_compress.errors import EvaluationError
-from me2e_compress.evaluators.highway.generate import seed_of
+from me2e_compress.evaluators.highway.driven_frames import seed_of
 from me2e_compress.graph import sha256_of
 from me2e_compress.simulator.routes import SCENARIO_ABILITIES, Route, load_routes
 from models.driver.episodes import (

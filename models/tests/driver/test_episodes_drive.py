@@ -25,6 +25,7 @@ from models.driver.episodes.recording_policy import (
     RecordingPolicy,
     cameras_of,
 )
+from models.tests.driver.beginning import drive_beginning
 
 pytestmark = pytest.mark.xdist_group("episodes")
 
@@ -255,7 +256,7 @@ def test_a_recorded_picture_shows_the_weather() -> None:
     tasks = tasks_of(replace(CALM, scenarios=("HighwayExit",), variants=12))
     dark = next(e for e in tasks if World(e.route()).weather.night > 0.5)
     policy = RecordingPolicy(seed=3)
-    drive(dark.route(), policy, Drive(), enough=lambda w: w.time_us >= 100_000)
+    drive_beginning(dark.route(), policy, 100_000)
     assert policy.world is not None
     cameras = cameras_of(policy.world, CameraRig(*SIZE))
 

@@ -11,14 +11,13 @@ import pytest
 
 from me2e_compress.driving.contract import Observation, Plan, RouteInfo
 from me2e_compress.driving.onnx_policy import OnnxPolicy
-from me2e_compress.evaluators import Drive
-from me2e_compress.evaluators.highway.runner import drive
 from me2e_compress.simulator.scene import Scene
 from me2e_compress.simulator.world import World
 from models.driver.episodes import Collection
 from models.driver.episodes.collecting import episode_of
 from models.driver.episodes.collection import Task, tasks_of
 from models.driver.episodes.recording_policy import PlanInForce, RecordingPolicy
+from models.tests.driver.beginning import drive_beginning
 from tests.evaluators.highway.drivers import straight_on
 
 pytestmark = pytest.mark.xdist_group("episodes")
@@ -86,12 +85,7 @@ def test_a_student_decides_at_the_stored_samples() -> None:
     student = Ahead()
     policy = RecordingPolicy(3, 0.0, 0.0, student, every=4)
 
-    drive(
-        task("HighwayExit").route(),
-        policy,
-        Drive(),
-        enough=lambda w: w.time_us >= 1_000_000,
-    )
+    drive_beginning(task("HighwayExit").route(), policy, 1_000_000)
 
     assert [each.time_us for each in student.shown] == list(
         range(0, 1_000_000, 200_000)

@@ -5,10 +5,12 @@ from pathlib import Path
 
 import pytest
 
-from me2e_compress.evaluators.highway import generate as gate
-from me2e_compress.evaluators.highway.generate import ScenarioRoutes, propose
+from me2e_compress.errors import EvaluationError
+from me2e_compress.evaluators.highway.driven_frames import propose
 from me2e_compress.simulator.routes import Route, load_routes
+from models.driver import admission as gate
 from models.driver import trial
+from models.driver.admission import ScenarioRoutes
 from models.driver.curriculum import Trial
 from models.driver.errors import TrainingError
 
@@ -48,11 +50,14 @@ def test_a_search_that_was_killed_goes_on(
     with pytest.raises(KeyboardInterrupt):
         found(path)
     monkeypatch.setattr(gate, "generate", second := Gate())
+    with pytest.raises(EvaluationError, match="begun with seed 7, not 8; delete it"):
+        gate.make_routes(path, 8, TYPES, 2)
     routes = found(path)
     assert second.asked == [TYPES[1]]
     assert [each.scenario for each in routes] == [TYPES[0], TYPES[0], TYPES[1]]
     monkeypatch.setattr(gate, "generate", None)  # nobody is asked again
     assert found(path) == routes
+    assert [each.name for each in tmp_path.iterdir()] == ["trial.json"]
 
 
 def test_routes_that_ship_are_not_tried_on(

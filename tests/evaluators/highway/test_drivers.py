@@ -12,12 +12,11 @@ from me2e_compress.driving.policies import Driver, driver_named
 from me2e_compress.errors import EvaluationError
 from me2e_compress.evaluators.highway.blind import SPEEDS_MPS, Blind, centre_plan
 from me2e_compress.evaluators.highway.drivers import OnnxDriver, image_size_of
-from me2e_compress.evaluators.highway.generate import dry_run
 from me2e_compress.metrics.episode import InfractionKind
-from me2e_compress.simulator.routes import Route
 from tests.evaluators.highway.drivers import straight_on
 from tests.evaluators.highway.tiny_world import circle, ego_at, straight
 from tests.installed import install
+from tests.simulator.world.driving import drive_blind, route_of
 
 
 def test_drivers_by_name() -> None:
@@ -113,8 +112,8 @@ def test_it_bends_with_the_route() -> None:
 
 
 def test_it_drives_into_what_stands_there() -> None:
-    drive = dry_run(Route("a", "ParkedObstacle", "Overtaking", 7), Blind(8.0))
-    assert drive.infractions == (InfractionKind.COLLISION_VEHICLE,)
+    faults = drive_blind(route_of("ParkedObstacle", 7), 8.0)
+    assert [each.kind for each in faults] == [InfractionKind.COLLISION_VEHICLE]
 
 
 def test_without_a_world_it_says_what_is_missing() -> None:

@@ -13,12 +13,15 @@ from me2e_compress.driving.contract import Observation, PedalsAndWheel, RouteInf
 from me2e_compress.driving.latency import FixedLatency, parse_latency
 from me2e_compress.evaluators import Drive
 from me2e_compress.evaluators.highway.blind import Blind
+from me2e_compress.evaluators.highway.drivers import OnnxDriver
 from me2e_compress.evaluators.highway.expert.expert_policy import Expert
 from me2e_compress.evaluators.highway.observe import can_bus_of, road_users
 from me2e_compress.evaluators.highway.runner import EndingRules, Listeners, drive
 from me2e_compress.metrics.episode import COLLISIONS, Ending, Episode, InfractionKind
 from me2e_compress.metrics.route_scores import route_score, score_to_first_collision
+from me2e_compress.shipped.drivers import shipped
 from me2e_compress.simulator.pictures.route import Moment
+from me2e_compress.simulator.routes import load_routes, pick_routes
 from me2e_compress.simulator.scene import ActorKind, Ego
 from me2e_compress.simulator.traffic.bodies import Contacts, EgoVehicle, depth
 from me2e_compress.simulator.traffic.network import Pose
@@ -418,3 +421,17 @@ def test_contacts_soon_after_or_near_are_no_other_collision() -> None:
         counted.append(contacts.counts(time_s * 1_000_000, mine, body))
 
     assert counted == [True, False, True, False, True]
+
+
+# The weights that ship, in closed loop; five CPU seconds.
+
+
+def test_the_shipped_driver_passes_a_parked_car() -> None:
+    """A route that nobody passes blindly, and one of the shortest."""
+    (route,) = pick_routes(load_routes(), "ParkedObstacle_R2_0")
+    policy = OnnxDriver(shipped("highway")).open()
+
+    episode = drive(route, policy, Drive())
+
+    assert (episode.ending, episode.infractions) == (Ending.COMPLETED, ())
+    assert route_score(episode).composed == 100.0

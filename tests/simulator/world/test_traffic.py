@@ -1,10 +1,11 @@
 import math
 from collections.abc import Iterator
+from dataclasses import replace
 from statistics import median
 
 import pytest
 
-from me2e_compress.evaluators.highway.generate import propose, with_other_traffic
+from me2e_compress.evaluators.highway.driven_frames import propose
 from me2e_compress.simulator.camera_rig import CLEAR, DRAWN, drawn_weather
 from me2e_compress.simulator.routes import SCENARIO_ABILITIES, Route
 from me2e_compress.simulator.scenarios.builders import stage_of
@@ -17,7 +18,12 @@ from me2e_compress.simulator.traffic.right_of_way import (
     Regulator,
     SignalPlan,
 )
-from me2e_compress.simulator.traffic.stage import HORIZON_S, Stage, arrival_times
+from me2e_compress.simulator.traffic.stage import (
+    HORIZON_S,
+    TRAFFIC,
+    Stage,
+    arrival_times,
+)
 from me2e_compress.simulator.world import World
 
 BRAKE, GO = Control(-8.0, 0.0), Control(1.0, 0.0)
@@ -99,7 +105,8 @@ def test_lights_and_signs_are_met_by_as_many_types_as_promised(
 
 def test_other_traffic_is_other_traffic_on_the_same_road() -> None:
     route = proposed("T_Junction")
-    one, other = stage_of(route), stage_of(with_other_traffic(route))
+    anew = replace(route, parameters={**route.parameters, TRAFFIC: 7})
+    one, other = stage_of(route), stage_of(anew)
 
     assert arrivals(one) != arrivals(other)
     assert {**one.parameters, "traffic": 0} == {**other.parameters, "traffic": 0}

@@ -1,4 +1,4 @@
-"""Generate routes: proposed by scenario types, admitted by the gate.
+"""Make sets of routes: proposed by scenario types, admitted by the gate.
 
 Whom the ego meets is a matter of chance. A route is admitted if the expert, who knows
 only what the cameras show, solves it twice within `MOST_S`, with its own traffic and
@@ -8,28 +8,38 @@ leaving the route do not count. Both decide ten times a second, and a drive ends
 its first fault: that halves the time of an examination.
 """
 
-import zlib
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass, replace
 from functools import partial
+from pathlib import Path
+from typing import Any
 
-import numpy as np
+from pydantic import TypeAdapter
 
-from me2e_compress.driving.contract import Policy
-from me2e_compress.driving.latency import FixedLatency
+from me2e_compress.driving.realtime import HeldControl
 from me2e_compress.errors import EvaluationError
-from me2e_compress.evaluators.contract import Drive
 from me2e_compress.evaluators.highway.blind import SPEEDS_MPS, Blind
+from me2e_compress.evaluators.highway.controller import AnchoredPlan
+from me2e_compress.evaluators.highway.driven_frames import propose, seed_of
+from me2e_compress.evaluators.highway.episode_recorder import EpisodeRecorder
 from me2e_compress.evaluators.highway.expert.expert_policy import Expert
-from me2e_compress.evaluators.highway.runner import Listeners, drive
+from me2e_compress.evaluators.highway.observe import ObservationBuilder
+from me2e_compress.evaluators.highway.runner import EndingRules
 from me2e_compress.metrics.episode import Ending, InfractionKind
+from me2e_compress.registry import documents
+from me2e_compress.runtime.atomic import write_document
 from me2e_compress.runtime.children import pool
-from me2e_compress.simulator.routes import SCENARIO_ABILITIES, Route
-from me2e_compress.simulator.scenarios import VARIANTS
-from me2e_compress.simulator.scenarios.builders import stage_of
-from me2e_compress.simulator.scene import INFRACTIONS, EventKind
+from me2e_compress.simulator.camera_rig import CameraRig
+from me2e_compress.simulator.routes import (
+    ROAD_VERSION,
+    SCENARIO_ABILITIES,
+    Route,
+    save_routes,
+)
+from me2e_compress.simulator.scene import INFRACTIONS, Control, EventKind
 from me2e_compress.simulator.traffic.stage import TRAFFIC
 from me2e_compress.simulator.world import World
+from me2e_compress.version import __version__
 
 ENDS_ONLY = (
     InfractionKind.ROUTE_TIMEOUT,
@@ -52,7 +62,6 @@ class DryRun:
     triggered: bool
     actors_crashed: bool
     seconds: float
-    failure: str | None = None
 
     @property
     def solved(self) -> bool:
@@ -60,9 +69,12 @@ class DryRun:
         return self.ending is Ending.COMPLETED and not self.infractions
 
 
+VARIANTS = 5
+"""Routes of each type, as in Bench2Drive's 220."""
 MOST_S = 80.0
 """Nobody drives for longer; two cycles of a light."""
-TEN_A_SECOND = Drive(FixedLatency(100_000))
+DECISION_US = 100_000
+"""What a decision takes."""
 MOST_BLIND = 1
 """At how many speeds a blind driver may solve a route."""
 BLIND_MPS = (SPEEDS_MPS[2], SPEEDS_MPS[1], SPEEDS_MPS[0])
@@ -70,25 +82,32 @@ BLIND_MPS = (SPEEDS_MPS[2], SPEEDS_MPS[1], SPEEDS_MPS[0])
 FAULTS = INFRACTIONS | {EventKind.ACTOR_COLLISION}
 
 
-def dry_run(route: Route, policy: Policy) -> DryRun:
+def dry_run(route: Route, policy: Blind | Expert) -> DryRun:
     """Drive a route once, until the rest cannot change the verdict."""
-    worlds = list[World]()
-
-    def decided(world: World) -> bool:
-        faults = any(event.kind in FAULTS for event in world.events)
-        return faults or world.time_us >= MOST_S * 1e6
-
-    listeners = Listeners(on_query=worlds.append)
-    episode = drive(route, policy, TEN_A_SECOND, listeners, decided)
-    kinds = [event.kind for event in worlds[-1].events]
-    faults = [found.kind for found in episode.infractions]
+    world, rules = World(route), EndingRules()
+    observer = ObservationBuilder(world, policy, CameraRig(), None)
+    clock, ending = HeldControl(Control(0.0, 0.0)), None
+    policy.reset(route)
+    scene = world.scene()
+    while ending is None:
+        if clock.decision_is_due:
+            plan = policy.plan(observer.observe(scene))
+            anchored = AnchoredPlan.of(plan, scene.ego, scene.time_us)
+            clock.decide(anchored.control(scene.ego, scene.time_us), DECISION_US)
+        world.step(clock.advance())
+        scene = world.scene()
+        ending = rules.ending(world, scene.ego.speed_mps)
+        at_fault = any(event.kind in FAULTS for event in world.events)
+        if ending is None and (at_fault or world.time_us >= MOST_S * 1e6):
+            ending = Ending.TIMEOUT
+    faults = [each.kind for each in EpisodeRecorder(world).episode(ending).infractions]
+    kinds = [event.kind for event in world.events]
     return DryRun(
         tuple(dict.fromkeys(kind for kind in faults if kind not in ENDS_ONLY)),
-        episode.ending,
+        ending,
         EventKind.TRIGGER in kinds,
         EventKind.ACTOR_COLLISION in kinds,
-        episode.frames[-1].time_us / 1e6 if episode.frames else 0.0,
-        episode.failure,
+        world.time_us / 1e6,
     )
 
 
@@ -140,8 +159,7 @@ def _unsolved(drive: DryRun) -> str | None:
     if drive.infractions:
         return f"the expert commits: {', '.join(drive.infractions)}"
     if not drive.solved:
-        why = drive.failure or drive.ending.value
-        return f"the expert ends after {drive.seconds:g} s: {why}"
+        return f"the expert ends after {drive.seconds:g} s: {drive.ending.value}"
     return None
 
 
@@ -191,22 +209,6 @@ class ScenarioRoutes:
         return len(self.routes) + len(self.refusals)
 
 
-def propose(scenario: str, seed: int, name: str) -> Route:
-    """Return a route of one of the 44 types, with every parameter written out."""
-    known = SCENARIO_ABILITIES.get(scenario)
-    if known is None:
-        there = ", ".join(sorted(SCENARIO_ABILITIES))
-        raise EvaluationError(f"no scenario {scenario!r}; there are {there}")
-    route = Route(name, scenario, known[0], seed)
-    return replace(route, parameters=dict(stage_of(route).parameters))
-
-
-def seed_of(seed: int, scenario: str, attempt: int) -> int:
-    """Return the seed of the n-th proposal of a type, different for every type."""
-    words = [seed, zlib.crc32(scenario.encode()), attempt]
-    return int(np.random.SeedSequence(words).generate_state(1)[0])
-
-
 def admitted_routes(
     scenario: str, seed: int, variants: int = VARIANTS
 ) -> ScenarioRoutes:
@@ -241,3 +243,59 @@ def generate(
         return
     with pool(workers) as processes:
         yield from processes.map(of_type, scenarios)
+
+
+def make_routes(
+    path: Path,
+    seed: int,
+    scenarios: Sequence[str] = tuple(SCENARIO_ABILITIES),
+    variants: int = VARIANTS,
+    workers: int = 1,
+    on_done: Callable[[int, int], None] = lambda done, total: None,
+) -> tuple[ScenarioRoutes, ...]:
+    """Write a set of admitted routes; it goes on where it was killed.
+
+    Args:
+        path: the manifest; ``PATH.part`` beside it holds the types that are done.
+        seed: of everything random.
+        scenarios: the types.
+        variants: routes of each type.
+        workers: processes.
+        on_done: called with the types done and their total.
+
+    Raises:
+        EvaluationError: a type has no such routes, or the draft is of other options.
+    """
+    deciding = {
+        "version": f"{__version__}, road version {ROAD_VERSION}",
+        "seed": seed,
+        "variants": variants,
+    }
+    draft = path.with_name(f"{path.name}.part")
+    harvests = dict[str, ScenarioRoutes]()
+    # what an earlier run has done
+    if draft.exists():
+        with documents.reading(draft, EvaluationError, "not a set that was begun"):
+            content = documents.content(draft)
+            record = TypeAdapter(dict[str, Any]).validate_json(content)
+            for key, wanted in deciding.items():
+                if record.get(key) != wanted:
+                    raise EvaluationError(
+                        f"{draft}: is a set that was begun with {key}"
+                        f" {record.get(key)}, not {wanted}; delete it, or choose"
+                        " another name"
+                    )
+            done = TypeAdapter(list[ScenarioRoutes])
+            begun = done.validate_python(record.get("done"))
+        harvests = {one.scenario: one for one in begun}
+    # each type is kept as soon as its routes are admitted
+    missing = [name for name in scenarios if name not in harvests]
+    for harvest in generate(seed, missing, variants, workers):
+        harvests[harvest.scenario] = harvest
+        kept = [asdict(one) for one in harvests.values()]
+        write_document(draft, deciding | {"done": kept})
+        on_done(len(harvests), len(scenarios))
+    ordered = tuple(harvests[name] for name in scenarios)
+    save_routes([route for one in ordered for route in one.routes], path)
+    draft.unlink(missing_ok=True)
+    return ordered
