@@ -55,6 +55,7 @@ FORMER = {
     "--latency-model": f"--latency-model {_NOW} a study's latency_model",
     "--dt-ms": f"--dt-ms {_NOW} a study's dt_ms",
     "--frame-limit": "--frame-limit is gone since 0.3.0: a decision may take 60 s",
+    "--drive-on": "--drive-on is gone since 0.3.0: a collision ends the route",
     "--host-stage": f"--host-stage {_NOW} the policy 'onnx{{path=F,host_stage=NAME}}'",
     "--smaller": f"--smaller {_NOW} a recipe's fold-constants{{bytes_per_node=0}}",
     "--allow-empty": f"--allow-empty {_NOW} -r exact, which writes no int8",

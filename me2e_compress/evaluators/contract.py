@@ -68,7 +68,6 @@ class Drive:
             what a finer one changes. Frames are recorded every 50 ms regardless.
         weather: Clear is what each route says.
         latency_model: Whether a latency drops decisions or delays every control.
-        drive_on: Whether a route goes on after a collision, as in Bench2Drive.
         routes: In the order of the results; none where the evaluator alone knows them.
         set_size: Number of routes of the whole set; 0 where the evaluator knows it.
         engine: Where routes are driven; None for one at a time on this machine.
@@ -82,7 +81,6 @@ class Drive:
     dt_us: int = DT_US
     weather: Weather = CLEAR
     latency_model: LatencyModel = LatencyModel.DROP
-    drive_on: bool = False
     routes: Sequence[RouteInfo] = ()
     set_size: int = 0
     engine: Engine | None = None
@@ -106,7 +104,6 @@ class Drive:
         latency_model: str = "drop",
         dt_ms: float = 50.0,
         weather: str = "",
-        drive_on: bool = False,
     ) -> Self:
         """Read what the command, a study's file and Python say alike of conditions.
 
@@ -128,14 +125,12 @@ class Drive:
             dt_us=round(dt_ms * 1000),
             weather=_weather_of(weather),
             latency_model=LatencyModel(latency_model),
-            drive_on=drive_on,
         )
 
     def conditions(self) -> dict[str, Any]:
         """Return everything but routes that decides episodes, as JSON."""
-        more: dict[str, Any] = {"drive_on": True} if self.drive_on else {}
         weather = asdict(self.weather)
-        return more | {
+        return {
             "latency": self.latency.to_json(),
             "latency_model": self.latency_model.value,
             "dt_us": self.dt_us,
@@ -166,7 +161,7 @@ def _weather_of(text: str) -> Weather:
 
 ABILITIES = (
     *("policy", "adapter", "module_map", "provider", "routes", "latency"),
-    *("latency_model", "dt_ms", "weather", "drive_on", "engine", "render"),
+    *("latency_model", "dt_ms", "weather", "engine", "render"),
 )
 """What an evaluator may declare that it takes: options of the command or of a study."""
 METHODS = {"routes": ("routes",), "render": ("render", "routes")}

@@ -22,7 +22,7 @@ from me2e_compress.simulator.routes import VERSION, check_version, is_route_id
 MANIFEST = "evaluation.json"
 ROUTES = "routes"
 DEFAULTS = {"drive_on": False}
-"""What holds where a manifest lacks the key."""
+"""What a manifest of 0.2 may say, and today's lacks."""
 MEASURED = "latency_samples"
 """Key of a manifest: number of samples that latencies were drawn from. It is
 derived data, and not compared."""

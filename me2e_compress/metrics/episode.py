@@ -14,7 +14,6 @@ __all__ = [
     "EgoFrame",
     "Ending",
     "Episode",
-    "FirstCollision",
     "Given",
     "InferenceRecord",
 ]
@@ -257,20 +256,6 @@ class Given:
 
 @with_config(_STRICT)
 @dataclass(frozen=True, slots=True)
-class FirstCollision:
-    """Where a drive that went on would have ended, by the rule of the first collision.
-
-    ``completion_percent`` is the share of the route passed until then,
-    ``outside_percent`` the share of that way outside the lanes.
-    """
-
-    time_us: int
-    completion_percent: Annotated[float, Field(ge=0.0, le=100.0)]
-    outside_percent: Annotated[float, Field(ge=0.0, le=100.0)]
-
-
-@with_config(_STRICT)
-@dataclass(frozen=True, slots=True)
 class Episode:
     """One route driven to its end.
 
@@ -285,8 +270,6 @@ class Episode:
             simulator reported them; None if they follow from the frames.
         given: What the simulator itself scored, if anything.
         conflicts: How close the ego came to others; None if it was not recorded.
-        first_collision: Of a drive that went on after one; None if there was none, or
-            the route ended with it.
     """
 
     route: str
@@ -303,7 +286,6 @@ class Episode:
     speed_ratios_percent: tuple[Number, ...] | None = None
     given: Given | None = None
     conflicts: ConflictRecord | None = None
-    first_collision: FirstCollision | None = None
 
     @property
     def succeeded(self) -> bool:
@@ -323,8 +305,6 @@ class Episode:
         record: dict[str, Any] = _EPISODE.dump_python(
             dataclasses.replace(self, frames=(), decisions=()), mode="json"
         )
-        if self.first_collision is None:
-            del record["first_collision"]
         record["frames"] = _columns(EgoFrame, self.frames)
         record["decisions"] = _columns(InferenceRecord, self.decisions)
         return record

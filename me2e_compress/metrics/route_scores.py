@@ -16,7 +16,6 @@ from me2e_compress.metrics.episode import (
     EgoFrame,
     Ending,
     Episode,
-    InfractionKind,
 )
 from me2e_compress.metrics.measure import Measure
 
@@ -41,22 +40,6 @@ def route_score(episode: Episode) -> RouteScore:
     """
     penalty = math.prod(infraction.factor for infraction in episode.infractions)
     return composed_of(episode.completion_percent, penalty)
-
-
-def score_to_first_collision(episode: Episode) -> RouteScore:
-    """Return the scores that a drive would have if its first collision had ended it.
-
-    That is `route_score` unless the drive went on: one drive is scored by both rules.
-    """
-    first = episode.first_collision
-    if first is None:
-        return route_score(episode)
-    penalty = 1.0 - first.outside_percent / 100.0
-    for infraction in episode.infractions:
-        before = infraction.time_us is not None and infraction.time_us <= first.time_us
-        if before and infraction.kind is not InfractionKind.OUTSIDE_ROUTE_LANES:
-            penalty *= infraction.factor
-    return composed_of(first.completion_percent, penalty)
 
 
 def composed_of(route: float, penalty: float) -> RouteScore:

@@ -20,7 +20,7 @@ from me2e_compress.simulator.scene import (
     SignalKind,
     SignalState,
 )
-from me2e_compress.simulator.traffic.bodies import Car, Contacts, StaticObject, Walker
+from me2e_compress.simulator.traffic.bodies import Car, StaticObject, Walker
 from me2e_compress.simulator.traffic.right_of_way import RightOfWay
 from me2e_compress.simulator.traffic.traffic_road import TrafficRoad
 
@@ -126,8 +126,6 @@ class World:
             actors still decide every 0.1 s.
         builder: Sets the stage, traffic included, instead of the registered scenario
             type: for new types.
-        drive_on: Go on after a collision, as CARLA does: both bodies stand, and neither
-            moves farther into the other.
 
     Attributes:
         path: The ego's route.
@@ -137,7 +135,6 @@ class World:
         outside_distance_m: Metres driven while that exceeded `TOLERANCE_M`.
         reason: Why the world has ended; None before that.
         collided: Scenes of the ego's collisions, by time in microseconds.
-        first_collision: When the ego first collided, and its two distances then.
         weather: What the route says.
     """
 
@@ -147,7 +144,6 @@ class World:
         *,
         dt_us: int = DT_US,
         builder: Builder | None = None,
-        drive_on: bool = False,
     ) -> None:
         if not 0 < dt_us <= DECISION_US:
             raise EvaluationError(
@@ -174,8 +170,6 @@ class World:
         self.reason: EndReason | None = None
         # collisions
         self.collided: dict[int, Scene] = {}
-        self.first_collision: tuple[int, float, float] | None = None
-        self._drive_on, self._contacts = drive_on, Contacts()
         self.weather = stage.weather
         # right of way decides at the ego's signs
         meets = min((begin for begin, _ in rules.priority_over_ego()), default=math.inf)
@@ -256,7 +250,6 @@ class World:
             self._road.ego_s = stage.ego_s
             self._road.act()
         # every frame: bodies move, then the rules are checked
-        self._contacts.before(stage.ego)
         self._road.step(self.dt_us / 1e6)
         stage.time_us += self.dt_us
         stage.schedule.show(stage.time_us)
@@ -300,26 +293,15 @@ class World:
 
     def _check_collisions(self) -> None:
         for a, b in self._road.touching():
-            if a.id == 0 and self._drive_on:
-                self._contacts.resist(self._stage.ego, b)
-                if not self._contacts.counts(self.time_us, self._stage.ego, b.id):
-                    continue
-            elif (a.id, b.id) in self._met:
+            if (a.id, b.id) in self._met:
                 continue
             self._met.add((a.id, b.id))
             if a.id == 0 and a.speed < STANDING_MPS:
                 event = self._stage.event(EventKind.STRUCK, "the standing ego", b)
             elif a.id == 0:
                 event = self._stage.event(EventKind.COLLISION, "the ego", b)
-                # the route ends, or both bodies stand
                 self.collided.setdefault(self.time_us, self.scene())
-                if self.first_collision is None:
-                    first = (self.progress_m, self.outside_distance_m)
-                    self.first_collision = (self.time_us, *first)
-                if self._drive_on:
-                    self._stage.ego.speed = b.speed = 0.0
-                else:
-                    self.reason = EndReason.COLLISION
+                self.reason = EndReason.COLLISION
             else:
                 words = f"actor {a.id}"
                 event = self._stage.event(EventKind.ACTOR_COLLISION, words, b)

@@ -50,7 +50,7 @@ class Condition:
         seed: Seed of draws from traces; None takes the study's.
         against: Another condition that differs from this one in one thing: drives are
             compared with those under it, route by route.
-        latency_model: As of ``evaluate``, and so ``dt_ms``, ``weather``, ``drive_on``.
+        latency_model: As of ``evaluate``, and so ``dt_ms``, ``weather``.
 
     Raises:
         StudyError: The name is invalid, or options do not go together.
@@ -67,7 +67,6 @@ class Condition:
     latency_model: str = "drop"
     dt_ms: float = 50.0
     weather: str = ""
-    drive_on: bool = False
 
     def __post_init__(self) -> None:
         check_name("condition", self.name)
@@ -88,9 +87,7 @@ class Condition:
     @functools.cached_property
     def drive(self) -> Drive:
         """The drive without its latency, which is each variant's, and its routes."""
-        return Drive.of_words(
-            self.latency_model, self.dt_ms, self.weather, self.drive_on
-        )
+        return Drive.of_words(self.latency_model, self.dt_ms, self.weather)
 
     def source(self, seed: int) -> LatencySource:
         """Return the latency source; one that lacks its trace waits for a model's.
@@ -125,7 +122,6 @@ class Condition:
             "latency_model": self.latency_model != "drop",
             "dt_ms": self.dt_ms != 50.0,
             "weather": bool(self.weather),
-            "drive_on": self.drive_on,
         }
         return tuple(name for name, is_asked in asked.items() if is_asked)
 
@@ -137,7 +133,6 @@ class Condition:
             "every control late (fifo)": self.latency_model != "drop",
             f"a step of {self.dt_ms:g} ms": self.dt_ms != 50.0,
             f"weather {self.weather}": self.weather,
-            "driving on after collisions": self.drive_on,
         }
         words = [words for words, changed in changes.items() if changed]
         # what a decision costs
@@ -165,7 +160,7 @@ class Condition:
             "dt_ms": self.dt_ms,
             "weather": self.weather,
             "against": self.against or None,
-        } | ({"drive_on": True} if self.drive_on else {})
+        }
 
     def _refusal(self) -> str:
         return (

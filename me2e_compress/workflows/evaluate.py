@@ -58,9 +58,7 @@ def drive_of(options: EvaluateOptions, evaluator: Evaluator) -> Drive:
     set_size = 0
     if "routes" in evaluator.takes:
         routes, set_size = evaluator.routes(str(options.routes))  # a number, too
-    conditions = Drive.of_words(
-        options.latency_model, options.dt_ms, options.weather, options.drive_on
-    )
+    conditions = Drive.of_words(options.latency_model, options.dt_ms, options.weather)
     return dataclasses.replace(
         conditions,
         latency=parse_latency(options.latency, seed=options.seed),

@@ -411,8 +411,6 @@ class EvaluateOptions(WorkerOptions, GraphOptions, WriteOptions):
     """step of the simulation; results at different steps are not compared"""
     weather: str = ""
     """fog_m=80,night=0.5,dropped=BACK+FRONT ..."""
-    drive_on: bool = False
-    """go on after a collision, as Bench2Drive"""
     render: str | None = None
     """draw this route as GIF and PNG"""
     evaluator: str = "highway"

@@ -176,11 +176,10 @@ def test_what_is_of_the_first_road_is_one_line(cli: Cli, tmp_path: Path) -> None
 def test_drives_of_another_road_are_refused(cli: Cli, tmp_path: Path) -> None:
     save_routes([route_of(STOP, 1)], tmp_path / "new.json")
 
-    report = cli.document("evaluate blind:12 -o out --routes new.json --drive-on")
+    report = cli.document("evaluate blind:12 -o out --routes new.json")
 
     assert report["routes"]["driven"] == 1
     manifest = json.loads((tmp_path / "out" / "evaluation.json").read_text())
-    assert manifest["drive_on"] is True
     old = json.dumps(manifest | {"road_version": 0})
     (tmp_path / "out" / "evaluation.json").write_text(old)
     assert "out: is of version 0 of the generator" in cli.refused("score out")

@@ -15,7 +15,6 @@ from me2e_compress.metrics.episode import (
     EgoFrame,
     Ending,
     Episode,
-    FirstCollision,
     InferenceRecord,
     Infraction,
     InfractionKind,
@@ -92,12 +91,6 @@ class EpisodeRecorder:
         world = self.world
         route, goal_m = world.route, world.path.goal_m
         completed = ending is Ending.COMPLETED
-        # where the route would have ended if it went on after a collision
-        first = None
-        if world.first_collision is not None and ending is not Ending.COLLISION:
-            time_us, passed_m, outside_m = world.first_collision
-            outside = _outside_percent(outside_m, passed_m)
-            first = FirstCollision(time_us, _percent(passed_m, goal_m), outside)
         return Episode(
             route=route.id,
             scenario=route.scenario,
@@ -111,7 +104,6 @@ class EpisodeRecorder:
             decisions=tuple(self.decisions),
             junction_m=junction_m(world.path),
             conflicts=self.conflicts.result(),
-            first_collision=first,
         )
 
 

@@ -74,8 +74,7 @@ class Highway(Evaluator):
         need_extra("highway", "driving")
         image_size = image_size_of(opened(policy))
         made, routes = drive.conditions(), _ours(drive.routes)
-        more = {"drive_on": made["drive_on"]} if drive.drive_on else {}
-        return more | {
+        return {
             VERSION: ROAD_VERSION,
             "version": __version__,
             "policy": policy.fingerprint(),

@@ -48,8 +48,7 @@ class EndingRules:
     """Decides when one route is over; constants of Bench2Drive's atomic_criteria.py.
 
     * the goal is reached, or the ego collides: the world itself ends there. CARLA
-      drives on after a collision, so its driving scores multiply more penalties, and
-      so do ours if the conditions say so;
+      drives on after a collision, so its driving scores multiply more penalties;
     * deviation: 30 m from the route, or more than 30 % of its length driven at least 15
       m away from it;
     * blocked: at most 0.1 m/s for 60 s;
@@ -135,9 +134,7 @@ class _Drive:
     ) -> None:
         self.route, self.policy, self.listeners = route, policy, listeners
         self.hosted = policy if isinstance(policy, HostedPolicy) else None
-        self.world = world = World(
-            route, dt_us=conditions.dt_us, drive_on=conditions.drive_on
-        )
+        self.world = world = World(route, dt_us=conditions.dt_us)
         self.recorder, self.rules = EpisodeRecorder(world), EndingRules()
         coast, model = Control(0.0, 0.0), conditions.latency_model
         self.clock = control_clock(model, coast, conditions.dt_us)

@@ -149,7 +149,6 @@ def collision(ego: Ego, other: Actor) -> Infraction:
         roadmap=ROAD,
         scene=lambda: Scene(50_000, ego, (other,), ()),
         collided={50_000: Scene(50_000, ego, (other,), ())},
-        first_collision=(50_000, 10.0, 0.0),
     )
     recorder = EpisodeRecorder(cast(World, world))
     recorder.record(world.scene())

@@ -120,7 +120,6 @@ def test_a_file_that_is_corrupt_or_of_another_evaluation_is_driven_again(
     [
         ({"policy": FASTER}, "policy"),
         ({"drive": replace(TRACED, latency=FixedLatency(1))}, "latency"),
-        ({"drive": replace(TRACED, drive_on=True)}, "drive_on is false, this one's tr"),
         ({"drive": replace(TRACED, frame_limit_s=5.0)}, "frame_limit_s"),
         ({"routes": (PARKED, EXIT)}, "routes"),
         (
@@ -137,6 +136,16 @@ def test_results_of_another_evaluation_are_not_mixed(
     with pytest.raises(EvaluationError, match=f"another evaluation: its {key}"):
         driven(results, **dict[str, Any](routes=TWO) | changed)
     assert contents(results) == before
+
+
+def test_results_that_drove_on_after_collisions_are_of_old(results: Path) -> None:
+    file = results / "evaluation.json"
+    manifest = json.loads(file.read_text())
+    file.write_text(json.dumps({**manifest, "drive_on": False}))
+    driven(results, TWO)
+    file.write_text(json.dumps({**manifest, "drive_on": True}))
+    with pytest.raises(EvaluationError, match="its drive_on is true, this one's false"):
+        driven(results, TWO)
 
 
 def test_measured_latency_drives_alone_and_warns(tmp_path: Path) -> None:
