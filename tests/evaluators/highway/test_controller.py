@@ -6,13 +6,11 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.interpolate import CubicSpline
 
 from me2e_compress.driving.contract import PedalsAndWheel, Trajectory
 from me2e_compress.evaluators.highway.blind import centre_plan
 from me2e_compress.evaluators.highway.controller import (
     AnchoredPlan,
-    clamped_spline,
     control_of,
     curvature_by,
 )
@@ -35,23 +33,6 @@ from tests.profiles import scaled
 
 LENGTH_M = 5.0
 AHEAD = np.array([[4.0 * k, 0.0] for k in range(1, 7)])
-STEPS = st.tuples(st.floats(0.3, 8.0), st.floats(-3.0, 3.0))
-
-
-@given(st.lists(STEPS, min_size=1, max_size=6), st.floats(-0.5, 0.5))
-def test_the_spline_is_scipys_to_the_bit(
-    steps: list[tuple[float, float]], course: float
-) -> None:
-    knots = np.cumsum([(0.0, 0.0), *steps], axis=0)
-    arc = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(knots, axis=0).T))])
-    tangent = np.array([math.cos(course), math.sin(course)])
-
-    ours = clamped_spline(arc, knots, tangent)
-
-    theirs = CubicSpline(arc, knots, bc_type=((1, tangent), (2, np.zeros(2))))
-    fine = np.linspace(0.0, arc[-1], 40)
-    np.testing.assert_array_equal(ours(fine), theirs(fine))
-    np.testing.assert_array_equal(ours(arc[-1], 1), theirs(arc[-1], 1))
 
 
 def follow(
