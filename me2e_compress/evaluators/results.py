@@ -175,7 +175,7 @@ def log_cost(folder: Path, driven: Driven) -> None:
 def _check_manifest(path: Path, made_by: object) -> None:
     """Check the parts that are read: routes, which are file names, and set size.
 
-    Drives of the first road, or of another version, are compared with none of this.
+    Drives of another version of the road are compared with none of this.
     """
     if not isinstance(made_by, dict) or not isinstance(made_by.get("routes"), list):
         raise EvaluationError(f"{path}: {MANIFEST} does not name its routes")

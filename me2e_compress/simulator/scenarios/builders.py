@@ -302,5 +302,4 @@ def stage_of(route: Route, builder: Builder | None = None) -> Stage:
     if not hasattr(stage, "ego"):
         raise EvaluationError(f"{route.scenario}: its layout set no route")
     stage.schedule.arrivals.sort(key=lambda arrival: (arrival[0], arrival[1].id))
-    stage.complete()
     return stage

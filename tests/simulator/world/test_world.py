@@ -7,7 +7,6 @@ import pytest
 
 from me2e_compress.errors import EvaluationError
 from me2e_compress.simulator.plane_geometry import resample
-from me2e_compress.simulator.routes import Parameter
 from me2e_compress.simulator.scenarios.roads import two_way
 from me2e_compress.simulator.scene import ActorKind, Control, EventKind
 from me2e_compress.simulator.traffic.bodies import Behaviour
@@ -47,34 +46,6 @@ def test_a_given_parameter_changes_that_one_alone() -> None:
     given = World(route_of(seed=1, obstacle_m=70.5)).parameters
 
     assert given == {**drawn, "obstacle_m": 70.5}
-
-
-@pytest.mark.parametrize(
-    ("scenario", "given", "words"),
-    [
-        ("Accident", {"obstacle_m": "far"}, "obstacle_m is 'far'"),
-        ("Accident", {"obstacle": 70.0}, "has no parameter obstacle here; there"),
-        ("VehicleTurningRoute", {"move": "up"}, "is 'up'; there are left, right"),
-    ],
-)
-def test_a_wrong_parameter_is_named(
-    scenario: str, given: dict[str, Parameter], words: str
-) -> None:
-    with pytest.raises(EvaluationError, match=words):
-        World(route_of(scenario, **given))  # type: ignore[arg-type]
-
-
-def test_a_script_must_draw_its_parameters_before_it_starts() -> None:
-    def late(stage: Stage) -> None:
-        two_way(stage)
-        stage.play(dice(stage))
-
-    def dice(stage: Stage) -> Script:
-        yield
-        stage.uniform("dice", 1.0, 6.0)
-
-    with pytest.raises(EvaluationError, match="parameter dice is drawn after"):
-        coast(World(route_of(), builder=late), 1)
 
 
 @pytest.mark.parametrize("value", [math.nan, math.inf])
