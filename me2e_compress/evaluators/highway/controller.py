@@ -180,8 +180,7 @@ def _smooth(knots: Floats, course: float) -> Floats:
     curve = knots[:1]
     if len(knots) > 1:
         arc = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(knots, axis=0).T))])
-        ends = (1, tangent), (2, np.zeros(2))
-        spline = CubicSpline(arc, knots, bc_type=ends)
+        spline = CubicSpline(arc, knots, bc_type=((1, tangent), (2, np.zeros(2))))
         fine = np.append(np.arange(0.0, arc[-1], STATION_M / 2), arc[-1])
         curve, tangent = spline(fine), spline(arc[-1], 1)
         tangent = tangent / np.hypot(*tangent)
