@@ -6,6 +6,7 @@ or in the dialect of a TensorRT plugin library.
 
 from me2e_compress.operators.base import (
     OPERATORS,
+    RESERVED,
     Cost,
     Operator,
     dialect_names,
@@ -32,6 +33,7 @@ from me2e_compress.operators.replace import (
 __all__ = [
     "OPERATORS",
     "OWN_DOMAIN",
+    "RESERVED",
     "Attribute",
     "Cost",
     "Dialect",

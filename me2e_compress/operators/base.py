@@ -129,7 +129,7 @@ OPERATORS: Registry[Operator] = Registry(
     },
 )
 
-_RESERVED = (OWN_DOMAIN, "com.microsoft")
+RESERVED = (OWN_DOMAIN, "com.microsoft")
 """Domains that define their operators; names there match no other dialect."""
 
 
@@ -145,10 +145,10 @@ def find(node: ir.Node) -> tuple[Operator, Dialect] | None:
         return None
     # Reserved domains match only their own dialects
     domain = "" if is_standard(node) or node.domain == PLUGIN_DOMAIN else node.domain
-    if domain in _RESERVED:
+    if domain in RESERVED:
         rows = [row for row in rows if row[1].domain == domain]
     else:
-        rows = [row for row in rows if row[1].domain not in _RESERVED]
+        rows = [row for row in rows if row[1].domain not in RESERVED]
     version = node.attributes.get_string("plugin_version", "1")
     return max(
         rows,

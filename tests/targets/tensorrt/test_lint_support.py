@@ -174,9 +174,12 @@ ROTATE = "m (float[2,4,4] x, float[1] a, float[2] c) => (float[2,4,4] y) { y = %
     [
         ("trt.RotateTRT<interpolation=1>(x, a, c)", None),
         ("trt.RotateTRT(x, a, c)", "needs attributes interpolation"),
-        ("trt.RotateTRT<interpolation=1>(x, a)", "takes 3 inputs, not 2"),
-        ("trt.RotateTRT<interpolation=1>(a, a, c)", "takes rank 3, not 1"),
-        ("trt.InverseTRT(x)", "takes rank 4, not 3"),
+        (
+            "trt.RotateTRT<interpolation=1>(x, a)",
+            "RotateTRT of BEVFormer_tensorrt takes 3 inputs, found 2",
+        ),
+        ("trt.RotateTRT<interpolation=1>(a, a, c)", "img is [1], not [C=1, H, W]"),
+        ("trt.InverseTRT(x)", "is [2, 4, 4], not ["),
         ("trt.Twist(x)", "trt::Twist is neither an operator nor a known plugin"),
     ],
 )
@@ -197,8 +200,8 @@ def test_deformable_attention_wants_int32_shapes() -> None:
     )
     (each,) = found(text)
 
-    assert "input 1 of MultiscaleDeformableAttnPlugin_TRT" in each.message
-    assert "must be int32" in each.message
+    assert "MultiscaleDeformableAttnPlugin_TRT of" in each.message
+    assert "spatial_shapes is int64, not int32" in each.message
 
 
 def test_a_local_function_stands_in_for_an_operator() -> None:

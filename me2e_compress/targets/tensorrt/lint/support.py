@@ -14,19 +14,18 @@ operator name, ``plugin_version`` and ``plugin_namespace``.
 """
 
 import dataclasses
-import functools
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator
 from typing import TypeAlias
 
 import onnx_ir as ir
 
 from me2e_compress import graph
+from me2e_compress.errors import PreconditionError
 from me2e_compress.graph import input_at, is_standard, nodes_of, opset_of, rank_of
 from me2e_compress.graph.nodes import is_plugin
 from me2e_compress.graph.shapes import unshaped_plugins
-from me2e_compress.operators import OWN_DOMAIN, Dialect, operators
-from me2e_compress.operators.dialect import INT32
+from me2e_compress.operators import RESERVED, Dialect, find
 from me2e_compress.targets import (
     LintFinding,
     LintRule,
@@ -131,60 +130,6 @@ UNSUPPORTED = frozenset(
 """Operators that the matrix lists as not supported."""
 
 
-@dataclasses.dataclass(frozen=True)
-class Plugin:
-    """The inputs and attributes of a plugin.
-
-    ``types`` and ``rank`` are those of its first input, where a rank of None accepts
-    any; ``integers`` are the indices of inputs that must be int32.
-    """
-
-    source: str
-    inputs: tuple[int, int]
-    attributes: tuple[str, ...]
-    types: frozenset[ir.DataType]
-    rank: int | None
-    integers: tuple[int, ...]
-
-
-_OTHER_DOMAINS = (OWN_DOMAIN, "com.microsoft")
-"""Domains whose operators are not TensorRT plugins."""
-
-
-@functools.cache
-def known_plugins() -> Mapping[str, Plugin]:
-    """Return the plugins of all known dialects, by the operator's name.
-
-    Where libraries share a name, anything that one of them accepts is allowed.
-    """
-    rows: dict[str, list[Dialect]] = {}
-    for operator in operators():
-        for dialect in operator.dialects:
-            if dialect.domain not in _OTHER_DOMAINS:
-                rows.setdefault(dialect.op_type, []).append(dialect)
-    return {op_type: _plugin(dialects) for op_type, dialects in rows.items()}
-
-
-def _plugin(dialects: Sequence[Dialect]) -> Plugin:
-    # Libraries that share a name are merged to the widest form.
-    first = dialects[0]
-    least = min(sum(not each.optional for each in row.operands) for row in dialects)
-    ranks = {row.operands[0].rank for row in dialects}
-    return Plugin(
-        first.source,
-        (least, max(len(row.operands) for row in dialects)),
-        tuple(each.name for each in first.attributes if each.required),
-        frozenset(kind for row in dialects for kind in row.operands[0].types),
-        ranks.pop() if len(ranks) == 1 else None,
-        tuple(
-            index
-            for index, operand in enumerate(first.operands)
-            if all(row.operands[index].types == INT32 for row in dialects)
-            and not operand.optional
-        ),
-    )
-
-
 OLDEST_OPSET = 9
 
 _DATA_INPUT = {"OneHot": 2, "Where": 1}
@@ -277,14 +222,13 @@ def plugins(model: ir.Model) -> Iterator[LintFinding]:
 
     TensorRT looks at the name alone; exporters leave the domain out.
     """
-    known = known_plugins()
     for node in nodes_of(model):
         if not is_plugin(node):
             continue
         # A local function makes an unknown operator acceptable.
-        plugin = known.get(node.op_type)
-        if plugin is not None:
-            for message in _misfits(node, plugin):
+        dialect = _plugin(node)
+        if dialect is not None:
+            for message in _misfits(node, dialect):
                 yield error("plugin", node, message)
         elif node.op_identifier() not in model.functions:
             yield error(
@@ -295,34 +239,28 @@ def plugins(model: ir.Model) -> Iterator[LintFinding]:
             )
 
 
-def _misfits(node: ir.Node, plugin: Plugin) -> Iterator[str]:
-    """Say where a node does not fit the plugin of its name."""
-    name, (least, most) = f"{node.op_type} of {plugin.source}", plugin.inputs
-    if not least <= len(node.inputs) <= most:
-        wanted = f"{least}" if least == most else f"{least} to {most}"
-        yield f"{name} takes {wanted} inputs, not {len(node.inputs)}"
-        return
-    # Check attributes, then type and rank of the first input.
-    if missing := [each for each in plugin.attributes if each not in node.attributes]:
+def _plugin(node: ir.Node) -> Dialect | None:
+    """Return the plugin of a node's name, of several the one that fits it best."""
+    match = find(node)
+    return None if match is None or match[1].domain in RESERVED else match[1]
+
+
+def _misfits(node: ir.Node, dialect: Dialect) -> Iterator[str]:
+    """Say where a node does not fit a plugin."""
+    name = f"{node.op_type} of {dialect.source}"
+    required = [each.name for each in dialect.attributes if each.required]
+    if missing := [each for each in required if each not in node.attributes]:
         yield f"{name} needs attributes {', '.join(missing)}"
-    first = node.inputs[0]
-    kind, rank = None if first is None else first.dtype, rank_of(first)
-    if kind is not None and kind not in plugin.types:
-        yield f"{name} does not take {kind.name.lower()}"
-    if None not in (rank, plugin.rank) and rank != plugin.rank:
-        yield f"{name} takes rank {plugin.rank}, not {rank}"
-    # Indices must be int32.
-    for index in plugin.integers:
-        value = node.inputs[index]
-        if value is not None and value.dtype not in (None, ir.DataType.INT32):
-            yield f"input {index} of {name} must be int32, not {value.dtype}"
+    try:
+        dialect.check(node)
+    except PreconditionError as refusal:
+        yield str(refusal).replace(dialect.call_of(node), name, 1)
 
 
 def plugin_shapes(model: ir.Model) -> Iterator[LintFinding]:
     """Find known plugins whose outputs have no shape, nor what follows them."""
-    known = known_plugins()
     for node in unshaped_plugins(model):
-        if node.op_type in known:
+        if _plugin(node) is not None:
             yield warning(
                 "plugin-shape",
                 node,
