@@ -88,14 +88,6 @@ class Operator(abc.ABC):
         """Return the own form, then every library's."""
         return (self.own, *self.dialects)
 
-    def dialect_reference(
-        self, dialect: Dialect, inputs: Arrays, attributes: Attributes
-    ) -> NdArray:
-        """Compute a call in a dialect, in numpy and float64."""
-        own = dialect.arrays_to_own(inputs, attributes)
-        result = self.reference(own, dialect.options_to_own(attributes))
-        return dialect.result_from_own_array(result)
-
     def cost(self, node: ir.Node, dialect: Dialect) -> Cost:
         """Return the cost of one call as far as the shapes are known."""
         shapes = dialect.shapes_to_own([open_shape(value) for value in node.inputs])

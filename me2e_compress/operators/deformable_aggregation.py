@@ -52,12 +52,6 @@ class ScaledFeature(Dialect):
         wide = call.cast(feature, scale.dtype or ir.DataType.FLOAT)
         return (call.add("Mul", [wide, scale]), *others)
 
-    def arrays_to_own(self, arrays: Arrays, attributes: Attributes) -> Arrays:
-        """Multiply the features by their scales."""
-        if len(arrays) < 6 or arrays[5] is None:
-            return arrays[:5]
-        return (np.asarray(arrays[0]) * arrays[5].astype(np.float64), *arrays[1:5])
-
     def shapes_to_own(self, shapes: Sequence[Dims | None]) -> Sequence[Dims | None]:
         """Drop the shape of the scales."""
         return shapes[:5]

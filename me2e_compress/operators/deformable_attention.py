@@ -52,10 +52,6 @@ class JoinedHeads(Dialect):
         sizes = (call.size(value, 0), call.size(locations, 1), width)
         return call.reshape(result, sizes)
 
-    def result_from_own_array(self, result: NdArray) -> NdArray:
-        """Join the heads."""
-        return result.reshape(*result.shape[:2], -1)
-
     def shape_from_own(self, shape: Dims) -> Dims:
         """Join the heads."""
         return (*shape[:2], product(shape[2:]))
@@ -109,30 +105,6 @@ class RawAttention(Dialect):
             )
         raw = call.reshape(raw, (batch, queries, heads, -1))
         return self.in_types(call, (value, shapes, reference, offsets, raw))
-
-    def arrays_to_own(self, arrays: Arrays, attributes: Attributes) -> Arrays:
-        """Compute the locations, the softmax and the start of each level."""
-        value, shapes, reference, offsets, raw = (np.asarray(each) for each in arrays)
-        count, (batch, queries, heads, _) = len(shapes), offsets.shape
-        group = reference.shape[-1] // 2
-        # Offsets in pixels, around the reference points
-        parted = offsets.reshape(batch, queries, heads, count, -1, group, 2)
-        scale = shapes[:, None, None, ::-1].astype(np.float64)
-        # an empty level has no positions: any number will do
-        parted = parted.astype(np.float64) / np.where(scale == 0, 1, scale)
-        at = parted + reference.reshape(batch, queries, 1, 1, 1, group, 2)
-        # Softmax in float64
-        powers = np.exp(raw - raw.max(axis=-1, keepdims=True).astype(np.float64))
-        weights = powers / powers.sum(axis=-1, keepdims=True)
-        # Start of each level
-        areas = shapes.astype(np.int64).prod(axis=1)
-        return (
-            value,
-            shapes,
-            np.cumsum(areas) - areas,
-            at.reshape(batch, queries, heads, count, -1, 2),
-            weights.reshape(batch, queries, heads, count, -1),
-        )
 
     def shapes_to_own(self, shapes: Sequence[Dims | None]) -> Sequence[Dims | None]:
         """Split the last axes into levels, points and x, y."""

@@ -99,7 +99,7 @@ class Dialect:
 
     Subclasses override the conversions where inputs, attributes or output differ:
     ``inputs_*`` and ``result_*`` write them as nodes, ``options_*`` convert attributes,
-    ``shape*`` shapes, and methods with ``array`` in their names numpy arrays.
+    and ``shape*`` shapes.
 
     Attributes:
         name: its name for ``translate-plugins`` and ``--dialect``.
@@ -157,14 +157,6 @@ class Dialect:
         self, call: FusedCall, result: ir.Value, own: Values
     ) -> ir.Value:
         """Write the conversion of the own form's output to this dialect's."""
-        return result
-
-    def arrays_to_own(self, arrays: Arrays, attributes: Attributes) -> Arrays:
-        """Convert this dialect's inputs to the own form's, in numpy."""
-        return arrays
-
-    def result_from_own_array(self, result: NdArray) -> NdArray:
-        """Convert the own form's output to this dialect's, in numpy."""
         return result
 
     def shape_from_own(self, shape: Dims) -> Dims:

@@ -258,12 +258,6 @@ class ScaledGrid(Dialect):
         grid = call.transpose(grid, (0, rank - 1, *range(1, rank - 1)))
         return image, call.add("Mul", [grid, call.numbers(_SCALE, grid)])
 
-    def arrays_to_own(self, arrays: Arrays, attributes: Attributes) -> Arrays:
-        """Put the components last, in -1..1."""
-        image, grid = arrays
-        assert grid is not None
-        return image, grid.transpose(0, *range(2, grid.ndim), 1) / _SCALE
-
     def shapes_to_own(self, shapes: Sequence[Dims | None]) -> Sequence[Dims | None]:
         """Put the components last."""
         image, grid = shapes

@@ -18,9 +18,7 @@ from me2e_compress.operators.dialect import (
     FLOATS,
     INTEGERS,
     OWN_DOMAIN,
-    Arrays,
     Dialect,
-    NdArray,
     Operand,
     Values,
     present,
@@ -97,25 +95,6 @@ class RawOwnForm(Dialect):
         result.type = ir.TensorType(ir.DataType.FLOAT)
         return result
 
-    def arrays_to_own(self, arrays: Arrays, attributes: Attributes) -> Arrays:
-        """Compute the locations and the weights in float64."""
-        value, shapes, starts, *rest = (np.asarray(each) for each in arrays)
-        reference, offsets, scores, mask = (each.astype(np.float64) for each in rest)
-        levels, points = len(shapes), offsets.shape[4]
-        away = _repeated(offsets, {3: levels, 4: points})
-        near, factor = (
-            _repeated(each, {4: points}).repeat(levels // (each.shape[3] or 1), axis=3)
-            for each in (reference, mask)
-        )
-        powers = np.exp(scores - scores.max(axis=-1, keepdims=True))
-        soft = powers / powers.sum(axis=-1, keepdims=True)
-        soft = soft.reshape(*soft.shape[:3], -1)
-        times = levels * points // soft.shape[3] if soft.shape[3] else 1
-        soft = np.tile(soft, (1, 1, 1, times))
-        weights = soft.reshape(*soft.shape[:3], levels, points) * factor
-        full = (*offsets.shape[:3], levels, points)
-        return (value, shapes, starts, near + away, np.broadcast_to(weights, full))
-
     def shapes_to_own(self, shapes: Sequence[Dims | None]) -> Sequence[Dims | None]:
         """Say how many levels and points there are after repetition."""
         value, sizes, starts, _, offsets, *_ = shapes
@@ -178,10 +157,3 @@ def _by_camera(call: FusedCall, value: ir.Value, levels: Size) -> ir.Value:
     product = call.add("Mul", [call.counting(levels), count])
     index = call.add("Div", [product, total])
     return call.add("Gather", [value, index], {"axis": 3})
-
-
-def _repeated(array: NdArray, full: Mapping[int, int]) -> NdArray:
-    times = [
-        full.get(axis, size) // (size or 1) for axis, size in enumerate(array.shape)
-    ]
-    return np.tile(array, times)

@@ -11,6 +11,7 @@ import onnxruntime
 from me2e_compress.graph.shapes import infer_shapes
 from me2e_compress.operators import Dialect, Operator, expand
 from me2e_compress.operators.call import AttributeValue
+from me2e_compress.testing.check_operator import DrawnCall, dialect_reference
 
 Arrays = Mapping[str, npt.NDArray[Any]]
 
@@ -110,11 +111,9 @@ def body_and_reference(
         open_dims=open_dims,
     )
     node = model.graph[0]
-    options = dialect.attributes_of(node)
+    call = DrawnCall(arrays, attributes or {})
     expand(node, opset=opset, by="test")
     assert all(each.domain == "" for each in model.graph)
     for domain in [each for each in model.graph.opset_imports if each]:
         del model.graph.opset_imports[domain]
-    return run(model, arrays), operator.dialect_reference(
-        dialect, list(arrays.values()), options
-    )
+    return run(model, arrays), dialect_reference(operator, dialect, call)

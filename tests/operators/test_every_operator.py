@@ -18,8 +18,10 @@ from me2e_compress.operators import (
     operators,
     translate,
 )
-from tests.operators.drawn import DRAWS, aggregation, attention, rotate, sampler
+from me2e_compress.testing.check_operator import DrawnCall, dialect_reference
+from tests.operators.drawn import DRAWS, Drawn, aggregation, attention, rotate, sampler
 from tests.operators.running import body_and_reference, graph_of, run
+from tests.operators.test_deformable_attention import CALL, arrays_of
 from tests.profiles import scaled
 
 ROWS = [
@@ -65,6 +67,31 @@ def hold(
 
 
 @pytest.mark.parametrize(
+    ("name", "spelling", "total"),
+    [
+        ("deformable-attention", "autoware", 8.966951255567565),
+        ("deformable-attention", "derryhub", 0.28138749866193885),
+        ("deformable-attention", "me2e-raw", 0.6545682701864984),
+        ("deformable-aggregation", "sparsedrive-v2", 3.9807939512435433),
+        ("grid-sampler-2d", "derryhub", 2.62734635),
+        ("grid-sampler-3d", "dl4agx", 9.294027669385786),
+    ],
+)
+def test_conversions_compute_what_numpy_computed(
+    name: str, spelling: str, total: float
+) -> None:
+    operator = OPERATORS.build(name, {})
+    dialect = dialect_of(operator, spelling)
+    assert dialect is not None
+    drawn: Drawn = arrays_of(dialect, CALL), {}
+    if name in DRAWS:
+        drawn = DRAWS[name](dialect, np.random.default_rng(4))
+    result = dialect_reference(operator, dialect, DrawnCall(*drawn))
+    parts = np.cos(np.arange(result.size)) * result.ravel()
+    assert parts.sum() == pytest.approx(total, rel=1e-7)
+
+
+@pytest.mark.parametrize(
     ("operator", "dialect"), BACK, ids=lambda each: getattr(each, "name", "")
 )
 def test_a_round_trip_gives_the_same_node_and_the_same_numbers(
@@ -82,7 +109,7 @@ def test_a_round_trip_gives_the_same_node_and_the_same_numbers(
     expand(node, opset=17, by="test")
     model.graph.opset_imports.clear()
     model.graph.opset_imports[""] = 17
-    want = operator.dialect_reference(dialect, list(arrays.values()), read)
+    want = dialect_reference(operator, dialect, DrawnCall(arrays, read))
     np.testing.assert_allclose(run(model, arrays), want, rtol=1e-4, atol=2e-4)
 
 

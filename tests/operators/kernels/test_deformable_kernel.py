@@ -14,6 +14,7 @@ from me2e_compress.operators.deformable_attention import DeformableAttention
 from me2e_compress.operators.raw_attention import raw_own_form
 from me2e_compress.runtime import runnable
 from me2e_compress.runtime.session import Session
+from me2e_compress.testing.check_operator import DrawnCall, dialect_reference
 from tests.operators.running import graph_of, in_float32
 from tests.operators.test_deformable_attention import arrays_of
 from tests.profiles import scaled
@@ -60,7 +61,7 @@ def test_every_dialect_answers_its_reference(
 
     found = Session(model, threads=1).run(arrays)["result"]
 
-    expected = OPERATOR.dialect_reference(dialect, list(arrays.values()), {})
+    expected = dialect_reference(OPERATOR, dialect, DrawnCall(arrays))
     assert np.allclose(found, expected, rtol=1e-4, atol=1e-4)
 
 
@@ -130,7 +131,7 @@ def raw_call() -> dict[str, Any]:
 def test_levels_share_offsets_and_a_camera_without_weight_is_not_read() -> None:
     arrays = raw_call()
     arrays["mask"][:, :, :, 1] = 0
-    expected = OPERATOR.dialect_reference(RAW, list(arrays.values()), {})
+    expected = dialect_reference(OPERATOR, RAW, DrawnCall(arrays))
     arrays["value"][:, 12:24] = np.nan
     model = graph_of(RAW, arrays, opset=17)
     _, needed = runnable.compiled_or_expanded(model, compiled=True)
@@ -155,18 +156,18 @@ call (uint8[1,36,23,8] value, int64[6,2] sizes, int64[6] starts,
 
 
 def test_int8_values_with_raw_offsets_and_scores() -> None:
-    _, *others = raw_call().values()
+    arrays = raw_call()
     stored = np.random.default_rng(2).integers(0, 256, (1, 36, 23, 8)).astype(np.uint8)
     model = ir.from_onnx_text(STORED_RAW)
     _, needed = runnable.compiled_or_expanded(model, compiled=True)
     assert [each.op_type for each in needed] == ["RawDeformableAttentionUint8"]
 
     names = [str(port.name) for port in model.graph.inputs]
-    feeds = dict(zip(names, [stored, *others], strict=True))
+    feeds = dict(zip(names, [stored, *list(arrays.values())[1:]], strict=True))
     found = Session(model, threads=1).run(feeds)["y"]
 
     real = (stored.astype(np.float64) - 119) * 0.02
-    expected = OPERATOR.dialect_reference(RAW, [real, *others], {})
+    expected = dialect_reference(OPERATOR, RAW, DrawnCall({**arrays, "value": real}))
     assert np.allclose(found, expected, rtol=1e-4, atol=1e-4)
 
 
