@@ -42,9 +42,10 @@ def main() -> None:
     given = parser.parse_args()
     given.out.mkdir(parents=True, exist_ok=True)
     path: Path = given.out / "records.jsonl"
-    stacks, targets = given.stacks.split(","), given.targets.split(",")
+    stacks: list[str] = given.stacks.split(",")
+    targets: list[str] = given.targets.split(",")
 
-    seeds = () if given.table else range(given.seeds)
+    seeds = range(0 if given.table else given.seeds)
     for seed, stack, target in product(seeds, stacks, targets):
         key = (stack, target, seed)
         if key in {key_of(record) for record in records(path)}:

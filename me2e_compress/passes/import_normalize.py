@@ -17,6 +17,7 @@ from me2e_compress.graph.shapes import static_shape
 from me2e_compress.graph.validity import ORIGINAL_DOMAIN, PLUGIN_DOMAIN
 from me2e_compress.passes.base import Context, Pass, PassResult
 from me2e_compress.passes.einsum_products import write_products
+from me2e_compress.passes.sequences import unpack_sequences
 from me2e_compress.targets.quantized import PAIR
 
 __all__ = [
@@ -189,6 +190,7 @@ class ImportNormalize(Pass):
        columns a Conv of kernel 1: layers, which become int8.
     9. Scales by channel that have dimensions of 1 beside become vectors: no runtime
        takes ``[64, 1, 1]``.
+    10. A sequence that is only taken apart again becomes its tensors.
 
     Subgraphs and function bodies are included. Unknown operators are left alone.
 
@@ -225,6 +227,8 @@ class ImportNormalize(Pass):
                     body.opset_imports[node.domain] = 1
                     changes += 1
         changes += write_products(model, self.name) + _flatten_scales(model, self.name)
+        if opset_of(model) >= LEAST_OPSET:
+            changes += unpack_sequences(model, self.name)
         return PassResult(model, changes, tuple(filter(None, (raise_note, note))))
 
 

@@ -1,0 +1,144 @@
+"""Sequences of tensors that a graph only takes apart again, as plain operators."""
+
+from collections.abc import Sequence
+
+import numpy as np
+import onnx_ir as ir
+
+from me2e_compress.graph import array_of, input_at, is_standard, provenance
+from me2e_compress.graph.nodes import graphs_of, integers_of
+from me2e_compress.graph.rewrite import (
+    add_constant,
+    fresh_name,
+    put,
+    remove_node,
+    value_names,
+)
+from me2e_compress.graph.shapes import static_shape
+
+
+def unpack_sequences(model: ir.Model, by: str) -> int:
+    """Write sequences of a known number of tensors as the tensors; count the nodes.
+
+    A sequence goes where all its readers take one tensor out at a constant place, ask
+    for its length, or join all. TensorRT's parser takes no sequence.
+
+    Given:   s = SplitToSequence(x, [2, 4])  ;  y = SequenceAt(s, 1)
+
+    Result:  a, b = Split(x, [2, 4])         ;  y = Identity(b)
+    """
+    count, names = 0, value_names(model.graph)
+    for body in graphs_of(model.graph):
+        for node in list(body):
+            if node.op_type not in ("SplitToSequence", "SequenceConstruct"):
+                continue
+            readers = list(node.outputs[0].consumers())
+            size = _length(node) if is_standard(node) else None
+            if size is None or not readers or node.outputs[0].is_graph_output():
+                continue
+            if not all(_unpacks(reader, size) for reader in readers):
+                continue
+            tensors = _tensors(node, size, names, by)
+            for reader in readers:
+                _read(reader, tensors, names, by)
+            remove_node(node)
+            count += 1 + len(readers)
+    return count
+
+
+def _length(node: ir.Node) -> int | None:
+    """Return how many tensors a sequence has; None where that is open."""
+    if node.op_type == "SequenceConstruct":
+        return len(node.inputs)
+    lengths = _lengths(node)
+    return None if lengths is None else len(lengths)
+
+
+def _lengths(node: ir.Node) -> list[int] | None:
+    """Return the lengths of the parts of a SplitToSequence along its axis."""
+    split = input_at(node, 1)
+    shape, axis = static_shape(node.inputs[0]), node.attributes.get_int("axis", 0)
+    size = None if shape is None else shape[axis]
+    if split is None:
+        kept = node.attributes.get_int("keepdims", 1)
+        return [1] * size if size is not None and kept else None
+    lengths, array = integers_of(split), array_of(split)
+    if lengths is None or array is None or array.ndim:
+        return lengths
+    # one number is the length of each part but the last
+    if size is None or lengths[0] < 1:
+        return None
+    return [min(lengths[0], size - at) for at in range(0, size, lengths[0])]
+
+
+def _unpacks(reader: ir.Node, size: int) -> bool:
+    """Return whether a reader of a sequence is a plain operator on its tensors."""
+    if reader.op_type == "SequenceAt":
+        places = integers_of(reader.inputs[1])
+        return bool(places) and -size <= places[0] < size
+    return reader.op_type in ("SequenceLength", "ConcatFromSequence")
+
+
+def _tensors(
+    node: ir.Node, size: int, names: set[str], by: str
+) -> Sequence[ir.Value | None]:
+    """Return the tensors of a sequence: those of its making, or of a Split."""
+    lengths = _lengths(node) if node.op_type == "SplitToSequence" else None
+    graph, source = node.graph, node.inputs[0]
+    if lengths is None or source is None:
+        return node.inputs
+    assert isinstance(graph, ir.Graph)
+    stored = np.array(lengths, np.int64)
+    split = add_constant(graph, stored, f"{node.name}_lengths", names)
+    new = _insert(node, "Split", [source, split], size, names, by)
+    new.attributes["axis"] = ir.AttrInt64("axis", node.attributes.get_int("axis", 0))
+    for value in new.outputs:
+        value.type = source.type
+    return new.outputs
+
+
+def _read(
+    reader: ir.Node, tensors: Sequence[ir.Value | None], names: set[str], by: str
+) -> None:
+    """Rewrite a reader of a sequence to read its tensors."""
+    graph = reader.graph
+    assert isinstance(graph, ir.Graph)
+    if reader.op_type == "SequenceAt":
+        (place,) = integers_of(reader.inputs[1]) or (0,)
+        put(reader, "Identity", [tensors[place]], by=by)
+        return
+    if reader.op_type == "SequenceLength":
+        stored = np.array(len(tensors), np.int64)
+        length = add_constant(graph, stored, f"{reader.name}_length", names)
+        put(reader, "Identity", [length], by=by)
+        return
+    # a new axis is put into each tensor before they are joined along it
+    axis = reader.attributes.get_int("axis", 0)
+    if reader.attributes.get_int("new_axis", 0):
+        stored = np.array([axis], np.int64)
+        axes = add_constant(graph, stored, f"{reader.name}_axes", names)
+        tensors = [
+            _insert(reader, "Unsqueeze", [tensor, axes], 1, names, by).outputs[0]
+            for tensor in tensors
+        ]
+    put(reader, "Concat", tensors, by=by, attributes={"axis": axis})
+
+
+def _insert(
+    old: ir.Node,
+    op: str,
+    inputs: Sequence[ir.Value | None],
+    outputs: int,
+    names: set[str],
+    by: str,
+) -> ir.Node:
+    """Put a new node in front of an old one."""
+    name = fresh_name(f"{old.name}_{op}", names)
+    new = ir.node(op, inputs, num_outputs=outputs, name=name)
+    for place, value in enumerate(new.outputs):
+        value.name = fresh_name(f"{name}_{place}", names)
+    provenance.inherit(new, [old], by=by)
+    graph = old.graph
+    assert isinstance(graph, ir.Graph)
+    graph.insert_before(old, new)
+    return new

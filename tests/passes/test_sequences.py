@@ -1,0 +1,53 @@
+"""Sequences that a graph only takes apart again become plain operators."""
+
+import numpy as np
+import onnx_ir as ir
+import pytest
+
+from me2e_compress.passes.sequences import unpack_sequences
+from me2e_compress.runtime.session import run_once
+
+
+def graph_of(body: str) -> ir.Model:
+    return ir.from_onnx_text(
+        f"""<ir_version: 9, opset_import: ["" : 17]>
+        g (float[2,6] x) => (y) <
+            int64 zero = {{0}}, int64 last = {{-1}}, int64 four = {{4}},
+            int64[2] parts = {{2, 4}}
+        > {{ {body} }}"""
+    )
+
+
+@pytest.mark.parametrize(
+    "body",
+    [
+        '["s"] s = SplitToSequence<axis = 1>(x, parts) ["y"] y = SequenceAt(s, last)',
+        '["s"] s = SplitToSequence<axis = -1>(x, four) ["y"] y = SequenceAt(s, last)',
+        '["s"] s = SplitToSequence(x) ["y"] y = SequenceAt(s, zero)',
+        '["s"] s = SequenceConstruct(x, x) ["y"] y = SequenceLength(s)',
+        '["n"] n = Neg(x) ["s"] s = SequenceConstruct(x, n)'
+        ' ["y"] y = ConcatFromSequence<axis = 1>(s)',
+        '["n"] n = Neg(x) ["s"] s = SequenceConstruct(x, n)'
+        ' ["y"] y = ConcatFromSequence<axis = -1, new_axis = 1>(s)',
+    ],
+)
+def test_a_sequence_becomes_its_tensors(body: str) -> None:
+    model = graph_of(body)
+    feeds = {"x": np.arange(12, dtype=np.float32).reshape(2, 6)}
+    before = run_once(model, feeds)["y"]
+    assert unpack_sequences(model, "test") == 2
+    np.testing.assert_array_equal(run_once(model, feeds)["y"], before)
+    assert not any("Sequence" in node.op_type for node in model.graph)
+
+
+@pytest.mark.parametrize(
+    "body",
+    [
+        '["s"] s = SplitToSequence<keepdims = 0>(x) ["y"] y = SequenceAt(s, zero)',
+        '["s"] s = SequenceConstruct(x) ["t"] t = SequenceInsert(s, x)'
+        ' ["y"] y = SequenceAt(t, last)',
+    ],
+)
+def test_other_sequences_stay(body: str) -> None:
+    model = graph_of(body)
+    assert unpack_sequences(model, "test") == 0
