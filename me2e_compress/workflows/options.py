@@ -419,5 +419,3 @@ class EvaluateOptions(WorkerOptions, GraphOptions, WriteOptions):
     def __post_init__(self) -> None:
         super().__post_init__()
         check_count("--seed", self.seed)
-
-

@@ -5,6 +5,7 @@ import pytest
 
 from me2e_compress.errors import RecipeError
 from me2e_compress.quantization.decision import Decision
+from me2e_compress.quantization.plan import make_plan
 from me2e_compress.quantization.rules import RULE_SETS
 from me2e_compress.quantization.scheme import QuantScheme
 from me2e_compress.targets.onnxruntime import OnnxRuntime

@@ -13,7 +13,6 @@ import numpy as np
 import onnx
 import pytest
 import torch
-from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from me2e_compress.graph import load
