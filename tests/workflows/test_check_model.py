@@ -5,8 +5,9 @@ from pathlib import Path
 
 import pytest
 
-from me2e_compress import ModelCheck, check_model
+from me2e_compress import check_model
 from me2e_compress.errors import EvaluationError
+from me2e_compress.workflows.evaluate import ModelCheck
 from me2e_compress.workflows.options import GraphOptions
 from tests.evaluators.highway.drivers import straight_on
 
