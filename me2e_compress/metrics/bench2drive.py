@@ -142,7 +142,6 @@ def _smoothed(values: Floats, derivative: int = 0) -> Floats:
 
 ABILITIES = ("Overtaking", "Merging", "Emergency_Brake", "Give_Way", "Traffic_Signs")
 TRAFFIC_SIGNS = "Traffic_Signs"
-MEAN = "mean"
 
 JUNCTION_MARGIN_M = 8.0
 """How far past the start of a junction the ego must come to have obeyed its signs."""
@@ -172,8 +171,8 @@ def successes(episodes: Sequence[Episode]) -> dict[str, tuple[bool, ...]]:
     }
 
 
-def ability_rates(episodes: Sequence[Episode]) -> dict[str, Estimate]:
-    """Return the rate of each ability of a real run in percent, and their mean.
+def ability_rates(episodes: Sequence[Episode]) -> tuple[Estimate, dict[str, Estimate]]:
+    """Return the mean of the abilities' rates of a real run in percent, and each rate.
 
     A real run does not say where junctions are. Where that decides, the rate of
     Traffic_Signs is None, and so is the mean.
@@ -202,9 +201,9 @@ def ability_rates(episodes: Sequence[Episode]) -> dict[str, Estimate]:
     lacks = [name for name, rate in rates.items() if rate.value is None]
     if lacks:
         reason = f"{lacks[0]}: {rates[lacks[0]].measure.reason}"
-        return {**rates, MEAN: Estimate.missing("%", reason, len(episodes))}
+        return Estimate.missing("%", reason, len(episodes)), rates
     mean = fmean(rate.value or 0.0 for rate in rates.values())
-    return {**rates, MEAN: Estimate(Measure(mean, "%"), None, None, len(episodes))}
+    return Estimate(Measure(mean, "%"), None, None, len(episodes)), rates
 
 
 def _ran_a_sign(episode: Episode) -> bool:

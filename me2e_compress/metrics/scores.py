@@ -10,7 +10,6 @@ import numpy as np
 from me2e_compress.metrics import bench2drive, route_scores
 from me2e_compress.metrics.bench2drive import (
     ABILITIES,
-    MEAN,
     ability_rates,
     success,
     successes,
@@ -209,8 +208,7 @@ def _abilities(
     Real runs do not tell where junctions are, which Traffic_Signs needs.
     """
     if any(episode.given is not None for episode in episodes):
-        rates = ability_rates(episodes)
-        return rates.pop(MEAN), rates
+        return ability_rates(episodes)
     outcomes = successes(episodes)
     each = {
         name: _rate(mastered, _types(e for e in episodes if name in e.abilities), seed)

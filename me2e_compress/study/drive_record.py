@@ -220,24 +220,20 @@ def changes(
     there = {each.name: each for each in drives if each.routes}
     costs = list[Change]()
     for condition in (each for each in conditions if each.against):
+        names = condition.name, condition.against
+        theirs, theirs_before = (there.get(f"{baseline}.{name}") for name in names)
         for drive in (each for each in drives if each.condition == condition.name):
-            # the drive and its counterpart, of the variant and the baseline
-            ours, before, theirs, theirs_before = (
-                there.get(f"{variant}.{name}")
-                for variant in (drive.variant, baseline)
-                for name in (condition.name, condition.against)
-            )
+            ours, before = (there.get(f"{drive.variant}.{name}") for name in names)
             if not (ours and before and theirs and theirs_before):
                 continue
             change = Change.of(ours, before, seed)
             if drive.variant != baseline:
-                beyond = {
-                    name: (
-                        (ours.values(column) - before.values(column))
-                        - (theirs.values(column) - theirs_before.values(column))
-                    ).mean(seed)
-                    for name, column in _CHANGED.items()
+                columns = _CHANGED.items()
+                own = {n: ours.values(c) - before.values(c) for n, c in columns}
+                its = {
+                    n: theirs.values(c) - theirs_before.values(c) for n, c in columns
                 }
+                beyond = {name: (own[name] - its[name]).mean(seed) for name in own}
                 change = replace(change, beyond=beyond)
             costs.append(change)
     return tuple(costs)

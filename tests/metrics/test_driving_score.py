@@ -135,13 +135,13 @@ TESTED = (
 
 
 def test_traffic_signs_are_rated_unless_a_junction_decides() -> None:
-    rates = ability_rates(TESTED)
+    mean, rates = ability_rates(TESTED)
 
     assert rates["Traffic_Signs"].value == rates["Merging"].value == 50.0
     # the others were not driven, so there is no mean of five
-    assert rates["mean"].measure.reason == "Overtaking: no such route was driven"
+    assert mean.measure.reason == "Overtaking: no such route was driven"
     rammed = drive(CRASH, route="rammed", abilities=SIGNS, completion=80.0)
-    rates = ability_rates((*TESTED, rammed))
+    _, rates = ability_rates((*TESTED, rammed))
     signs = rates["Traffic_Signs"].measure
     assert signs.reason == "where the junction is on rammed is not known"
     assert rates["Merging"].value == pytest.approx(100 / 3)
@@ -151,6 +151,6 @@ def test_the_mean_is_that_of_five() -> None:
     others = ("Overtaking", "Emergency_Brake", "Give_Way")
     routes = (*TESTED, *(drive(route=each, abilities=(each,)) for each in others))
 
-    mean = ability_rates(routes)["mean"]
+    mean, _ = ability_rates(routes)
 
     assert mean.value == (100 + 50 + 100 + 100 + 50) / 5
