@@ -85,7 +85,7 @@ class PassManager:
         first = passes[0].name if passes else ""
         if needs_import(model) and first != ImportNormalize.name:
             passes = (ImportNormalize(), *passes)
-        run = _Run(self, context, checkpoint=model)
+        run = _Run(self, context, progress, checkpoint=model)
         for done, current in enumerate(passes):
             progress(done, len(passes), current.name)
             if not current.exact:
@@ -117,14 +117,27 @@ def collector_paused() -> Iterator[None]:
             gc.enable()
 
 
+SEARCH_S = 300.0
+"""CPU seconds after which passes that may be guilty are named together."""
+_RECORD = (
+    " where they are like none that the model sees, record some: compress MODEL"
+    " --frames FRAMES"
+)
+
+
 class _Run:
     """The state of one run: steps done, and the stretch not verified yet."""
 
     def __init__(
-        self, manager: PassManager, context: Context, checkpoint: ir.Model
+        self,
+        manager: PassManager,
+        context: Context,
+        progress: Progress,
+        checkpoint: ir.Model,
     ) -> None:
         self.manager = manager
         self.context = context
+        self.progress = progress
         self.steps: list[Step] = []
         self.verifications: list[Verification] = []
         self.lossy: list[LossyPass] = []
@@ -178,13 +191,16 @@ class _Run:
         self.verifications.append(found)
         if found.passed or inputs is None:
             return
-        current, guilty, changed = _bisect(runnable, model, inputs)
+        suspects, guilty, changed = _bisect(runnable, model, inputs, self.progress)
+        current, who = suspects[-1], " or ".join(each.name for each in suspects)
         worst = max(found.judged, key=lambda name: found.errors[name])
+        drawn = inputs.kind == "synthetic"
         error = VerificationError(
-            f"{current.name} promises the same outputs and changed {worst} by"
+            f"{who} promises the same outputs and changed {worst} by"
             f" {found.errors[worst]:.3g} of its range"
             f" (allowed {found.tolerances[worst]:.0e}, {found.inputs} inputs)"
             f"{equivalence.where(guilty, changed, inputs)}"
+            + (f"; inputs were drawn (seed {self.context.seed}):{_RECORD}" * drawn)
         )
         raise self._with_reproducer(current, guilty, error)
 
@@ -243,19 +259,21 @@ class _Run:
 
 
 def _bisect(
-    stretch: Stretch, last: ir.Model, inputs: VerificationInputs
-) -> tuple[Pass, ir.Model, ir.Model]:
+    stretch: Stretch, last: ir.Model, inputs: VerificationInputs, progress: Progress
+) -> tuple[list[Pass], ir.Model, ir.Model]:
     """Find the first pass after which the outputs differ, in log2 trials.
 
-    Returns it with the graph before and the graph after it.
+    After ``SEARCH_S`` CPU seconds it stops. Returns the passes that are left, with the
+    graph before and the graph after them.
     """
     models = [*(model for _, model in stretch), last]
-    good, bad = 0, len(stretch)
-    while bad - good > 1:
+    good, bad, begun = 0, len(stretch), process_time()
+    while bad - good > 1 and process_time() - begun < SEARCH_S:
+        progress(len(stretch) - (bad - good), len(stretch), "which pass it was")
         middle = (good + bad) // 2
         trial = equivalence.verify((), models[0], models[middle], inputs)
         good, bad = (middle, bad) if trial.passed else (good, middle)
-    return *stretch[good], models[bad]
+    return [each for each, _ in stretch[good:bad]], models[good], models[bad]
 
 
 def _fails_alike(
