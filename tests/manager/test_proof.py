@@ -14,6 +14,7 @@ from me2e_compress.errors import VerificationError
 from me2e_compress.manager import (
     PassManager,
     Verification,
+    pass_manager,
     runtime_levels,
     verification_inputs,
 )
@@ -360,3 +361,15 @@ def test_outputs_do_not_keep_the_memory_of_their_session(driver: ir.Model) -> No
     (outputs,) = VerificationInputs([frame], "recorded").run(driver)
 
     assert all(value.flags.owndata for value in outputs.values())
+
+
+def test_the_search_for_a_guilty_pass_ends_and_says_what_was_drawn(
+    context: Context, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    chosen = (passes.scales(1.01), passes.ROUNDS)
+    drawn = r"^scales promises .*; inputs were drawn \(seed \d+\): .* --frames FRAMES$"
+    with pytest.raises(VerificationError, match=drawn):
+        checks(LINEAR, context, *chosen)
+    monkeypatch.setattr(pass_manager, "SEARCH_S", 0.0)
+    with pytest.raises(VerificationError, match=r"normalize or scales or rounds prom"):
+        checks(LINEAR, context, *chosen)

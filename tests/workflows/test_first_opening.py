@@ -18,7 +18,7 @@ from me2e_compress.runtime.children import run_script
 from me2e_compress.runtime.frames import Array, Frame
 from me2e_compress.runtime.session import Session
 from me2e_compress.workflows import checks
-from me2e_compress.workflows.checks import try_first
+from me2e_compress.workflows.checks import try_first, unseen
 from me2e_compress.workflows.compress import compress
 from me2e_compress.workflows.result import SILENT, Listener
 from tests.nets import save_text
@@ -150,3 +150,18 @@ def test_what_only_the_optimizer_refuses_is_run_as_it_stands_and_told(
     assert np.all(Session(path, int8_kernels=True).run({"x": x})["y"] == 12)
     with pytest.raises(GraphError, match="MatMulNBits"):
         Session(path, int8_kernels=True, optimize="extended")
+
+
+def test_layers_in_functions_are_counted_as_often_as_they_are_called() -> None:
+    model = ir.from_onnx_text("""<ir_version: 10, opset_import: ["" : 18, "own" : 1]>
+        m (float[4,4] x, float[4,4] k) => (float[4,4] y)
+            { a = own.Two(x, k) b = own.One(a, k) y = MatMul(b, k) }
+        <opset_import: ["" : 18, "own" : 1], domain: "own">
+        Two (x, k) => (y) { a = own.One(x, k) y = own.One(a, k) }
+        <opset_import: ["" : 18], domain: "own">
+        One (x, k) => (y) { a = MatMul(x, k) y = Relu(a) }""")
+    hint = unseen(model)
+    assert hint.startswith("3 layers in functions of the file (own::Two, own::One), ")
+    assert "python -c 'import onnx, onnx.inliner as i; onnx.save(" in hint
+    model.functions.clear()
+    assert "layer" not in unseen(model)
