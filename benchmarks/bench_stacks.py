@@ -8,6 +8,7 @@ own with an empty cache, as on the first day. One line of JSON a run is appended
 OUT/records.jsonl; runs that are there already are skipped, so that the command may be
 stopped at any time and started again. At the end, or with ``--table`` at once, a table:
 worst is the noisiest output of all seeds (matched agents where an output is a set).
+Below it stand the outputs that one target keeps 6 dB better than the other.
 """
 
 import argparse
@@ -27,6 +28,8 @@ from me2e_compress.shipped.drivers import SHIPPED
 
 STACKS = ("tcp", "highway", "vad-tiny", "uniad-tiny")
 TARGETS = ("onnxruntime", "tensorrt")
+PARTED_DB = 6.0
+"""Unsigned integers have half the step of signed ones behind a ReLU: 6 dB."""
 Record = Mapping[str, Any]
 
 
@@ -55,6 +58,7 @@ def main() -> None:
             file.write(json.dumps(result) + "\n")
         print(" ".join(map(str, key)), result["exit"], result["last"], flush=True)
     print_table(records(path))
+    print_parted(records(path))
 
 
 def records(path: Path) -> list[Record]:
@@ -163,6 +167,20 @@ def print_table(measured: list[Record]) -> None:
                 f"{min(seconds):.0f} to {max(seconds):.0f}",
             ]
         print(" | ".join(map(str, cells)))
+
+
+def print_parted(measured: list[Record]) -> None:
+    """List the outputs that one target keeps PARTED_DB better than the other."""
+    told = {key_of(each): each.get("sqnr_db", {}) for each in measured}
+    for (stack, target, seed), here in told.items():
+        there = told.get((stack, TARGETS[1], seed), {}) if target == TARGETS[0] else {}
+        for name in here.keys() & there.keys():
+            if abs(here[name] - there[name]) > PARTED_DB:
+                print(
+                    f"{stack}, seed {seed}: placed for {TARGETS[0]}, {name} keeps"
+                    f" {here[name]:.1f} dB; as placed for {TARGETS[1]}"
+                    f" {there[name]:.1f} dB"
+                )
 
 
 if __name__ == "__main__":

@@ -75,7 +75,7 @@ def _unpacks(reader: ir.Node, size: int) -> bool:
     """Return whether a reader of a sequence is a plain operator on its tensors."""
     if reader.op_type == "SequenceAt":
         places = integers_of(reader.inputs[1])
-        return bool(places) and -size <= places[0] < size
+        return places is not None and -size <= places[0] < size
     return reader.op_type in ("SequenceLength", "ConcatFromSequence")
 
 

@@ -142,8 +142,8 @@ class DiffusionDrive(nn.Module):
         self, noise: Tensor, bev: Tensor, agents: Tensor, ego: Tensor
     ) -> tuple[Tensor, Tensor]:
         """Take both steps from anchors with noise; courses are within 32 m."""
-        kept: Tensor = self.kept  # type: ignore[assignment]
-        noisy = kept[8].sqrt() * self.anchors / 32 + (1 - kept[8]).sqrt() * noise
+        kept, anchors = self.get_buffer("kept"), self.get_buffer("anchors")
+        noisy = kept[8].sqrt() * anchors / 32 + (1 - kept[8]).sqrt() * noise
         for step, after in zip(STEPS, (*STEPS[1:], None), strict=True):
             points = noisy.clamp(-1, 1) * 32
             query = self.encode(sines(points, 16).flatten(2))

@@ -164,7 +164,7 @@ class SineEmbedding(nn.Module):
 
 
 class Centres(nn.Module):
-    """CenterNet's heads, and the best centres, each its neighbourhood's largest."""
+    """CenterNet's heads, and the best of the centres that are local peaks."""
 
     def __init__(self, classes: int = 4, best: int = 8) -> None:
         super().__init__()
@@ -211,7 +211,7 @@ def picture_head(channels: int, classes: int) -> nn.Sequential:
 
 
 class Radar(nn.Module):
-    """Radar points read the BEV where they are; queries gather a few objects."""
+    """Radar points read the BEV at their places; queries gather them to objects."""
 
     def __init__(self, sensors: int = 4, queries: int = 5) -> None:
         super().__init__()
