@@ -36,6 +36,9 @@ def unpack_sequences(model: ir.Model, by: str) -> int:
             size = _length(node) if is_standard(node) else None
             if size is None or not readers or node.outputs[0].is_graph_output():
                 continue
+            # what is taken of a stored weight is folded, tensor by tensor
+            if array_of(node.inputs[0]) is not None:
+                continue
             if not all(_unpacks(reader, size) for reader in readers):
                 continue
             tensors = _tensors(node, size, names, by)
