@@ -24,7 +24,8 @@ _NOW = "is gone since 0.3.0: use"
 FORMER = {
     "calibration method entropy": f"entropy {_NOW} mse",
     "calibration method moving-average": f"moving-average {_NOW} max-min",
-    "quantize-int8 weight_only_gemv": f"weight_only_gemv {_NOW} without=[gemv]",
+    "quantize-int8 weight_only_gemv": f"weight_only_gemv {_NOW} "
+    "rules=safe{without=[gemv]}",
     "fold-constants growth": f"growth {_NOW} bytes_per_node",
     "command build": f"build {_NOW} trtexec --onnx=M.onnx --saveEngine=M.engine",
     "command ranges": f"ranges {_NOW} calibrate, which says what deserves a look",

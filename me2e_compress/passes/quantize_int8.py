@@ -43,10 +43,7 @@ class QuantizeInt8(Pass):
             attention weights, ego status and operators whose kernels are too coarse in
             float; ``paper``, its two stages alone; a rule set of your own, by name or,
             in Python, as an object; each with options, ``paper{extra=[my-rule]}``.
-        without: names of rules to switch off, e.g. ``gemv``.
         target: who will run the graph: ``onnxruntime``, ``tensorrt``.
-        attention_limit: longest attention that becomes int8, in tokens; None leaves it
-            to the rules (512).
         overrides: TOML file of exceptions to the plan.
         method: how ranges are read from the frames: ``max-min``, ``percentile:P`` or
             ``mse``; None leaves it to the rules (``safe``: ``mse``, ``paper``:
@@ -61,10 +58,8 @@ class QuantizeInt8(Pass):
     scheme: str = "full"
     modules: tuple[str, ...] = ()
     rules: str | RuleSet = DEFAULT_RULES
-    without: tuple[str, ...] = ()
     # what a text means must not change with the default
     target: str = dataclasses.field(default=DEFAULT_TARGET, metadata=WRITTEN)
-    attention_limit: int | None = None
     overrides: Path | None = None
     method: str | None = None
     ranges: Path | None = None
@@ -134,12 +129,7 @@ class QuantizeInt8(Pass):
 
     def _rules(self) -> RuleSet:
         named = self.rules
-        rules = RULE_SETS.parse(named) if isinstance(named, str) else named
-        # Options of the pass override those of the rule set
-        options: dict[str, object] = {"without": (*rules.without, *self.without)}
-        if self.attention_limit is not None:
-            options["attention_limit"] = self.attention_limit
-        return RULE_SETS.with_options(rules, options)
+        return RULE_SETS.parse(named) if isinstance(named, str) else named
 
 
 def _notes(plan: QuantPlan, target: str) -> tuple[str, ...]:

@@ -22,16 +22,15 @@ _FLOATS = (ir.DataType.FLOAT, ir.DataType.FLOAT16, ir.DataType.DOUBLE)
 
 
 def float_bytes(model: ir.Model, plan: QuantPlan) -> dict[str, int]:
-    """Count the bytes of weights that a plan leaves in float, by rule; most first.
+    """Count the bytes of weights that stay float by rule, the most first.
 
-    The rule is that of the first node that reads the weight, or ``target``. A weight
-    that any node stores as int8 does not count, nor do biases of int8 layers and
-    constants below a kilobyte. The plan must include what the target leaves in float.
+    Left out are weights that any node stores as int8, biases of int8 layers, and
+    constants below a kilobyte. What the plan's target leaves in float is by ``target``.
     """
     decided = {each.output: each for each in plan.decisions}
     kept = {each.output for each in plan.kept_float}
-    left, stored = dict[str, tuple[str, int]](), set[str]()
     # float weights, and those that some other node stores as int8
+    left, stored = dict[str, tuple[str, int]](), set[str]()
     for node in model.graph:
         decision = decided.get(str(node.outputs[0].name)) if node.outputs else None
         if decision is None:
@@ -42,16 +41,15 @@ def float_bytes(model: ir.Model, plan: QuantPlan) -> dict[str, int]:
                 continue
             if tensor.dtype not in _FLOATS or tensor.nbytes < LEAST_BYTES:
                 continue
-            name = str(value.name)
             if is_int8 and at == decision.weight:
-                stored.add(name)
+                stored.add(str(value.name))
             elif not is_int8:
                 rule = "target" if decision.output in kept else decision.rule
-                left.setdefault(name, (rule, tensor.nbytes))
+                left.setdefault(str(value.name), (rule, tensor.nbytes))
     by_rule = Counter[str]()
-    for name, (rule, count) in left.items():
-        by_rule[rule] += 0 if name in stored else count
-    return {rule: count for rule, count in by_rule.most_common() if count}
+    for name, (rule, size) in left.items():
+        by_rule[rule] += 0 if name in stored else size
+    return {rule: size for rule, size in by_rule.most_common() if size}
 
 
 LEAST_SHOWN = 10_000

@@ -68,9 +68,8 @@ def test_options_are_not_for_a_plan_that_is_made(
 
 def test_what_a_concat_joins_is_listed(cli: Cli, tmp_path: Path) -> None:
     model = net(
-        "two (float[4,32] x, float[32,32] v, float[64,32] w) => (float[4,32] k,"
-        " float[4,32] q) { k = MatMul(x, v) c = Concat<axis=1>(x, k)"
-        " q = MatMul(c, w) }",
+        "two (float[4,32] x, float[32,32] v, float[64,32] w) => (float[4,32] q)"
+        " { k = MatMul(x, v) c = Concat<axis=1>(x, k) q = MatMul(c, w) }",
         {"v": np.eye(32), "w": np.ones((64, 32))},
     )
     graph.save(model, tmp_path / "two.onnx")

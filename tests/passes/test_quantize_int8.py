@@ -63,25 +63,18 @@ def test_the_quantized_graph_runs_stays_close_and_carries_its_plan(
     assert len(plan.decisions) == 10
 
 
-ATTENTION, SAFE = {"rules": "paper", "target": "tensorrt"}, {"target": "tensorrt"}
+SAFE = {"target": "tensorrt"}
 
 
 @pytest.mark.parametrize(
     ("options", "notes"),
     [
         (
-            ATTENTION | {"attention_limit": 8},
+            SAFE | {"rules": "paper{attention_limit=8}"},
             [
                 "scheme full: backbone, head",
                 "2 of 10 nodes int8; by rule: attention-length 2, layer 2",
                 "2 tensors calibrated on 4 frames",
-            ],
-        ),
-        (
-            {"rules": "paper", "attention_limit": 60},
-            [
-                "close decisions: /head/QK: 64 queries, 64 keys: close to the limit of"
-                " 60; /head/AV: 64 queries, 64 keys: close to the limit of 60"
             ],
         ),
         (
@@ -92,7 +85,7 @@ ATTENTION, SAFE = {"rules": "paper", "target": "tensorrt"}, {"target": "tensorrt
             ],
         ),
         (
-            SAFE | {"without": ("small-product", "attention-weights")},
+            SAFE | {"rules": "safe{without=[small-product, attention-weights]}"},
             ["4 of 10 nodes int8; by rule: attention 2, layer 2"],
         ),
     ],
@@ -175,7 +168,11 @@ def test_overrides_are_read_from_a_file(context: Context, tmp_path: Path) -> Non
     [
         ({"scheme": "fp8"}, RecipeError, "no scheme fp8; there are feature-ext"),
         ({"modules": ("occ",)}, ModuleMapError, "occ: no such module"),
-        ({"without": ("speed",)}, RecipeError, "rule speed cannot be switched off"),
+        (
+            {"rules": "safe{without=[speed]}"},
+            RecipeError,
+            "rule speed cannot be switched off",
+        ),
         ({"rules": "int4"}, RecipeError, "no rule set 'int4'; there are safe, paper"),
         ({"target": "qnn"}, RecipeError, "no target 'qnn'; there are tensorrt"),
         ({"overrides": Path("none.toml")}, RecipeError, "none.toml: no such file"),

@@ -49,7 +49,7 @@ def test_an_option_that_is_gone_is_a_usage_error(
 
 def test_what_is_named_instead_is_taken() -> None:
     assert RULE_SETS.parse("safe{without=[gemv]}").without == ("gemv",)
-    assert recipe.parse("quantize-int8{without=[gemv]}")
+    assert recipe.parse("quantize-int8{rules=safe{without=[gemv]}}")
     for method in ("mse", "max-min", "percentile"):
         assert OBSERVERS.parse(method).name == method
 
@@ -82,7 +82,7 @@ def test_a_name_that_is_gone_is_one_line(
     [
         (
             "quantize-int8{weight_only_gemv=true}",
-            "weight_only_gemv is gone since 0.3.0: use without=[gemv]",
+            "weight_only_gemv is gone since 0.3.0: use rules=safe{without=[gemv]}",
         ),
         ("fold-constants{growth=0}", "growth is gone since 0.3.0: use bytes_per_node"),
         (
