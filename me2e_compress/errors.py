@@ -26,6 +26,8 @@ FORMER = {
     "calibration method moving-average": f"moving-average {_NOW} max-min",
     "quantize-int8 weight_only_gemv": f"weight_only_gemv {_NOW} "
     "rules=safe{without=[gemv]}",
+    "quantize-int8 without": f"without {_NOW} rules=safe{{without=[gemv]}}",
+    "quantize-int8 attention_limit": f"attention_limit {_NOW} rules=NAME{{...}}",
     "fold-constants growth": f"growth {_NOW} bytes_per_node",
     "command build": f"build {_NOW} trtexec --onnx=M.onnx --saveEngine=M.engine",
     "command ranges": f"ranges {_NOW} calibrate, which says what deserves a look",

@@ -95,9 +95,8 @@ def advice(model: ir.Model) -> str:
     names = ",".join(deciding_inputs(model))
     return names and (
         f"branches or projections hang on {names}: where all frames have one value,"
-        " compress with --passes"
+        " compress first with --passes"
         f" import-normalize,freeze-inputs{{inputs=[{names}]}},fold-constants"
-        " first: what is written has it as a constant"
     )
 
 
@@ -110,7 +109,8 @@ def deciding_inputs(model: ir.Model) -> tuple[str, ...]:
             least = FLAGS
         elif node.op_type == "MatMul":
             near = (_roots(model, value) for value in node.inputs)
-            roots = {root for some in near for root in some if _has_matrices(root)}
+            every = (root for some in near for root in some)
+            roots = {e for e in every if (static_shape(e) or ())[-2:] in MATRICES}
             least = 16 * MOST_MATRICES
         else:
             continue
@@ -118,10 +118,6 @@ def deciding_inputs(model: ir.Model) -> tuple[str, ...]:
         if all(size is not None and math.prod(size) <= least for size in sizes):
             names |= dict.fromkeys(str(root.name) for root in roots)
     return tuple(name for name in names if name not in states)
-
-
-def _has_matrices(value: ir.Value) -> bool:
-    return (static_shape(value) or ())[-2:] in MATRICES
 
 
 def _roots(model: ir.Model, value: ir.Value | None) -> set[ir.Value]:

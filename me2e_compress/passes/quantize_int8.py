@@ -7,21 +7,17 @@ from typing import ClassVar
 
 import onnx_ir as ir
 
-from me2e_compress.calibration.ranges import Ranges
 from me2e_compress.calibration.review import review
 from me2e_compress.display import counted
 from me2e_compress.errors import PreconditionError
 from me2e_compress.passes.base import Context, Pass, PassResult
-from me2e_compress.quantization.decision import INT8, Overrides, QuantPlan, stamp_plan
+from me2e_compress.quantization.decision import Overrides, QuantPlan, stamp_plan
 from me2e_compress.quantization.plan import make_plan
 from me2e_compress.quantization.rules import DEFAULT_RULES, RULE_SETS, RuleSet
 from me2e_compress.quantization.scheme import QuantScheme
 from me2e_compress.registry.registry import WRITTEN
 from me2e_compress.targets import DEFAULT_TARGET, TARGETS, Target
 from me2e_compress.targets.quantized import QUANTIZE, describe_quantized, pairs_of
-
-_SHOWN = 5
-"""Number of items of a kind that a note lists."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -39,10 +35,8 @@ class QuantizeInt8(Pass):
     Attributes:
         scheme: ``feature-ext``, ``prediction`` or ``full``.
         modules: module names instead of a scheme.
-        rules: ``safe`` (also called ``tensorrt``), which keeps geometry, positions,
-            attention weights, ego status and operators whose kernels are too coarse in
-            float; ``paper``, its two stages alone; a rule set of your own, by name or,
-            in Python, as an object; each with options, ``paper{extra=[my-rule]}``.
+        rules: ``safe``; ``paper``, its two stages alone; a rule set of your own, by
+            name or, in Python, as an object; with options, ``paper{without=[gemv]}``.
         target: who will run the graph: ``onnxruntime``, ``tensorrt``.
         overrides: TOML file of exceptions to the plan.
         method: how ranges are read from the frames: ``max-min``, ``percentile:P`` or
@@ -90,7 +84,7 @@ class QuantizeInt8(Pass):
         target.check_types(plan, model)
         tensors = target.tensors(plan, model)
         if not tensors:
-            notes = ("nothing to quantize", *_notes(plan, self.target))
+            notes = ("nothing to quantize", plan.headline)
             return PassResult(model, 0, notes)
         # Calibrate
         method, saved = self.method_of_ranges, self.ranges
@@ -98,7 +92,9 @@ class QuantizeInt8(Pass):
         # Place the quantizers and record the plan
         placed = target.place(model, plan, ranges)
         stamp_plan(placed, plan)
-        notes = (*_notes(plan, self.target), *_findings(ranges))
+        count, frames = len(ranges.tensors), counted(ranges.frames, "frame")
+        on = f"{counted(count, 'tensor')} calibrated on {frames}"
+        notes = (plan.headline, on, *map(str, review(ranges)))
         return PassResult(placed, len(plan.placed), notes)
 
     def plan(self, model: ir.Model, context: Context) -> QuantPlan:
@@ -130,39 +126,3 @@ class QuantizeInt8(Pass):
     def _rules(self) -> RuleSet:
         named = self.rules
         return RULE_SETS.parse(named) if isinstance(named, str) else named
-
-
-def _notes(plan: QuantPlan, target: str) -> tuple[str, ...]:
-    counts = ", ".join(f"{rule} {count}" for rule, count in plan.counts().items())
-    placed = f"{len(plan.placed)} of {len(plan.decisions)} nodes {INT8}"
-    if plan.kept_float:
-        placed += f"; {len(plan.chosen)} by the plan"
-    # What the target keeps in float, by reason
-    kept: dict[str, list[str]] = {}
-    for decision in plan.kept_float:
-        kept.setdefault(decision.reason, []).append(decision.node or decision.output)
-    return (
-        f"scheme {plan.scheme.name}: {', '.join(plan.scheme.modules)}",
-        f"{placed}; by rule: {counts}",
-        *(
-            line
-            for reason, names in kept.items()
-            for line in _first(names, f"{len(names)} stay float on {target}, {reason}")
-        ),
-    )
-
-
-def _findings(ranges: Ranges) -> tuple[str, ...]:
-    on = counted(ranges.frames, "frame")
-    return (
-        f"{counted(len(ranges.tensors), 'tensor')} calibrated on {on}",
-        *map(str, review(ranges)),
-    )
-
-
-def _first(items: list[str], what: str) -> tuple[str, ...]:
-    if not items:
-        return ()
-    more = len(items) - _SHOWN
-    listed = "; ".join(items[:_SHOWN])
-    return (f"{what}: {listed}" + (f"; and {more} more" if more > 0 else ""),)

@@ -311,8 +311,8 @@ class Overrides(_Strict):
         with documents.reading(origin, RecipeError, "not overrides"):
             return cls.model_validate(content)
 
-    def bind(self, model: ir.Model) -> "Pins":
-        """Find the nodes of a graph that they apply to.
+    def bind(self, model: ir.Model) -> Mapping[ir.Node, Override]:
+        """Map the nodes of a graph to the override that applies to them.
 
         Raises:
             RecipeError: an override matches nothing.
@@ -328,44 +328,36 @@ class Overrides(_Strict):
             if not nodes:
                 raise RecipeError(f"override {each} matches none of {len(main)} nodes")
             pinned.update(dict.fromkeys(nodes, each))  # the last that matches wins
-        return Pins(pinned)
+        return pinned
 
 
 NONE = Overrides()
 
 
-@dataclasses.dataclass(frozen=True)
-class Pins:
-    """Overrides bound to the nodes of one graph."""
+def check_followed(
+    pinned: Mapping[ir.Node, Override], decided: Mapping[ir.Node, Decision]
+) -> None:
+    """Refuse overrides to int8 that no node could follow.
 
-    pinned: Mapping[ir.Node, Override]
-
-    def get(self, node: ir.Node) -> Override | None:
-        """Return the user's decision for a node, if any."""
-        return self.pinned.get(node)
-
-    def check(self, decided: Mapping[ir.Node, Decision]) -> None:
-        """Refuse overrides to int8 that no node could follow.
-
-        The RecipeError names the override and why its first node cannot be int8.
-        """
-        # overrides to int8 that some node follows, and those that one refuses
-        refused: dict[Override, Decision] = {}
-        followed: dict[Override, None] = {}
-        for node, override in self.pinned.items():
-            if override.dtype != INT8:
-                continue
-            if decided[node].dtype == INT8:
-                followed[override] = None
-            else:
-                refused.setdefault(override, decided[node])
-        # an override that nobody follows is a fault
-        for override, decision in refused.items():
-            if override not in followed:
-                raise RecipeError(
-                    f"override {override}: {decision.node or decision.output} cannot"
-                    f" be int8: {decision.reason}"
-                )
+    The RecipeError names the override and why its first node cannot be int8.
+    """
+    # overrides to int8 that some node follows, and those that one refuses
+    refused: dict[Override, Decision] = {}
+    followed: dict[Override, None] = {}
+    for node, override in pinned.items():
+        if override.dtype != INT8:
+            continue
+        if decided[node].dtype == INT8:
+            followed[override] = None
+        else:
+            refused.setdefault(override, decided[node])
+    # an override that nobody follows is a fault
+    for override, decision in refused.items():
+        if override not in followed:
+            raise RecipeError(
+                f"override {override}: {decision.node or decision.output} cannot"
+                f" be int8: {decision.reason}"
+            )
 
 
 def _tensors(node: ir.Node) -> list[str]:

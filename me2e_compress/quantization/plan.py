@@ -3,6 +3,7 @@
 import dataclasses
 import functools
 from collections.abc import Mapping, Sequence
+from typing import TypeAlias
 
 import onnx_ir as ir
 
@@ -23,10 +24,11 @@ from me2e_compress.quantization.decision import (
     NONE,
     RESIDUAL,
     Decision,
+    Override,
     Overrides,
-    Pins,
     QuantPlan,
     ScaleGroup,
+    check_followed,
 )
 from me2e_compress.quantization.rules import (
     DEFAULT_RULES,
@@ -111,6 +113,10 @@ def share_scales(plan: QuantPlan, ranges: Ranges) -> Ranges:
     return dataclasses.replace(ranges, tensors=widened)
 
 
+Pins: TypeAlias = Mapping[ir.Node, Override]
+"""What the user decides of which nodes."""
+
+
 def make_plan(
     model: ir.Model,
     scheme: QuantScheme,
@@ -160,7 +166,7 @@ def make_plan(
                     axis=None,
                 )
     decided.update(_residuals(main, decided, facts, pins))
-    pins.check(decided)
+    check_followed(pins, decided)
     decisions = tuple(decided.values())
     groups = find_groups(main, decided) if asked.share_concat else ()
     text = RULE_SETS.text(asked)
@@ -180,7 +186,11 @@ def tensors_of(plan: QuantPlan, model: ir.Model) -> tuple[str, ...]:
 
 
 def _decide(
-    node: ir.Node, facts: RuleFacts, rules: Sequence[Rule], pins: Pins, main: ir.Graph
+    node: ir.Node,
+    facts: RuleFacts,
+    rules: Sequence[Rule],
+    pins: Pins,
+    main: ir.Graph,
 ) -> Decision:
     decision = functools.partial(
         Decision,
@@ -238,7 +248,10 @@ def _int8(
 
 
 def _residuals(
-    graph: ir.Graph, decided: Mapping[ir.Node, Decision], facts: RuleFacts, pins: Pins
+    graph: ir.Graph,
+    decided: Mapping[ir.Node, Decision],
+    facts: RuleFacts,
+    pins: Pins,
 ) -> dict[ir.Node, Decision]:
     """Decide the Adds that end a residual block: which branch is read as int8.
 

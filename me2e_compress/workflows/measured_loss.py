@@ -208,7 +208,6 @@ def split_frames(
     if recording is None:
         reason = "no recorded frames" if samples is None else SHIPPED_FRAMES
         return SplitFrames(None, samples, reason, samples)
-    # a state needs frames to grow
     run = RUN if recurrent_inputs(model) else 1
     calibration, measured = hold_out(recording, most, run)
     if any(each.reads_ranges and not each.needs_frames for each in passes):

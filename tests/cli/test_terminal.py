@@ -63,7 +63,7 @@ def test_notes_are_for_the_verbose(cli: Cli, dense: Path, words: str) -> None:
         "compress dense.onnx -o out.onnx --scheme full --frames frames --map map.toml"
         " --verify-frames 0"
     )
-    note = "quantize-int8: scheme full: "
+    note = "quantize-int8: scheme full, "
 
     assert note not in cli.done(line).out
     assert note in cli.done(words.format(line)).out

@@ -130,11 +130,6 @@ class RuleFacts:
         return constant_values(self.model)
 
     @functools.cached_property
-    def priced(self) -> bool:
-        """Whether the target estimates what int8 saves and costs."""
-        return self.costs is not None and self.costs(self.model, ()) is not None
-
-    @functools.cached_property
     def weight_elements(self) -> int:
         """How many numbers the graph's weights hold."""
         shapes = map(static_shape, self.model.graph.initializers.values())

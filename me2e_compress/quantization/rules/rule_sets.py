@@ -164,7 +164,8 @@ class MatrixVector(Rule):
 
     def _pays(self, node: ir.Node, facts: RuleFacts) -> bool:
         shape = static_shape(node.inputs[1])
-        if self.share is None or shape is None or not facts.priced:
+        costs = None if facts.costs is None else facts.costs(facts.model, ())
+        if self.share is None or shape is None or costs is None:
             return False
         elements = math.prod(shape)
         large = elements >= max(LEAST_READ, self.share * facts.weight_elements)
@@ -177,8 +178,6 @@ class PaperRules(RuleSet):
 
     Attributes:
         attention_limit: longest attention that becomes int8, in tokens.
-        without: names of rules that are switched off, e.g. ``gemv``.
-        extra: more rules, asked last.
     """
 
     name: ClassVar[str] = "paper"
