@@ -84,8 +84,7 @@ class QuantizeInt8(Pass):
         target.check_types(plan, model)
         tensors = target.tensors(plan, model)
         if not tensors:
-            notes = ("nothing to quantize", plan.headline)
-            return PassResult(model, 0, notes)
+            return PassResult(model, 0, ("nothing to quantize", plan.headline))
         # Calibrate
         method, saved = self.method_of_ranges, self.ranges
         ranges = context.ranges(self.name, model, tensors, method=method, saved=saved)

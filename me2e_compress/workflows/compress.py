@@ -111,6 +111,7 @@ class CompressResult(Result):
         measured = None if self.loss is None else self.loss.table()
         if self.loss is not None and self.loss.fidelity is not None:
             time += f", {self.loss.seconds:.0f} of them to measure"
+        time += self.slower and f"; {self.slower}"
         lint = self.lint
         wrong = [] if lint is None else filter(None, (lint.refusal, lint.miscomputed))
         error = None
@@ -119,7 +120,7 @@ class CompressResult(Result):
         return Shown(
             headline,
             (*self.report.tables(), *filter(None, [measured])),
-            filter(None, (*self.verdict(), self.slower, time, headline, weights)),
+            filter(None, (*self.verdict(), time, headline, weights)),
             (
                 *(() if self.loss is None else self.loss.alerts()),
                 *filter(None, ["" if self.int8 is None else self.int8.empty]),

@@ -198,11 +198,9 @@ def recording(folder: Path, count: int, scenes: tuple[int, ...]) -> CalibrationS
     [
         (2, 1, [1], [1]),
         (16, 1, [1, 4, 6, 9, 12, 14], [1, 4, 6, 9, 12, 14]),
-        (48, 1, [*range(1, 48, 3)], [*range(1, 48, 3)]),
         (96, 1, [*range(3, 96, 6)], [*range(3, 96, 6)]),
         # a state grows along runs, each within a scene
         (16, 3, [1, 2, 3, 9, 10, 11], [1, 9]),
-        (12, 4, [4, 5, 6, 7], [4]),
         # one frame is all there is
         (1, 1, [0], [0]),
     ],

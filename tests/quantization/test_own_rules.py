@@ -63,15 +63,6 @@ def test_a_pipeline_names_them() -> None:
     assert PASSES.parse('quantize-int8{rules="paper"}') == QuantizeInt8(rules="paper")
 
 
-def test_a_registered_set_as_an_object_is_written_as_its_text() -> None:
-    rules = RULE_SETS.parse("paper{without=[gemv]}")
-    text = recipe.to_text((QuantizeInt8(rules=rules),))
-    (back,) = recipe.parse(text)
-
-    assert isinstance(back, QuantizeInt8)
-    assert RULE_SETS.parse(str(back.rules)) == rules
-
-
 # Rules and sets of rules of another package, which its entry points name.
 
 

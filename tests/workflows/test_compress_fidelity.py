@@ -1,6 +1,7 @@
 """``compress`` measures what it did, warns, and names the command that finds why."""
 
 import dataclasses
+import itertools
 import json
 from pathlib import Path
 from typing import Any
@@ -12,7 +13,10 @@ import pytest
 import me2e_compress as me2e
 from me2e_compress import graph
 from me2e_compress.calibration.calibrator import Calibrator
+from me2e_compress.calibration.dataset import CalibrationSet
+from me2e_compress.runtime.providers import CPU
 from me2e_compress.workflows.measured_loss import ADVICE
+from me2e_compress.workflows.written import larger, slower
 from tests.command import Command
 from tests.frames import record
 from tests.nets import MAP_TEXT, conv_attention, map_text, net
@@ -243,3 +247,35 @@ def test_an_output_that_is_no_longer_finite_is_not_overlooked(tmp_path: Path) ->
         for each in found.alerts()
     )
     assert found.status == "warning"
+
+
+@pytest.mark.usefixtures("cameras")
+def test_a_file_that_is_larger_or_no_faster_says_so(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    options = me2e.CompressOptions(scheme="full", rules="paper", module_map="map.toml")
+    found = me2e.compress("in.onnx", "out.onnx", frames="frames", options=options)
+
+    more = larger(found.output, found.source)
+    count = found.source_bytes - found.output_bytes
+    assert more.startswith(f"in.onnx is {count:,} bytes larger than out.onnx: origins")
+    assert found.larger == ""
+    assert more in dataclasses.replace(found, larger=more).verdict()
+    # one second of the source, then so many of what was written
+    for seconds, said in ((2, "out.onnx takes 2.00 times as long as in"), (0.9, "")):
+        clock = itertools.accumulate(itertools.cycle([0, 1, 0, seconds]))
+        monkeypatch.setattr("time.process_time", clock.__next__)
+        taken = slower(found.source, found.output, CalibrationSet("frames"), CPU)
+        assert (taken[: len(said)], bool(taken)) == (said, bool(said))
+
+
+def test_stack_traces_of_an_exporter_are_dropped(tmp_path: Path) -> None:
+    text = "n (float[4] x) => (float[4] y) { y = Relu(x) }"
+    model = net(text, {})
+    model.graph[0].doc_string = "/home/somebody/model.py(17): forward"
+    model.graph[0].metadata_props["pkg.torch.onnx.stack_trace"] = "/home/somebody"
+    graph.save(model, tmp_path / "in.onnx")
+
+    me2e.compress(tmp_path / "in.onnx", tmp_path / "out.onnx", "exact")
+
+    assert b"somebody" not in (tmp_path / "out.onnx").read_bytes()
