@@ -111,6 +111,7 @@ FORMER = {
         f"adapter tcp-{name}": f"tcp-{name} {_NOW} models.tcp.policy"
         for name in ("control", "fusion", "beta-control", "beta-fusion")
     },
+    "adapter key control": f"controls of a graph {_NOW} a policy in Python",
     "demo --stack": f"--stack {_NOW} python -m models.export",
     **{
         f"demo {option}": f"demo {option} {_NOW} compress, compare and a study"
@@ -119,6 +120,7 @@ FORMER = {
     "--road": "--road is gone since 0.3.0: there is one road, with traffic",
     "study road": "the key road is gone since 0.3.0: there is one road, with traffic",
     "study record.road": "the key road is gone since 0.3.0: there is one road",
+    "model expert": f"expert {_NOW} models.driver.expert:Expert, in the repository",
     "policy highway-2": f"highway-2 {_NOW} highway",
     "model highway-2": f"highway-2 {_NOW} highway",
     "pass static-geometry": f"static-geometry {_NOW} freeze-inputs, with --frames",

@@ -5,30 +5,24 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Self
 
-import numpy as np
-
-from me2e_compress.display import reason
 from me2e_compress.driving.adapter import Adapter, ImageNormalization
 from me2e_compress.driving.adapter.adapter import ZEROS, RecurrentEntry
 from me2e_compress.driving.adapter.inputs import ModelInputs, contract_names
 from me2e_compress.driving.adapter.outputs import ModelOutputs
 from me2e_compress.driving.contract import (
     PLAN_TIMES_S,
-    Answer,
     Observation,
     RouteInfo,
     Trajectory,
-    fed,
     fits,
     six_waypoints,
     zeros,
 )
 from me2e_compress.driving.host_stage import HostStage, HostWork
 from me2e_compress.errors import EvaluationError, FramesError, GraphError
-from me2e_compress.registry.documents import UNREADABLE, check_regular
 from me2e_compress.runtime.frames import Array
 from me2e_compress.runtime.providers import CPU, Provider
-from me2e_compress.runtime.session import DTYPES, Session, SessionPort
+from me2e_compress.runtime.session import Session, SessionPort
 
 Entries = Mapping[str, RecurrentEntry] | None
 
@@ -58,12 +52,10 @@ def answers_by_input(
 class FirstValues:
     """What recurrent inputs hold at the first decision of a route.
 
-    ``held`` values are read from files; ``given`` maps a recurrent input to the input
-    whose value it takes; ``zeros`` are for inputs that only the adapter calls
-    recurrent.
+    ``given`` maps a recurrent input to the input whose value it takes; ``zeros`` are
+    for inputs that only the adapter calls recurrent.
     """
 
-    held: Mapping[str, Array]
     given: Mapping[str, str]
     zeros: Mapping[str, Array]
 
@@ -71,47 +63,21 @@ class FirstValues:
     def of(
         cls, session: Session, entries: Entries, recurrent: Mapping[str, str]
     ) -> Self:
-        """Read the files, and check every value against its input."""
-        held: dict[str, Array] = {}
+        """Check every value against its input."""
         given: dict[str, str] = {}
         ports = session.inputs
         for name, entry in (entries or {}).items():
             where = f"first value of {name}: {entry.first}"
-            if entry.file is not None:
-                held[name] = _from_file(entry.file, name, ports[name], where)
-            elif entry.first != ZEROS:
+            if entry.first != ZEROS:
                 given[name] = _input(entry.first, ports[name], ports, recurrent, where)
         # all others start from zeros
-        known = {*held, *given, *session.recurrent}
+        known = {*given, *session.recurrent}
         others = [name for name in recurrent if name not in known]
-        return cls(held, given, {name: zeros(name, ports[name]) for name in others})
+        return cls(given, {name: zeros(name, ports[name]) for name in others})
 
     def at(self, feeds: Mapping[str, Array]) -> dict[str, Array]:
         """Return those that are not zeros, given the feeds of the first decision."""
-        return {**self.held, **{to: feeds[name] for to, name in self.given.items()}}
-
-
-def _from_file(path: Path, name: str, port: SessionPort, where: str) -> Array:
-    """Read an array; from an ``.npz``, the one named like the input."""
-    try:
-        check_regular(path)
-        value = np.load(path, allow_pickle=False)
-        if not isinstance(value, np.ndarray):
-            with value as archive:
-                value = archive[name]
-    except KeyError as error:
-        raise EvaluationError(f"{where} holds no array {name}") from error
-    except UNREADABLE as error:
-        raise EvaluationError(f"{where} cannot be read: {reason(error)}") from error
-    # it must fit the port
-    missing = max(0, len(port.shape) - value.ndim)
-    if not fits((1,) * missing + value.shape, port.shape):
-        raise EvaluationError(
-            f"{where} has shape {list(value.shape)}, the input takes {list(port.shape)}"
-        )
-    if not np.can_cast(value.dtype, DTYPES[port.type], "same_kind"):
-        raise EvaluationError(f"{where} is {value.dtype}, the input takes {port.type}")
-    return fed(value, port)
+        return {to: feeds[name] for to, name in self.given.items()}
 
 
 def _input(
@@ -124,8 +90,8 @@ def _input(
     if source not in ports or source in recurrent:
         plain = ", ".join(name for name in ports if name not in recurrent)
         raise EvaluationError(
-            f"{where} is none of {ZEROS}, a file .npy or .npz, and an input that is not"
-            f" recurrent; those are {plain or 'none'}"
+            f"{where} is neither {ZEROS} nor an input that is not recurrent; those are"
+            f" {plain or 'none'}"
         )
     other = ports[source]
     if other.type != port.type or not fits(other.shape, port.shape):
@@ -144,8 +110,8 @@ class OnnxPolicy:
     [18], ``command`` int64 [1] and ``timestamp`` float [1], seconds since the route
     began; a model may lack any of them. A recurrent input ``X`` is answered by the
     output ``X_out`` and zero at the start of a route. The output is ``plan`` [1, 6, 2].
-    An `Adapter` maps other names and layouts, first values, waypoints of any number and
-    spacing, and controls. ``stage`` changes the plan on the host.
+    An `Adapter` maps other names and layouts, first values, and waypoints of any number
+    and spacing. ``stage`` changes the plan on the host.
     """
 
     session: Session
@@ -194,10 +160,6 @@ class OnnxPolicy:
         recurrent = recurrent_of(session, adapter)
         inputs = ModelInputs.of(session, adapter, recurrent)
         outputs = ModelOutputs.of(session, adapter)
-        if stage is not None and outputs.plan is None:
-            raise EvaluationError(
-                f"{stage.name} changes a plan, and this model answers controls alone"
-            )
         first = FirstValues.of(session, adapter.recurrent, recurrent)
         policy = cls(session, adapter, inputs, outputs, recurrent, first, stage)
         # a misfit that only a run shows
@@ -230,12 +192,12 @@ class OnnxPolicy:
     def reset(self, route: RouteInfo | None) -> None:
         """Begin a route: recurrent inputs return to their first values."""
         self._begins = True
-        known = self.session.first_state(self.first.held)
+        known = self.session.first_state({})
         self.inputs.reset()
         own = {name: each for name, each in known.items() if name in self.recurrent}
         self._state = {**self.first.zeros, **own}
 
-    def plan(self, observation: Observation) -> Answer:
+    def plan(self, observation: Observation) -> Trajectory:
         """Run the model once."""
         # run the model, with first values where a route begins
         feeds = self.feeds(observation)
@@ -246,7 +208,7 @@ class OnnxPolicy:
         self._state = {name: outputs[to] for name, to in self.recurrent.items()}
         # the host stage may change the plan, as six waypoints every 0.5 s
         plan = self.outputs.trajectory(outputs, feeds, observation)
-        if plan is not None and self.stage is not None:
+        if self.stage is not None:
             work = self.stage.work(six_waypoints(plan), outputs)
             if not isinstance(work, HostWork):
                 raise EvaluationError(
@@ -255,7 +217,7 @@ class OnnxPolicy:
                 )
             self.host_iterations, self.host_cells = work.iterations, work.cells
             plan = Trajectory(work.plan, PLAN_TIMES_S)
-        return self.outputs.answer(plan, outputs)
+        return plan
 
     def feeds(self, observation: Observation) -> dict[str, Array]:
         """Convert an observation to the graph's inputs, without recurrent ones."""

@@ -9,7 +9,6 @@ from google.protobuf.message import DecodeError
 
 from me2e_compress import graph
 from me2e_compress.calibration.dataset import CalibrationSet
-from me2e_compress.driving.adapter import Adapter
 from me2e_compress.driving.adapter.outputs import adapted
 from me2e_compress.driving.host_stage import HOST_STAGES
 from me2e_compress.driving.policies import Driver, driver_named
@@ -174,7 +173,7 @@ def _key(
         str(study.seed),
         # as before there was a choice, so that what was made then is still found
         *(() if study.provider == CPU else (PROVIDERS.text(study.provider),)),
-        *(() if variant.adapter is None else (Adapter.digest(variant.adapter),)),
+        *(() if variant.adapter is None else (graph.sha256_of(variant.adapter),)),
         *contents,
     )
     return hashlib.sha256("\n".join(decisive).encode()).hexdigest()

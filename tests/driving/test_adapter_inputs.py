@@ -11,7 +11,6 @@ from me2e_compress.driving.adapter import Adapter
 from me2e_compress.driving.adapter.inputs import ModelInputs
 from me2e_compress.driving.onnx_policy import OnnxPolicy
 from me2e_compress.errors import EvaluationError
-from me2e_compress.evaluators.highway.drivers import OnnxDriver
 from me2e_compress.runtime.session import Session
 from me2e_compress.workflows.frames import record_frames
 from me2e_compress.workflows.options import FramesOptions
@@ -227,58 +226,39 @@ def policy_of(folder: Path, model: Path, text: str) -> OnnxPolicy:
     return OnnxPolicy.open(model, Adapter.load(toml))
 
 
-FILE_AND_INPUT = """
+OF_INPUT = """
 [recurrent]
-prev_tracks = { first = "queries.npz" }
 prev_time = { from = "next_time", first = "timestamp" }
 """
 
 
-def queries(folder: Path, shape: tuple[int, ...] = (6, 2)) -> None:
-    np.savez(folder / "queries.npz", prev_tracks=np.full(shape, 5.0), other=np.ones(3))
-
-
 def answers(policy: OnnxPolicy, times_us: tuple[int, ...]) -> list[float]:
     plans = [policy.plan(observation(STILL, time_us)) for time_us in times_us]
-    return [float(np.asarray(plan.points)[3, 1]) for plan in plans]  # type: ignore[union-attr]
+    return [float(np.asarray(plan.points)[3, 1]) for plan in plans]
 
 
-def test_a_route_begins_with_a_file_beside_the_adapter_and_another_input(
-    tmp_path: Path,
-) -> None:
-    queries(tmp_path)
-    policy = policy_of(tmp_path, counter(tmp_path), FILE_AND_INPUT)
+def test_a_route_begins_with_the_value_of_another_input(tmp_path: Path) -> None:
+    policy = policy_of(tmp_path, counter(tmp_path), OF_INPUT)
     policy.reset(None)
 
-    assert answers(policy, (2_000_000, 2_500_000)) == [5.0, 6.5]
+    assert answers(policy, (2_000_000, 2_500_000)) == [0.0, 1.5]
     policy.reset(None)
-    assert answers(policy, (7_000_000,)) == [5.0]
+    assert answers(policy, (7_000_000,)) == [0.0]
 
 
 def test_recorded_scenes_begin_so_too(tmp_path: Path) -> None:
-    queries(tmp_path)
     model, toml = counter(tmp_path), tmp_path / "a.toml"
-    toml.write_text(FILE_AND_INPUT)
+    toml.write_text(OF_INPUT)
     options = FramesOptions(count=4, adapter=toml, scene_length=2)
 
     folder = record_frames(model, tmp_path / "frames", options)
 
     found = [frame.arrays for frame in CalibrationSet(folder)]
     assert [sorted(each) for each in found] == [
-        ["prev_time", "prev_tracks", "timestamp"],
+        ["prev_time", "timestamp"],
         ["timestamp"],
     ] * 2
-    assert (found[2]["prev_tracks"] == 5.0).all()
-
-
-def test_another_file_is_another_driver(tmp_path: Path) -> None:
-    model, toml = counter(tmp_path), tmp_path / "a.toml"
-    toml.write_text(FILE_AND_INPUT)
-    queries(tmp_path)
-    before = OnnxDriver(model, toml).fingerprint()
-    np.savez(tmp_path / "queries.npz", prev_tracks=np.zeros((6, 2)))
-
-    assert OnnxDriver(model, toml).fingerprint() != before
+    assert found[2]["prev_time"] == found[2]["timestamp"]
 
 
 @pytest.mark.parametrize(
@@ -305,14 +285,9 @@ def test_the_models_other_pairs_stay_but_for_what_the_adapter_feeds(
             "[recurrent]\nprev_tracks = { first = 'timestamp' }",
             r"is tensor\(float\) \[1\], the input takes tensor\(float\) \[1, 6, 2\]",
         ),
-        ("[recurrent]\nprev_tracks.first = 'none.npy'", "none.npy cannot be read"),
         (
-            "[recurrent]\nprev_time = { first = 'queries.npz' }",
-            "queries.npz holds no array prev_time",
-        ),
-        (
-            "[recurrent]\nprev_tracks = { first = 'queries.npz' }",
-            r"has shape \[5, 2\], the input takes \[1, 6, 2\]",
+            "[recurrent]\nprev_tracks.first = 'none.npy'",
+            "none.npy is neither zeros nor an input that is not recurrent; those",
         ),
         ("[recurrent]\nprev_time = { begin = 'zeros' }", r"adapter recurrent.prev_tim"),
     ],
@@ -320,7 +295,6 @@ def test_the_models_other_pairs_stay_but_for_what_the_adapter_feeds(
 def test_a_first_value_that_does_not_fit_is_one_line(
     tmp_path: Path, text: str, words: str
 ) -> None:
-    queries(tmp_path, (5, 2))
     with pytest.raises(EvaluationError, match=words) as caught:
         policy_of(tmp_path, counter(tmp_path), text)
     assert "\n" not in str(caught.value)

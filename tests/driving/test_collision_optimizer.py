@@ -101,7 +101,7 @@ def test_a_model_without_the_output_is_refused_when_it_is_opened(
 @pytest.mark.parametrize(
     ("policy", "words"),
     [
-        ("expert{host_stage=collision-optimizer}", "expert has no option 'host_stage'"),
+        ("blind{host_stage=collision-optimizer}", "blind has no option 'host_stage'"),
         ("onnx{path=m.onnx, host_stage=smoother}", "no host stage 'smoother'"),
     ],
 )

@@ -48,12 +48,6 @@ PLAN = """
 output = "wp"
 step_s = 0.5
 """
-CONTROL = """
-[control]
-throttle = "action[0]"
-steer = "action[1]"
-brake = "action[2]"
-"""
 
 
 def checked(tmp_path: Path, adapter: str | None = ADAPTER + PLAN) -> ModelCheck:
@@ -83,15 +77,6 @@ def test_every_port_and_its_part(tmp_path: Path) -> None:
     assert found.drives_by == "its plan"
 
 
-def test_controls_drive(tmp_path: Path) -> None:
-    found = checked(tmp_path, ADAPTER + CONTROL)
-
-    assert not found.problems
-    assert found.drives_by == "its controls"
-    uses = {each.name: each.use for each in found.outputs}
-    assert uses["action"] == "control: steer, throttle, brake"
-
-
 def test_all_that_is_missing_is_told_at_once(tmp_path: Path) -> None:
     found = checked(tmp_path, None)
 
@@ -110,15 +95,13 @@ def test_all_that_is_missing_is_told_at_once(tmp_path: Path) -> None:
     ("old", "new", "message"),
     [
         ("std = 12.0}, {source", "std = 12.0}, {source = 'speed'}, {source", "state"),
-        ("action[2]", "action[3]", r"action has 3 numbers: there is no action\[3\]"),
         ("step_s = 0.5", "", "step_s must say how far apart"),
         ('output = "wp"', 'output = "value"', r"value has shape \[1\], a plan is"),
         ('"wp"', '"way"', "no output way, which is named as the plan"),
     ],
 )
 def test_what_does_not_fit(tmp_path: Path, old: str, new: str, message: str) -> None:
-    drives_by = CONTROL if "action" in old else PLAN
-    adapter = (ADAPTER + drives_by).replace(old, new)
+    adapter = (ADAPTER + PLAN).replace(old, new)
     (problem,) = checked(tmp_path, adapter).problems
 
     assert message.replace("\\", "") in problem

@@ -69,28 +69,6 @@ def test_mirrored_latitudes_are_told_and_driven_by(
     assert agent._motion(board.world.sensed()).y == pytest.approx(-92.5, abs=0.1)
 
 
-CONTROLS = """
-[control]
-throttle = "gas[0]"
-steer = "gas[1]"
-"""
-
-
-def test_a_graph_of_controls_presses_as_it_says(
-    board: Leaderboard, graph_agent: ModuleType, tmp_path: Path
-) -> None:
-    model = straight_on(
-        tmp_path / "m.onnx",
-        outputs="float[2] gas",
-        body="gas = Identity (asked)",
-        initializers=", float[2] asked = {0.25, 0.5}",
-    )
-
-    board.drive(graph_agent, options(model, CONTROLS), 1)
-
-    assert board.seen == [(0.25, 0.5, 0.0)]
-
-
 def numbered(
     agent: object, monkeypatch: pytest.MonkeyPatch, module: ModuleType
 ) -> None:

@@ -1,7 +1,6 @@
 """The TOML file that adapts a model."""
 
 import json
-import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,13 +13,10 @@ from pydantic import (
     ConfigDict,
     Field,
     ValidationError,
-    ValidationInfo,
-    field_validator,
     model_validator,
 )
 
 from me2e_compress.driving.adapter.image_inputs import ImageInput, ImageNormalization
-from me2e_compress.driving.contract import PedalsAndWheel
 from me2e_compress.driving.input_sources import (
     INPUT_SOURCES,
     Axes,
@@ -29,7 +25,6 @@ from me2e_compress.driving.input_sources import (
 )
 from me2e_compress.driving.input_sources.sources import NavigationCommand
 from me2e_compress.errors import EvaluationError
-from me2e_compress.graph.files import sha256_of
 from me2e_compress.graph.recurrence import RECURRENT, declared_pairs
 from me2e_compress.registry import documents
 from me2e_compress.runtime.frames import Array
@@ -39,7 +34,6 @@ from me2e_compress.runtime.plan_adapter import PLAN, PlanAdapter
 
 
 ZEROS = "zeros"
-_FILES = (".npy", ".npz")
 
 
 class RecurrentEntry(BaseModel):
@@ -48,9 +42,8 @@ class RecurrentEntry(BaseModel):
     Attributes:
         answer: The output that is fed back; in the file ``from``. None leaves it to the
             model's metadata and the naming rules.
-        first: The value where a route begins: ``zeros``; a file ``.npy``, or ``.npz``
-            with an array of the input's name, relative to the adapter; or an input of
-            the graph, whose value at that moment it takes.
+        first: The value where a route begins: ``zeros``, or an input of the graph,
+            whose value at that moment it takes.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -62,129 +55,6 @@ class RecurrentEntry(BaseModel):
     @classmethod
     def _of_text(cls, value: Any) -> Any:
         return {"from": value} if isinstance(value, str) else value
-
-    @field_validator("first")
-    @classmethod
-    def _beside(cls, text: str, info: ValidationInfo) -> str:
-        """Resolve a file relative to the adapter."""
-        if Path(text).suffix in _FILES and info.context is not None:
-            return str(info.context / text)
-        return text
-
-    @property
-    def file(self) -> Path | None:
-        """The file of the first value, if it is read from one."""
-        path = Path(self.first)
-        return path if path.suffix in _FILES else None
-
-
-# Read throttle, steering and brake from a model's outputs.
-
-
-Pair: TypeAlias = tuple[float, float]
-Outputs: TypeAlias = Mapping[str, Array]
-
-_ELEMENT = re.compile(r"(?P<output>.+)\[(?P<index>\d+)\]")
-_PEDALS = ("throttle", "brake", "acceleration")
-_NUMBERS = ("steer", *_PEDALS)
-_FORMS = (
-    {"throttle", "steer"},
-    {"throttle", "steer", "brake"},
-    {"acceleration", "steer"},
-)
-
-
-class ControlAdapter(BaseModel):
-    """How to read controls from a model's outputs.
-
-    Each number is an output with one element, ``steer``, or an element of a larger one,
-    ``action[1]``, indexed over the flattened output. Give throttle and steer, with or
-    without a brake; or one acceleration, which brakes below 0, and steer.
-
-    Attributes:
-        throttle: The output or element that holds the throttle.
-        brake: The output or element that holds the brake.
-        acceleration: The output or element that replaces throttle and brake.
-        steer: The output or element that holds the steering.
-        throttle_range: The model's values at no and at full throttle.
-        brake_range: The model's values at no and at full brake.
-        acceleration_range: The model's values at full brake and at full throttle.
-        steer_range: The model's values at full left and at full right.
-        clip: Whether values beyond their range are clipped; else they end the route.
-    """
-
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
-
-    throttle: str | None = None
-    brake: str | None = None
-    acceleration: str | None = None
-    steer: str | None = None
-    throttle_range: Pair = (0.0, 1.0)
-    brake_range: Pair = (0.0, 1.0)
-    acceleration_range: Pair = (-1.0, 1.0)
-    steer_range: Pair = (-1.0, 1.0)
-    clip: bool = False
-
-    @model_validator(mode="after")
-    def _one_form(self) -> Self:
-        # exactly one way to read the controls
-        named = {name for name in _NUMBERS if getattr(self, name) is not None}
-        if named not in _FORMS:
-            raise ValueError(
-                "either throttle, steer and brake, or acceleration and steer"
-            )
-        # ranges that can be divided by
-        for name in _NUMBERS:
-            nothing, full = getattr(self, f"{name}_range")
-            if nothing == full:
-                raise ValueError(f"{name}_range: both ends are {full:g}")
-        return self
-
-    @property
-    def outputs(self) -> dict[str, str]:
-        """The output or element of each quantity, by its name in the document."""
-        said = ((name, getattr(self, name)) for name in _NUMBERS)
-        return {where: name for name, where in said if where is not None}
-
-    def read(self, outputs: Outputs) -> PedalsAndWheel:
-        """Return the model's controls."""
-        steer = self._number("steer", outputs, -1.0)
-        if self.acceleration is not None:
-            said = self._number("acceleration", outputs, -1.0)
-            # NaN stays NaN, on the throttle
-            return PedalsAndWheel(max(said, 0.0), steer, max(0.0, -said))
-        throttle = self._number("throttle", outputs, 0.0)
-        brake = 0.0 if self.brake is None else self._number("brake", outputs, 0.0)
-        return PedalsAndWheel(throttle, steer, brake)
-
-    def _number(self, name: str, outputs: Outputs, least: float) -> float:
-        """Return a number from ``least`` to 1, the ends of its range."""
-        said = element(outputs, getattr(self, name))
-        begin, end = getattr(self, f"{name}_range")
-        share = (said - begin) / (end - begin)
-        value: float = least + (1.0 - least) * share
-        return min(max(value, least), 1.0) if self.clip else value
-
-
-def output_named(text: str, outputs: Mapping[str, object]) -> tuple[str, int | None]:
-    """Split ``name`` or ``name[k]`` into the output's name and k."""
-    found = None if text in outputs else _ELEMENT.fullmatch(text)
-    if found is None:
-        return text, None
-    return found["output"], int(found["index"])
-
-
-def element(outputs: Outputs, text: str) -> float:
-    """Return the number that ``name`` or ``name[k]`` refers to."""
-    name, index = output_named(text, outputs)
-    row = np.asarray(outputs[name], np.float64).reshape(-1)
-    if index is None and len(row) != 1:
-        raise EvaluationError(
-            f"{name} has {len(row)} numbers: say which, {name}[0] for the first"
-        )
-    if index is not None and index >= len(row):
-        raise EvaluationError(f"{name} has {len(row)} numbers: there is no {text}")
-    return float(row[index or 0])
 
 
 # One input of a graph, made of input sources.
@@ -326,7 +196,6 @@ class Adapter(BaseModel):
         plan: Which output is the plan, the times of its waypoints, whether it holds
             steps, which mode is taken; ``command_input = "command"`` lets the
             navigator's command pick it.
-        control: Which outputs are the controls, which drive in place of the plan.
         image: Normalisation of image inputs that have none of their own.
         axes: Ground frame of the model.
     """
@@ -338,42 +207,26 @@ class Adapter(BaseModel):
     images: dict[str, ImageInput] = {}
     recurrent: dict[str, RecurrentEntry] | None = None
     plan: PlanAdapter | None = None
-    control: ControlAdapter | None = None
     image: ImageNormalization | None = None
     axes: Axes = Axes.FORWARD_LEFT
-
-    @model_validator(mode="after")
-    def _one_driver(self) -> Self:
-        if self.plan is not None and self.control is not None:
-            raise ValueError("plan and control both drive: leave one out")
-        return self
 
     @classmethod
     def load(cls, path: Path) -> Self:
         """Read a TOML file."""
         with documents.reading(path, EvaluationError, "not TOML"):
             content = documents.from_toml(documents.content(path))
-        return cls.parse(content, f"{path}: adapter", path.parent)
+        return cls.parse(content, f"{path}: adapter")
 
     @classmethod
-    def parse(cls, content: object, origin: str, folder: Path | None = None) -> Self:
+    def parse(cls, content: object, origin: str) -> Self:
         """Read what a document holds; ``origin`` is its name in error messages."""
         try:
-            return cls.model_validate(content, context=folder)
+            return cls.model_validate(content)
         except ValidationError as error:
             first = error.errors(include_url=False)[0]
             where = ".".join(map(str, first["loc"]))
             words = first["msg"].removeprefix("Value error, ")
             raise EvaluationError(f"{origin} {where}: {words}") from error
-
-    @classmethod
-    def digest(cls, path: Path) -> str:
-        """Return what identifies an adapter together with the files that it names."""
-        entries = (cls.load(path).recurrent or {}).values()
-        files = [path, *(each.file for each in entries if each.file is not None)]
-        if missing := [file for file in files if not file.is_file()]:
-            raise EvaluationError(f"{path}: adapter: no such file: {missing[0]}")
-        return "+".join(map(sha256_of, files))
 
     def metadata(self, own: Mapping[str, str]) -> dict[str, str]:
         """Return the adapter's recurrent pairs and plan in the form of graph metadata.

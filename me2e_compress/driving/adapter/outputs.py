@@ -9,14 +9,9 @@ from typing import Self, TypeAlias
 import numpy as np
 import onnx_ir as ir
 
-from me2e_compress.driving.adapter.adapter import (
-    ZEROS,
-    Adapter,
-    ControlAdapter,
-    output_named,
-)
+from me2e_compress.driving.adapter.adapter import ZEROS, Adapter
 from me2e_compress.driving.adapter.inputs import ModelInputs
-from me2e_compress.driving.contract import Answer, Observation, Shape, Trajectory, zeros
+from me2e_compress.driving.contract import Observation, Shape, Trajectory, zeros
 from me2e_compress.driving.input_sources import INPUT_SOURCES
 from me2e_compress.driving.shipped_adapters import adapter_file
 from me2e_compress.errors import EvaluationError, GraphError
@@ -32,52 +27,28 @@ COMMAND = "command"
 
 @dataclass(frozen=True)
 class ModelOutputs:
-    """How a graph's outputs are read at each decision, without recurrent ones.
-
-    ``plan`` is None if the controls drive, ``control`` if the plan drives.
-    """
+    """How a graph's outputs are read at each decision, without recurrent ones."""
 
     adapter: Adapter
-    plan: PlanAdapter | None
-    control: ControlAdapter | None
+    plan: PlanAdapter
 
     @classmethod
     def of(cls, session: Session, adapter: Adapter) -> Self:
         """Find the outputs of a graph to read."""
-        outputs, control = list(session.outputs), adapter.control
-        if control is not None:
-            there = dict.fromkeys(outputs)
-            for text, what in control.outputs.items():
-                name, _ = output_named(text, there)
-                if name not in there:
-                    raise EvaluationError(
-                        f"no output {name}, which the adapter names as {what}; there"
-                        f" are {', '.join(outputs)}"
-                    )
-            return cls(adapter, None, control)
-        plan = plan_of(adapter.plan, session.metadata, outputs)
+        plan = plan_of(adapter.plan, session.metadata, list(session.outputs))
         check_command(plan, session.inputs)
-        return cls(adapter, plan, None)
+        return cls(adapter, plan)
 
     def trajectory(
         self,
         outputs: Mapping[str, Array],
         feeds: Mapping[str, Array],
         observation: Observation,
-    ) -> Trajectory | None:
-        """Return the plan in the ego frame; None where controls drive."""
-        if self.plan is None:
-            return None
+    ) -> Trajectory:
+        """Return the plan in the ego frame."""
         command = np.array([observation.command])
         points = self.plan.plan(outputs, {**feeds, COMMAND: command})
         return self.plan.trajectory(self.adapter.to_ego(points))
-
-    def answer(self, plan: Trajectory | None, outputs: Mapping[str, Array]) -> Answer:
-        """Return the plan (as the host stage left it), or the controls."""
-        if self.control is not None:
-            return self.control.read(outputs)
-        assert plan is not None
-        return plan
 
 
 def check_command(plan: PlanAdapter, inputs: Collection[str]) -> None:
@@ -259,8 +230,8 @@ def input_uses(
 class OutputUses:
     """Which outputs drive, and how they are read.
 
-    ``drives_by`` names the plan or the controls in words, and is empty if there
-    is none; ``uses`` is by output; ``problems`` are names that do not exist.
+    ``drives_by`` names the plan in words, and is empty if there is none; ``uses`` is by
+    output; ``problems`` are names that do not exist.
     """
 
     drives_by: str
@@ -274,19 +245,11 @@ class OutputUses:
             found = ModelOutputs.of(session, adapter)
         except (EvaluationError, GraphError) as error:
             return cls("", {}, (str(error),))
-        uses: dict[str, str] = {}
-        if found.plan is not None:
-            output = found.plan.output
-            uses[output] = plan_words(found.plan, session.outputs[output].shape)
-            if found.plan.scores is not None:
-                uses[found.plan.scores] = "scores, which pick the plan's mode"
-        if found.control is not None:
-            # what is read of each output as a control
-            for text, what in found.control.outputs.items():
-                output, _ = output_named(text, session.outputs)
-                before = f"{uses[output]}, " if output in uses else "control: "
-                uses[output] = before + what
-        return cls("its plan" if found.control is None else "its controls", uses, ())
+        output = found.plan.output
+        uses = {output: plan_words(found.plan, session.outputs[output].shape)}
+        if found.plan.scores is not None:
+            uses[found.plan.scores] = "scores, which pick the plan's mode"
+        return cls("its plan", uses, ())
 
     def ports(
         self, session: Session, recurrent: Mapping[str, str]

@@ -1,4 +1,4 @@
-"""What a graph answers, read by an adapter: other waypoints, controls, both fused."""
+"""What a graph answers, read by an adapter: other waypoints, a host stage."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -8,8 +8,8 @@ from typing import ClassVar
 import pytest
 
 from me2e_compress.driving.adapter import Adapter
-from me2e_compress.driving.contract import PedalsAndWheel, Trajectory
-from me2e_compress.driving.host_stage import CollisionOptimizer, HostStage, HostWork
+from me2e_compress.driving.contract import Trajectory
+from me2e_compress.driving.host_stage import HostStage, HostWork
 from me2e_compress.driving.onnx_policy import OnnxPolicy
 from me2e_compress.errors import EvaluationError
 from me2e_compress.evaluators.highway.drivers import OnnxDriver
@@ -59,26 +59,10 @@ def test_waypoints_of_any_number_in_the_models_axes(tmp_path: Path) -> None:
     assert found.times_s[[0, 8]].tolist() == [0.2, 1.8]
 
 
-VECTOR = "[control]\nthrottle = 'gas[0]'\nsteer = 'gas[1]'\nbrake = 'gas[2]'\n"
-
-
-def test_controls_drive_in_place_of_the_plan(tmp_path: Path) -> None:
-    policy = adapted(controlled(tmp_path), VECTOR).open()
-    policy.reset(EXIT)
-
-    assert policy.plan(observation()) == PedalsAndWheel(0.5, 0.25, 0.0)
-
-
 @pytest.mark.parametrize(
     ("toml", "message"),
     [
-        (
-            "[control]\nthrottle = 'pedal'\nsteer = 'gas[1]'",
-            "no output pedal, which the adapter names as throttle; there are plan, gas",
-        ),
-        ("[control]\nsteer = 'gas[1]'", "control: either throttle, steer and brake"),
-        ("[control]\nthrottle = 'gas'\nsteer = 'gas[1]'", "gas has 3 numbers: say"),
-        (f"{VECTOR}\n[plan]\noutput = 'plan'", "plan and control both drive"),
+        ("[control]\nsteer = 'gas'", "controls of a graph is gone since 0.3.0: use a"),
         ("[plan]\noutput = 'gas'\nstep_s = 0.5", "gas has shape [1, 3], a plan is"),
         ("[plan]\noutput = 'plan'\nstep_s = 0", "plan.step_s: Input should be greater"),
         ("[plan]\noutput = 'plan'\nshape = [6, 0]", "every side is 1 or more"),
@@ -94,13 +78,6 @@ def test_what_does_not_fit_is_one_line(tmp_path: Path, toml: str, message: str) 
         adapted(controlled(tmp_path), toml).open()
     assert message in str(caught.value)
     assert "\n" not in str(caught.value)
-
-
-def test_a_host_stage_needs_a_plan(tmp_path: Path) -> None:
-    driver = adapted(controlled(tmp_path), VECTOR, CollisionOptimizer())
-
-    with pytest.raises(EvaluationError, match="changes a plan, and this model answers"):
-        driver.open()
 
 
 @dataclass(frozen=True)
