@@ -31,15 +31,15 @@ ROUTE = {
 }
 RUN = {"_checkpoint": {"records": [ROUTE], "progress": [1, 1]}, "eligible": True}
 STUDY = """
-title = "a blind driver and the expert"
+title = "two blind drivers"
 baseline = "blind"
 routes = "1"
 [[variant]]
 name = "blind"
 policy = "blind"
 [[variant]]
-name = "expert"
-policy = "expert"
+name = "faster"
+policy = "blind:12"
 [[condition]]
 name = "ideal"
 latency = "none"

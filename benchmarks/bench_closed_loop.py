@@ -31,14 +31,15 @@ from me2e_compress.driving.policies import Driver, driver_named
 from me2e_compress.evaluators import Drive
 from me2e_compress.evaluators.highway.engine import LocalEngine
 from me2e_compress.evaluators.highway.evaluator import Highway
-from me2e_compress.evaluators.highway.expert.expert_policy import Expert
 from me2e_compress.evaluators.results import drive_routes
 from me2e_compress.metrics.bench2drive import ABILITIES
 from me2e_compress.metrics.measure import Estimate
 from me2e_compress.metrics.scores import Scores, score
 from me2e_compress.simulator.routes import Route, load_routes, pick_routes
 from me2e_compress.workflows.result import SILENT
+from models.driver.expert import Expert
 
+EXPERT = "models.driver.expert:Expert"
 LATENCIES_S = (0.0, 0.05, 0.15, 0.25, 0.45, 0.85)
 MODEL_MS = 10.0
 SIDE = 192
@@ -154,7 +155,7 @@ def bench_drivers(out: Path, workers: int) -> None:
     columns = ["DS", "room", "SR", *ABILITIES, "DE", "DC", "DE b2d", "DC b2d"]
     print("| driver | " + " | ".join(columns) + " |")
     print("|---" * (len(columns) + 1) + "|")
-    for name in ("expert", "blind:4", "blind:8", "blind:12"):
+    for name in (EXPERT, "blind:4", "blind:8", "blind:12"):
         folder = out / name.replace(":", "-")
         found, _ = evaluate(folder, driver_named(name), routes, workers)
         each = [found.each_ability[ability] for ability in ABILITIES]
@@ -177,7 +178,7 @@ def bench_latency(out: Path, workers: int) -> None:
     for seconds in LATENCIES_S:
         folder = out / (f"expert-{seconds:g}s" if seconds else "expert")
         scores, _ = evaluate(
-            folder, driver_named("expert"), load_routes(), workers, round(seconds * 1e6)
+            folder, driver_named(EXPERT), load_routes(), workers, round(seconds * 1e6)
         )
         rate, driving = scores.success_rate, scores.driving_score.value
         print(
@@ -191,7 +192,7 @@ def bench_bytes(out: Path, workers: int) -> None:
     folders = [out / f"bytes-{count}" for count in (1, max(2, workers))]
     for folder, count in zip(folders, (1, max(2, workers)), strict=True):
         shutil.rmtree(folder, ignore_errors=True)
-        evaluate(folder, driver_named("expert"), routes, count, 150_000)
+        evaluate(folder, driver_named(EXPERT), routes, count, 150_000)
     one, other = (
         {p.relative_to(f): p.read_bytes() for p in f.rglob("*.json")} for f in folders
     )
@@ -205,7 +206,7 @@ def bench_throughput(out: Path, _: int) -> None:
     light = model_of(1, out / "light.onnx")
     drivers = {
         "blind:8, no cameras": driver_named("blind:8"),
-        "expert, no cameras": driver_named("expert"),
+        "expert, no cameras": driver_named(EXPERT),
         "expert and six cameras 96x160": ShadowDriver(light),
     }
     print("| driver | frames/s on one core | MB a worker |\n|---|---|---|")

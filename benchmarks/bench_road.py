@@ -45,6 +45,7 @@ from me2e_compress.simulator.routes import (
 from me2e_compress.simulator.scene import EventKind, Scene, SignalKind, SignalState
 from me2e_compress.simulator.world import World
 from me2e_compress.study.drive_record import DriveRecord
+from models.driver.expert.privileged import privileged
 
 NEAR_M, MOVING_MPS = 80.0, 0.3
 AHEAD_M = 40.0
@@ -88,7 +89,9 @@ def blind_drive(route: Route, speed_mps: float) -> BlindDrive:
 
     def look(world: World) -> None:
         worlds.append(world)
-        ahead = [(e.line_s - world.ego_s, e.state) for e in world.privileged(()).phases]
+        ahead = [
+            (e.line_s - world.ego_s, e.state) for e in privileged(world, ()).phases
+        ]
         lit.append(any(0.0 < at < AHEAD_M and state in WAIT for at, state in ahead))
 
     episode = drive(

@@ -1,8 +1,8 @@
-"""A front-camera policy, cloned from the expert in seconds, without torch.
+"""A front-camera policy, cloned from the driver that ships in seconds, without torch.
 
 A picture of the front camera, pooled to 6 x 20 cells, the speed and the target point go
 through a fixed random layer; the only thing learnt is a ridge regression of the
-expert's next two seconds on it.
+driver's next two seconds on it.
 
     python clone.py blank.onnx
     me2e-compress frames blank.onnx --adapter front.toml -n 480 -o frames/
@@ -74,7 +74,7 @@ def fitted(xs: Floats, ways: Floats) -> Floats:
 def network(weights: Floats | None) -> onnx.ModelProto:
     """Build the graph; without weights it stands still, and asks for the CAN bus too.
 
-    That is how frames are recorded for it: the CAN bus tells where the expert drove.
+    That is how frames are recorded for it: the CAN bus tells where the driver drove.
     """
     learnt = np.zeros((FEATURES, 2 * STEPS)) if weights is None else weights
     nodes = [

@@ -145,9 +145,9 @@ def frames(
 ) -> None:
     """Write calibration frames, coherent in time, seen by six cameras.
 
-    For a driver that ships, or any ONNX file that keeps the policy contract
-    (--adapter), the expert drives fresh routes. With --from, recorded driving is laid
-    out as the file takes it (docs/writing-logs.md).
+    The driver that ships drives fresh routes, and the model looks on: highway, or any
+    ONNX file that keeps the policy contract (--adapter). With --from, recorded driving
+    is laid out as the file takes it (docs/writing-logs.md).
 
     Args:
         stack: highway, or M.onnx

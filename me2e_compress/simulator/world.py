@@ -1,14 +1,10 @@
-"""One route, stepped frame by frame, and what only a privileged policy sees of it."""
+"""One route, stepped frame by frame."""
 
 import math
-from collections.abc import Collection
-from dataclasses import dataclass
 from enum import StrEnum
 
-import numpy as np
-
 from me2e_compress.errors import EvaluationError
-from me2e_compress.simulator.plane_geometry import Floats, Roadmap, RoutePath
+from me2e_compress.simulator.plane_geometry import Roadmap, RoutePath
 from me2e_compress.simulator.routes import Route
 from me2e_compress.simulator.scenarios.builders import Builder, stage_of
 from me2e_compress.simulator.scene import (
@@ -18,83 +14,10 @@ from me2e_compress.simulator.scene import (
     EventKind,
     Scene,
     SignalKind,
-    SignalState,
 )
 from me2e_compress.simulator.traffic.bodies import Car, StaticObject, Walker
 from me2e_compress.simulator.traffic.right_of_way import RightOfWay
 from me2e_compress.simulator.traffic.traffic_road import TrafficRoad
-
-FORESEEN_M = 90.0
-
-
-@dataclass(frozen=True, eq=False, slots=True)
-class Intent:
-    """The plan of one moving actor, by its id in the scene.
-
-    Attributes:
-        path: [M, 2] metres: its position, then the way that it will take.
-        target_mps: The speed that it wants on this way; 0 while it waits.
-        acceleration_mps2: Its present acceleration.
-        sees_ego: Whether it brakes for the ego.
-    """
-
-    actor_id: int
-    path: Floats
-    target_mps: float
-    acceleration_mps2: float
-    sees_ego: bool
-
-
-@dataclass(frozen=True, slots=True)
-class Phase:
-    """A signal on the ego's route, by its id in the scene.
-
-    The route crosses its line at the arc length ``line_s``, m; signs have no state.
-    """
-
-    signal_id: int
-    line_s: float
-    state: SignalState | None
-
-
-@dataclass(frozen=True, slots=True)
-class Privileged:
-    """What a privileged policy may see besides the scene."""
-
-    intents: tuple[Intent, ...]
-    phases: tuple[Phase, ...]
-
-
-def intent_of(body: Car | Walker) -> Intent:
-    """Return what an actor will do if nothing disturbs it."""
-    if isinstance(body, Walker):
-        target = body.top_speed_mps if body.going and not body.done else 0.0
-        return Intent(body.id, body.rest(), target, 0.0, False)
-    acceleration = float(body.action["acceleration"])
-    forced = body.forced_mps2
-    target = float(body.target_speed)
-    if forced is not None:
-        target = 0.0 if forced < -1.0 else float(body.speed)
-    # the centre lines of the lanes ahead
-    pieces = [np.array([[body.pose.x, body.pose.y]])]
-    skip, found = body.lane_s + body.speed * 0.5 + 1.0, 0.0
-    for index in body.lanes[body.leg :]:
-        stations, centre = body.network.samples(index)
-        length = body.network.length(index)
-        ahead = centre[stations > skip]
-        if body.offset_m and len(ahead) > 1:
-            steps = np.gradient(ahead, axis=0)
-            steps /= np.hypot(steps[:, :1], steps[:, 1:])
-            left = np.stack([-steps[:, 1], steps[:, 0]], axis=1)
-            ahead = ahead + body.offset_m * left
-        pieces.append(ahead)
-        found += length - max(skip, 0.0)
-        skip = max(0.0, skip - length)
-        if found > FORESEEN_M:
-            break
-    way = np.concatenate(pieces)
-    return Intent(body.id, way, target, acceleration, body.behaviour.sees_ego)
-
 
 DT_US = 50_000
 """20 Hz, as Bench2Drive."""
@@ -128,6 +51,7 @@ class World:
             type: for new types.
 
     Attributes:
+        stage: What the scenario set, bodies and signals included.
         path: The ego's route.
         roadmap: All lanes, stop lines and crosswalks.
         parameters: Every parameter of the scenario with its value.
@@ -151,7 +75,7 @@ class World:
             )
         self.route, self.dt_us = route, dt_us
         # the scenario sets the stage
-        self._stage = stage = stage_of(route, builder)
+        self.stage = stage = stage_of(route, builder)
         self.path: RoutePath = stage.path
         self.parameters = dict(stage.parameters)
         self.roadmap: Roadmap = stage.network.roadmap(
@@ -183,7 +107,7 @@ class World:
     @property
     def time_us(self) -> int:
         """Simulated time since the start."""
-        return self._stage.time_us
+        return self.stage.time_us
 
     @property
     def done(self) -> bool:
@@ -193,12 +117,12 @@ class World:
     @property
     def events(self) -> tuple[Event, ...]:
         """All events so far, in order."""
-        return tuple(self._stage.events)
+        return tuple(self.stage.events)
 
     @property
     def ego_s(self) -> float:
         """Arc length of the ego's projection on its route."""
-        return self._stage.ego_s
+        return self.stage.ego_s
 
     @property
     def progress_m(self) -> float:
@@ -207,24 +131,12 @@ class World:
 
     def scene(self) -> Scene:
         """Return a frozen snapshot, right-handed."""
-        bodies = [*self._stage.bodies, *self._stage.static_objects]
+        bodies = [*self.stage.bodies, *self.stage.static_objects]
         return Scene(
             self.time_us,
-            self._stage.ego.snapshot(),
+            self.stage.ego.snapshot(),
             tuple(_actor(body) for body in bodies),
-            tuple(signal.snapshot() for signal in self._stage.regulators),
-        )
-
-    def privileged(self, actors: Collection[int] | None = None) -> Privileged:
-        """Return intents, of all or only of some actors, and signal phases."""
-        signs = [sign for sign in self._stage.regulators if sign.line_s is not None]
-        return Privileged(
-            tuple(
-                intent_of(body)
-                for body in self._stage.bodies
-                if actors is None or body.id in actors
-            ),
-            tuple(Phase(sign.id, sign.line_s or 0.0, sign.state) for sign in signs),
+            tuple(signal.snapshot() for signal in self.stage.regulators),
         )
 
     def step(self, control: Control) -> None:
@@ -238,7 +150,7 @@ class World:
             raise EvaluationError(f"route {self.route.id}: {control} is not finite")
         if self.done:
             raise EvaluationError(f"route {self.route.id} has ended: {self.reason}")
-        stage = self._stage
+        stage = self.stage
         stage.ego.wanted = control
         # every 0.1 s: scripts act, then cars decide on the same positions
         if stage.time_us >= self._next_decision_us:
@@ -271,7 +183,7 @@ class World:
 
     def _take_stage(self) -> None:
         """Take over the bodies that scripts added and removed; drop cars that left."""
-        stage = self._stage
+        stage = self.stage
         stage.bodies = [
             body for body in stage.bodies if not (isinstance(body, Car) and body.gone)
         ]
@@ -281,7 +193,7 @@ class World:
             body.road = self._road
 
     def _check_lanes(self) -> None:
-        stage, pose = self._stage, self._stage.ego.pose
+        stage, pose = self.stage, self.stage.ego.pose
         self.outside_m = self.roadmap.outside_m(pose.x, pose.y)
         outside = self.outside_m > TOLERANCE_M
         if outside:
@@ -297,15 +209,15 @@ class World:
                 continue
             self._met.add((a.id, b.id))
             if a.id == 0 and a.speed < STANDING_MPS:
-                event = self._stage.event(EventKind.STRUCK, "the standing ego", b)
+                event = self.stage.event(EventKind.STRUCK, "the standing ego", b)
             elif a.id == 0:
-                event = self._stage.event(EventKind.COLLISION, "the ego", b)
+                event = self.stage.event(EventKind.COLLISION, "the ego", b)
                 self.collided.setdefault(self.time_us, self.scene())
                 self.reason = EndReason.COLLISION
             else:
                 words = f"actor {a.id}"
-                event = self._stage.event(EventKind.ACTOR_COLLISION, words, b)
-            self._stage.events.append(event)
+                event = self.stage.event(EventKind.ACTOR_COLLISION, words, b)
+            self.stage.events.append(event)
 
 
 def _actor(body: Car | Walker | StaticObject) -> Actor:

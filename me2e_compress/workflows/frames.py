@@ -23,6 +23,7 @@ from me2e_compress.errors import FramesError
 from me2e_compress.extras import need_extra
 from me2e_compress.graph import sha256_of
 from me2e_compress.runtime.frames import Frame
+from me2e_compress.shipped.drivers import shipped
 from me2e_compress.version import __version__
 from me2e_compress.workflows.checks import check_folder, model_path, try_first, writing
 from me2e_compress.workflows.options import FramesOptions
@@ -77,10 +78,10 @@ def record_frames(
 ) -> Path:
     """Make frames of a driver and write them, all or nothing.
 
-    For a driver that ships, or any ONNX file that keeps the policy contract, the expert
-    drives fresh routes of highway-env. With a log, recorded driving is laid out as the
-    file takes it. A run that was killed goes on after its last whole scene. The folder
-    is returned.
+    The driver that ships drives fresh routes of highway-env, and the model looks on: a
+    driver that ships, or any ONNX file that keeps the policy contract. With a log,
+    recorded driving is laid out as the file takes it. A run that was killed goes on
+    after its last whole scene. The folder is returned.
 
     Raises:
         GraphError: The file is missing or altered, or the folder is the input.
@@ -113,8 +114,8 @@ def _recorded(
     # a recording is continued only if the sources and the adapter are the same
     if options.adapter is not None:
         adapter = adapter_file(Path(options.adapter))
-        of += f" {Adapter.digest(adapter)}"
-    # frames come from a log, or from the expert's driving
+        of += f" {sha256_of(adapter)}"
+    # frames come from a log, or from the shipped driver's driving
     about: dict[str, str | int] = {"stack": str(source)}
     if log is not None:
         count, length, provider = options.count, options.scene_length, options.runs_on
@@ -141,9 +142,11 @@ def _driven(model: Path, adapter: Path | None, options: FramesOptions) -> Source
 
     adapted = None if adapter is None else Adapter.load(adapter)
     policy = OnnxPolicy.open(model, adapted, options.runs_on)
+    driver = OnnxPolicy.open(shipped("highway"))
     length = options.scene_length
     return lambda begin: driven_frames(
         policy,
+        driver,
         options.count,
         seed=options.seed,
         scene_length=DRIVEN_SCENE_LENGTH if length is None else length,

@@ -200,7 +200,7 @@ class FramesOptions(WriteOptions, AdapterOptions, ProviderOptions):
     scene_length: int | None = None
     """frames a scene; default 16, of a log all"""
     log: Annotated[str | None, Parameter(name="--from")] = None
-    """recorded driving, read by another package: LOG:ROOT; else the expert drives"""
+    """recorded driving, read by another package: LOG:ROOT; else highway drives"""
 
     def __post_init__(self) -> None:
         check_count("--seed", self.seed)

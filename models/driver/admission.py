@@ -22,7 +22,6 @@ from me2e_compress.evaluators.highway.blind import SPEEDS_MPS, Blind
 from me2e_compress.evaluators.highway.controller import AnchoredPlan
 from me2e_compress.evaluators.highway.driven_frames import propose, seed_of
 from me2e_compress.evaluators.highway.episode_recorder import EpisodeRecorder
-from me2e_compress.evaluators.highway.expert.expert_policy import Expert
 from me2e_compress.evaluators.highway.observe import ObservationBuilder
 from me2e_compress.evaluators.highway.runner import EndingRules
 from me2e_compress.metrics.episode import Ending, InfractionKind
@@ -40,6 +39,7 @@ from me2e_compress.simulator.scene import INFRACTIONS, Control, EventKind
 from me2e_compress.simulator.traffic.stage import TRAFFIC
 from me2e_compress.simulator.world import World
 from me2e_compress.version import __version__
+from models.driver.expert import Expert
 
 ENDS_ONLY = (
     InfractionKind.ROUTE_TIMEOUT,

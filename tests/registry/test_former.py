@@ -57,6 +57,7 @@ def test_what_is_named_instead_is_taken() -> None:
 @pytest.mark.parametrize(
     ("line", "words"),
     [
+        ("evaluate expert -o out", "expert is gone since 0.3.0: use models.driver.ex"),
         ("export tcp -o m.onnx", "tcp is gone since 0.3.0: use a file: python -m mode"),
         ("frames tcp -o made", "tcp is gone since 0.3.0: use a file: python -m models"),
         (

@@ -73,7 +73,7 @@ def test_passes_that_need_no_frames(make: Make, text: str) -> None:
 @pytest.mark.parametrize("name", ["", "a b", "../up", "a/b", ".hidden", "a.b"])
 def test_a_name_that_is_no_folder(name: str) -> None:
     with pytest.raises(StudyError, match="a name is made of letters"):
-        Variant(name, "expert")
+        Variant(name, "blind")
 
 
 @pytest.mark.parametrize(
@@ -86,8 +86,8 @@ def test_a_name_that_is_no_folder(name: str) -> None:
     ],
 )
 def test_a_driver_that_is_no_model_takes_nothing(options: dict[str, object]) -> None:
-    with pytest.raises(StudyError, match="variant e: expert is not a model"):
-        Variant("e", "expert", **options)  # type: ignore[arg-type]
+    with pytest.raises(StudyError, match="variant e: blind is not a model"):
+        Variant("e", "blind", **options)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(

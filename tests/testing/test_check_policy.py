@@ -17,11 +17,7 @@ from me2e_compress.driving.contract import (
 )
 from me2e_compress.driving.policies import Driver
 from me2e_compress.errors import VerificationError
-from me2e_compress.evaluators.highway.drivers import (
-    BlindDriver,
-    ExpertDriver,
-    OnnxDriver,
-)
+from me2e_compress.evaluators.highway.drivers import BlindDriver, OnnxDriver
 from me2e_compress.simulator.scene import Control
 from me2e_compress.simulator.world import World
 from me2e_compress.testing import check_policy
@@ -31,9 +27,8 @@ DENSE = np.array([0.1, 0.2])
 AHEAD = np.array([[2.0 * k, 0.0] for k in range(1, 7)])
 
 
-@pytest.mark.parametrize("driver", [BlindDriver(6.0), ExpertDriver()])
-def test_our_policies_hold(driver: Driver) -> None:
-    assert len(check_policy(driver)) == 8
+def test_a_privileged_policy_holds() -> None:
+    assert len(check_policy(BlindDriver(6.0))) == 8
 
 
 def test_a_recurrent_model_holds(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""Closed-loop evaluation in highway-env: world, cameras, expert, runner.
+"""Closed-loop evaluation in highway-env: world, cameras, runner.
 
 Reading results does not need highway-env; driving needs the extra ``highway``.
 """

@@ -73,24 +73,6 @@ def contact_times(one: Floats, other: Floats, approach: Floats) -> Floats:
     return np.where(touches, np.maximum(begins, 0.0), np.inf)
 
 
-def rays_through(starts: Floats, ends: Floats, boxes: Floats) -> tuple[Floats, Floats]:
-    """Return [R, B] the parts of R rays at which they enter and leave B boxes.
-
-    Starts and ends are [R, 2]; where the first exceeds the second, a ray misses.
-    """
-    cos, sin, half = np.cos(boxes[:, 2]), np.sin(boxes[:, 2]), boxes[:, 3:5] / 2
-    start, way = starts[:, None] - boxes[None, :, :2], (ends - starts)[:, None]
-    enters, leaves = np.full(start.shape[:2], -np.inf), np.full(start.shape[:2], np.inf)
-    for axis, (c, s) in enumerate(((cos, sin), (-sin, cos))):
-        at = c * start[..., 0] + s * start[..., 1]
-        step = c * way[..., 0] + s * way[..., 1]
-        step = np.where(np.abs(step) < 1e-9, 1e-9, step)
-        one, other = (-half[:, axis] - at) / step, (half[:, axis] - at) / step
-        enters = np.maximum(enters, np.minimum(one, other))
-        leaves = np.minimum(leaves, np.maximum(one, other))
-    return enters, leaves
-
-
 def _along_axes(one: Floats, other: Floats, vectors: Floats) -> Floats:
     """Return [..., 4] vectors along and across the first box and the other."""
     columns: list[Any] = []

@@ -1,4 +1,4 @@
-"""Calibration frames recorded from the model's view while the expert drives."""
+"""Calibration frames recorded from a model's view while a driver drives."""
 
 import zlib
 from collections.abc import Iterator
@@ -11,7 +11,6 @@ from me2e_compress.driving.onnx_policy import OnnxPolicy
 from me2e_compress.driving.realtime import DT_US
 from me2e_compress.errors import EvaluationError, FramesError
 from me2e_compress.evaluators.highway.controller import AnchoredPlan
-from me2e_compress.evaluators.highway.expert.expert_policy import Expert
 from me2e_compress.evaluators.highway.observe import ObservationBuilder
 from me2e_compress.evaluators.highway.runner import EndingRules
 from me2e_compress.runtime.frames import Array, Frame
@@ -35,6 +34,7 @@ SEED_OFFSET = 1_000_000
 
 def driven_frames(
     policy: OnnxPolicy,
+    driver: OnnxPolicy,
     count: int,
     *,
     seed: int,
@@ -44,8 +44,8 @@ def driven_frames(
 ) -> Iterator[Frame]:
     """Yield what a model sees on fresh routes, every half second.
 
-    A scene is a random stretch of one route, driven by the expert without latency by
-    what the cameras show; fewer frames than ``scene_length`` if the route ends before.
+    A scene is a random stretch of one route, driven by ``driver`` without latency;
+    fewer frames than ``scene_length`` if the route ends before.
     Its clock, its CAN bus and (since they are left out) its recurrent inputs start
     anew. Scenario types alternate; none of the routes is one of the 220 that ship.
     Frames are keyed by the graph's input names, without the recurrent inputs; the
@@ -70,7 +70,7 @@ def driven_frames(
         spare_us = EXPERT_S[route.scenario] * 1_000_000 - scene_length * STEP_US
         begin_us = int(random.integers(0, max(1, spare_us // DT_US))) * DT_US
         for at, arrays in enumerate(
-            _look(policy, route, begin_us, min(scene_length, count - done))
+            _look(policy, driver, route, begin_us, min(scene_length, count - done))
         ):
             yield Frame(done, at == 0, arrays, place)
             done += 1
@@ -111,16 +111,12 @@ def seed_of(seed: int, scenario: str, attempt: int) -> int:
 
 
 def _look(
-    policy: OnnxPolicy, route: Route, begin_us: int, count: int
+    policy: OnnxPolicy, driver: OnnxPolicy, route: Route, begin_us: int, count: int
 ) -> Iterator[dict[str, Array]]:
     """Yield the model's feeds from a moment on, until enough or the route ends."""
-    world, expert, rules = (World(route), Expert(cameras_only=True), EndingRules())
-    # the expert drives, the model looks on
-    rig = CameraRig(*policy.image_size)
-    texture = paint_texture(world.roadmap, world.path.points)
-    cameras = Cameras(texture, rig, world.weather) if policy.needs_images else None
-    driver = ObservationBuilder(world, expert, rig, None)
-    passenger = ObservationBuilder(world, policy, rig, cameras)
+    world, rules = World(route), EndingRules()
+    driving, watching = (_observer_of(world, each) for each in (driver, policy))
+    driver.reset(route)
     # record every half second, from the first moment on
     policy.reset(route)
     wanted = count
@@ -128,11 +124,19 @@ def _look(
     while count and rules.ending(world, scene.ego.speed_mps) is None:
         since_us = scene.time_us - begin_us
         if since_us >= 0 and since_us % STEP_US == 0:
-            feeds = policy.feeds(replace(passenger.observe(scene), time_us=since_us))
+            feeds = policy.feeds(replace(watching.observe(scene), time_us=since_us))
             first = policy.first.at(feeds) if count == wanted else {}
             yield {**feeds, **first}
             count -= 1
-        plan = expert.plan(driver.observe(scene))
+        plan = driver.plan(driving.observe(scene))
         anchored = AnchoredPlan.of(plan, scene.ego, scene.time_us)
         world.step(anchored.control(scene.ego, scene.time_us))
         scene = world.scene()
+
+
+def _observer_of(world: World, policy: OnnxPolicy) -> ObservationBuilder:
+    rig, cameras = CameraRig(*policy.image_size), None
+    if policy.needs_images:
+        texture = paint_texture(world.roadmap, world.path.points)
+        cameras = Cameras(texture, rig, world.weather)
+    return ObservationBuilder(world, policy, rig, cameras)

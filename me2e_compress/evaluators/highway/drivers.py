@@ -1,4 +1,4 @@
-"""Drivers of this evaluator: the expert, the blind one, an ONNX file.
+"""Drivers of this evaluator: the blind one, an ONNX file.
 
 A driver imports its simulator or runtime only when it is opened.
 """
@@ -15,19 +15,6 @@ from me2e_compress.errors import EvaluationError
 from me2e_compress.graph import load, sha256_of
 from me2e_compress.graph.modules.module_map import ModuleMap
 from me2e_compress.runtime.providers import CPU, Provider
-
-
-@dataclass(frozen=True)
-class ExpertDriver(Driver):
-    """The privileged expert, who sees the world itself."""
-
-    name: ClassVar[str] = "expert"
-
-    def open(self) -> Policy:
-        """Return the expert."""
-        from me2e_compress.evaluators.highway.expert.expert_policy import Expert
-
-        return Expert()
 
 
 @dataclass(frozen=True)
@@ -112,9 +99,7 @@ class OnnxDriver(Driver):
         """Return the digests of its files, with provider and host stage."""
         digests = [sha256_of(self.path)]
         if self.adapter is not None:
-            from me2e_compress.driving.adapter import Adapter
-
-            digests.append(Adapter.digest(self.adapter))
+            digests.append(sha256_of(self.adapter))
         if self.module_map is not None:
             digests.append(repr(ModuleMap.load(self.module_map)))
         if self.provider != CPU:

@@ -9,12 +9,11 @@ import numpy as np
 import numpy.typing as npt
 
 from me2e_compress.evaluators.highway.controller import beyond
-from me2e_compress.evaluators.highway.expert.expert_policy import decide
 from me2e_compress.evaluators.highway.observe import can_bus_of
 from me2e_compress.simulator.camera_rig import CameraRig
 from me2e_compress.simulator.plane_geometry import Floats, RoutePath
 from me2e_compress.simulator.scene import Signal, SignalKind, SignalState
-from me2e_compress.simulator.world import Privileged, World
+from me2e_compress.simulator.world import World
 from models.driver.episodes.agents import (
     FUTURE_STEPS,
     FUTURE_US,
@@ -24,6 +23,8 @@ from models.driver.episodes.agents import (
 from models.driver.episodes.birdseye import ground_classes
 from models.driver.episodes.jpeg import pictures
 from models.driver.episodes.recording_policy import LabelledFrame, cameras_of
+from models.driver.expert.expert_policy import decide
+from models.driver.expert.privileged import Privileged
 
 SIGNALS = 4
 SIGNAL_COLUMNS = 8

@@ -19,16 +19,9 @@ from me2e_compress.driving.contract import (
     RouteInfo,
     six_waypoints,
 )
-from me2e_compress.evaluators.highway.expert.expert_policy import (
-    ExpertDecision,
-    Memory,
-    ceiling,
-    decide,
-)
 from me2e_compress.evaluators.highway.observe import (
     ObservationBuilder,
     scene_and_world,
-    seen,
 )
 from me2e_compress.runtime.plan_adapter import Trajectory
 from me2e_compress.simulator.camera_rig import CameraRig
@@ -36,7 +29,15 @@ from me2e_compress.simulator.cameras.ground import paint_texture
 from me2e_compress.simulator.cameras.renderer import Cameras
 from me2e_compress.simulator.plane_geometry import Floats
 from me2e_compress.simulator.scene import Scene
-from me2e_compress.simulator.world import Phase, World
+from me2e_compress.simulator.world import World
+from models.driver.expert.expert_policy import (
+    ExpertDecision,
+    Memory,
+    ceiling,
+    decide,
+)
+from models.driver.expert.privileged import Phase, privileged
+from models.driver.expert.visibility import seen
 
 BURST_S = (0.4, 1.5)
 PAUSE_S = (0.9, 4.8)
@@ -234,7 +235,7 @@ class RecordingPolicy:
             self._begin(world)
         memory = self.frames[-1].decision.memory if self.frames else Memory()
         shown = seen(scene)
-        known = world.privileged([actor.id for actor in shown.actors])
+        known = privileged(world, [actor.id for actor in shown.actors])
         decision = decide(shown, known, world.path, self.top, memory)
         self.frames.append(
             LabelledFrame(scene, known.phases, observation.command, memory, decision)

@@ -9,12 +9,6 @@ from me2e_compress.driving.realtime import HeldControl
 from me2e_compress.errors import EvaluationError
 from me2e_compress.evaluators.highway.controller import AnchoredPlan
 from me2e_compress.evaluators.highway.driven_frames import propose, seed_of
-from me2e_compress.evaluators.highway.expert.expert_policy import (
-    Expert,
-    Memory,
-    ceiling,
-    decide,
-)
 from me2e_compress.metrics.episode import Ending, InfractionKind
 from me2e_compress.simulator.plane_geometry import Floats
 from me2e_compress.simulator.routes import (
@@ -34,6 +28,13 @@ from models.driver.admission import (
     examine,
     generate,
 )
+from models.driver.expert.expert_policy import (
+    Expert,
+    Memory,
+    ceiling,
+    decide,
+)
+from models.driver.expert.privileged import privileged
 from tests.simulator.world.driving import route_of
 
 SEED = 77_001
@@ -67,7 +68,7 @@ def test_the_planned_waypoints_are_where_the_ego_then_is() -> None:
     planned = list[Floats]()
     while not world.done and world.time_us < 40_000_000:
         scene = world.scene()
-        decision = decide(scene, world.privileged(), world.path, top, memory)
+        decision = decide(scene, privileged(world), world.path, top, memory)
         memory = decision.memory
         plan = AnchoredPlan.of(decision.waypoints, scene.ego, scene.time_us)
         planned.append(scene.ego.placed(np.asarray(decision.waypoints, float))[1])
@@ -87,7 +88,7 @@ def test_a_decision_that_takes_long_drives_worse() -> None:
     while not world.done and world.time_us < 40_000_000:
         if held.decision_is_due:
             scene = world.scene()
-            decision = decide(scene, world.privileged(), world.path, top, memory)
+            decision = decide(scene, privileged(world), world.path, top, memory)
             memory = decision.memory
             plan = AnchoredPlan.of(decision.waypoints, scene.ego, scene.time_us)
             control = plan.control(scene.ego, scene.time_us)

@@ -8,7 +8,6 @@ import pytest
 
 from me2e_compress.driving.contract import Observation, Plan
 from me2e_compress.evaluators import Drive
-from me2e_compress.evaluators.highway.expert.expert_policy import Expert, ceiling
 from me2e_compress.evaluators.highway.runner import drive
 from me2e_compress.simulator.camera_rig import CLEAR, CameraRig
 from me2e_compress.simulator.cameras.ground import paint_texture
@@ -25,6 +24,7 @@ from models.driver.episodes.recording_policy import (
     RecordingPolicy,
     cameras_of,
 )
+from models.driver.expert.expert_policy import Expert, ceiling
 from models.tests.driver.beginning import drive_beginning
 
 pytestmark = pytest.mark.xdist_group("episodes")

@@ -7,7 +7,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from me2e_compress.evaluators.highway.expert.expert_policy import ExpertDecision, Memory
 from me2e_compress.simulator.scene import (
     DIMENSIONS,
     Actor,
@@ -18,11 +17,12 @@ from me2e_compress.simulator.scene import (
     SignalKind,
     SignalState,
 )
-from me2e_compress.simulator.world import Phase
 from models.driver.episodes import GRID
 from models.driver.episodes.agents import agents
 from models.driver.episodes.episode_arrays import Arrays, signals
 from models.driver.episodes.recording_policy import LabelledFrame
+from models.driver.expert.expert_policy import ExpertDecision, Memory
+from models.driver.expert.privileged import Phase
 
 NORTH = Ego(100.0, 50.0, math.pi / 2, 8.0, 0.0, 0.0, 0.0, 0.0, 5.0, 2.0)
 """Looks north: 10 m ahead is (100, 60), 3 m to its left (97, 50)."""

@@ -8,9 +8,9 @@ from me2e_compress.driving.onnx_policy import OnnxPolicy
 from me2e_compress.errors import FramesError
 from me2e_compress.evaluators.highway import driven_frames as room
 from me2e_compress.evaluators.highway.driven_frames import driven_frames, fresh_routes
-from me2e_compress.evaluators.highway.expert.expert_policy import Expert
 from me2e_compress.runtime.frames import Frame
 from me2e_compress.runtime.session import replay
+from me2e_compress.shipped.drivers import shipped
 from me2e_compress.simulator.camera_rig import CameraRig
 from tests.evaluators.highway.drivers import straight_on
 from tests.stand_in import write_model
@@ -25,9 +25,14 @@ def policy(tmp_path_factory: pytest.TempPathFactory) -> OnnxPolicy:
 
 
 @pytest.fixture(scope="module")
-def seen(policy: OnnxPolicy) -> list[Frame]:
+def driver() -> OnnxPolicy:
+    return OnnxPolicy.open(shipped("highway"))
+
+
+@pytest.fixture(scope="module")
+def seen(policy: OnnxPolicy, driver: OnnxPolicy) -> list[Frame]:
     """Two scenes and a bit."""
-    return list(driven_frames(policy, 10, seed=3, scene_length=4))
+    return list(driven_frames(policy, driver, 10, seed=3, scene_length=4))
 
 
 def test_scenes_begin_with_their_clock_where_routes_do(seen: list[Frame]) -> None:
@@ -83,20 +88,22 @@ def test_the_can_bus_counts_since_the_last_frame(seen: list[Frame]) -> None:
             assert apart == pytest.approx(0.0, abs=1e-4)
 
 
-def test_a_model_without_images_gets_none(tmp_path: Path) -> None:
+def test_a_model_without_images_gets_none(driver: OnnxPolicy, tmp_path: Path) -> None:
     model = straight_on(tmp_path / "m.onnx", inputs="float[1, 18] can_bus")
 
-    (frame,) = driven_frames(OnnxPolicy.open(model), 1, seed=0)
+    (frame,) = driven_frames(OnnxPolicy.open(model), driver, 1, seed=0)
     assert {name: array.shape for name, array in frame.arrays.items()} == {
         "can_bus": (1, 18)
     }
 
 
 def test_a_scene_is_the_same_whatever_was_made_before(
-    policy: OnnxPolicy, seen: list[Frame]
+    policy: OnnxPolicy, driver: OnnxPolicy, seen: list[Frame]
 ) -> None:
     last = seen[8]
-    again = driven_frames(policy, 10, seed=3, scene_length=4, done=8, first=last.place)
+    again = driven_frames(
+        policy, driver, 10, seed=3, scene_length=4, done=8, first=last.place
+    )
     for one, other in zip(again, seen[8:], strict=True):
         assert (one.index, one.starts_scene) == (other.index, other.starts_scene)
         for name, array in one.arrays.items():
@@ -121,20 +128,6 @@ def test_no_route_is_one_that_drivers_are_judged_on(
     assert next(fresh_routes(0)) == second
 
 
-def test_the_expert_drives_by_what_the_cameras_show(
-    policy: OnnxPolicy, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    experts = list[bool]()
-
-    def expert(*, cameras_only: bool) -> Expert:
-        experts.append(cameras_only)
-        return Expert(cameras_only=cameras_only)
-
-    monkeypatch.setattr(room, "Expert", expert)
-    assert len(list(driven_frames(policy, 2, seed=0, scene_length=1))) == 2
-    assert set(experts) == {True}
-
-
 @pytest.mark.parametrize(
     ("count", "seed", "length", "words"),
     [
@@ -144,7 +137,12 @@ def test_the_expert_drives_by_what_the_cameras_show(
     ],
 )
 def test_bad_numbers(
-    policy: OnnxPolicy, count: int, seed: int, length: int, words: str
+    policy: OnnxPolicy,
+    driver: OnnxPolicy,
+    count: int,
+    seed: int,
+    length: int,
+    words: str,
 ) -> None:
     with pytest.raises(FramesError, match=words):
-        next(driven_frames(policy, count, seed=seed, scene_length=length))
+        next(driven_frames(policy, driver, count, seed=seed, scene_length=length))

@@ -5,12 +5,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from me2e_compress.evaluators.highway.controller import AnchoredPlan
-from me2e_compress.evaluators.highway.expert.expert_policy import (
-    Memory,
-    ceiling,
-    decide,
-)
 from me2e_compress.simulator.bicycle import advance
 from me2e_compress.simulator.plane_geometry import (
     Command,
@@ -30,7 +24,6 @@ from me2e_compress.simulator.scene import (
     SignalKind,
     SignalState,
 )
-from me2e_compress.simulator.world import Intent, Phase, Privileged
 
 DT_US = 50_000
 LAG_S = (0.2, 0.1)
@@ -104,15 +97,10 @@ class TinyWorld:
     ego: Ego
     actors: tuple[Actor, ...] = ()
     signals: tuple[Signal, ...] = ()
-    intents: tuple[Intent, ...] = ()
     time_us: int = 0
 
     def scene(self) -> Scene:
         return Scene(self.time_us, self.ego, self.actors, self.signals)
-
-    def privileged(self) -> Privileged:
-        phases = (Phase(s.id, s.stop_line[0][0], s.state) for s in self.signals)
-        return Privileged(self.intents, tuple(phases))
 
     def step(self, control: Control) -> None:
         dt, ego = DT_US / 1e6, self.ego
@@ -155,21 +143,3 @@ class TinyWorld:
                 if math.hypot(end, max(across - a.width / 2, 0.0)) < 0.9:
                     return True
         return False
-
-
-def drive(world: TinyWorld, seconds: float, every: int = 1) -> list[Scene]:
-    """Let the expert drive through the controller; all scenes, the last included."""
-    top, memory = ceiling(world.path), Memory()
-    scenes, control = [world.scene()], Control(0.0, 0.0)
-    for frame in range(round(seconds * 1e6 / DT_US)):
-        if frame % every == 0:
-            scene = world.scene()
-            decision = decide(scene, world.privileged(), world.path, top, memory)
-            memory = decision.memory
-            plan = AnchoredPlan.of(decision.waypoints, scene.ego, scene.time_us)
-            control = plan.control(scene.ego, scene.time_us)
-        world.step(control)
-        scenes.append(world.scene())
-        if world.touches:
-            break
-    return scenes

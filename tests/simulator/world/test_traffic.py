@@ -174,7 +174,7 @@ def test_a_red_light_stops_traffic_and_green_does_not() -> None:
 
 
 def cars_of(world: World) -> Iterator[Car]:
-    stage = world._stage
+    stage = world.stage
     return (body for body in stage.bodies if isinstance(body, Car))
 
 

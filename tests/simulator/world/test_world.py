@@ -2,11 +2,9 @@ import math
 import subprocess
 import sys
 
-import numpy as np
 import pytest
 
 from me2e_compress.errors import EvaluationError
-from me2e_compress.simulator.plane_geometry import resample
 from me2e_compress.simulator.scenarios.roads import two_way
 from me2e_compress.simulator.scene import ActorKind, Control, EventKind
 from me2e_compress.simulator.traffic.bodies import Behaviour
@@ -167,31 +165,6 @@ def test_cars_that_leave_the_map_are_gone() -> None:
     coast(world, 40)
 
     assert world.scene().actors == ()
-    assert world.privileged().intents == ()
-
-
-def test_an_intent_leads_where_the_actor_goes() -> None:
-    world = World(route_of("NonSignalizedJunctionRightTurn", 2))
-    (intent, *_) = world.privileged().intents
-    way = resample(intent.path, 0.25)
-    for _ in range(60):
-        world.step(Control(-8.0, 0.0))
-        actors = {actor.id: actor for actor in world.scene().actors}
-        if intent.actor_id not in actors:
-            break
-        actor = actors[intent.actor_id]
-        away = np.hypot(*(way - (actor.x, actor.y)).T).min()
-        assert away < 0.5
-
-
-def test_phases_are_those_on_the_route() -> None:
-    world = World(route_of("VanillaSignalizedTurnEncounterRedLight", 1))
-
-    (phase,) = world.privileged().phases
-
-    assert len(world.scene().signals) == 4
-    assert phase.state == "red"
-    assert 70 < phase.line_s < 130
 
 
 def test_a_slick_patch_takes_grip_away() -> None:

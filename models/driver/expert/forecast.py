@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 from me2e_compress.simulator.plane_geometry import Floats, RoutePath
 from me2e_compress.simulator.scene import Actor, ActorKind, Scene
-from me2e_compress.simulator.world import Intent
+from models.driver.expert.privileged import Intent
 
 Flags = npt.NDArray[np.bool_]
 TIMES_S = np.concatenate([np.arange(0.25, 3.01, 0.25), np.arange(3.5, 6.01, 0.5)])

@@ -7,14 +7,17 @@ import numpy as np
 
 from me2e_compress.driving.contract import Observation, Plan, RouteInfo
 from me2e_compress.evaluators.highway.controller import slope_of
-from me2e_compress.evaluators.highway.expert.forecast import (
+from me2e_compress.evaluators.highway.observe import scene_and_world
+from me2e_compress.simulator.plane_geometry import Floats, RoutePath
+from me2e_compress.simulator.scene import Scene, SignalKind, SignalState
+from models.driver.expert.forecast import (
     NOW_S,
     TIMES_S,
     Forecast,
     forecast,
     near,
 )
-from me2e_compress.evaluators.highway.expert.futures import (
+from models.driver.expert.futures import (
     Place,
     collision_cost,
     drive_cost,
@@ -24,10 +27,8 @@ from me2e_compress.evaluators.highway.expert.futures import (
     rule_cost,
     sample,
 )
-from me2e_compress.evaluators.highway.observe import scene_and_world, seen
-from me2e_compress.simulator.plane_geometry import Floats, RoutePath
-from me2e_compress.simulator.scene import Scene, SignalKind, SignalState
-from me2e_compress.simulator.world import Phase, Privileged
+from models.driver.expert.privileged import Phase, Privileged, privileged
+from models.driver.expert.visibility import seen
 
 LATERAL_MPS2 = 2.2
 """Lateral acceleration in bends; the comfort bound of nuPlan is 4.89."""
@@ -233,6 +234,6 @@ class Expert:
         memory = Memory() if self.last is None else self.last.memory
         if self.cameras_only:
             scene = seen(scene)
-        known = world.privileged({actor.id for actor in near(scene)})
+        known = privileged(world, {actor.id for actor in near(scene)})
         self.last = decide(scene, known, world.path, self._top, memory)
         return self.last.waypoints

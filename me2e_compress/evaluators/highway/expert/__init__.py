@@ -1,1 +1,0 @@
-"""The privileged expert: a sampling planner in the Frenet frame of the route."""
