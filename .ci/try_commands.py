@@ -31,15 +31,12 @@ ROUTE = {
 }
 RUN = {"_checkpoint": {"records": [ROUTE], "progress": [1, 1]}, "eligible": True}
 STUDY = """
-title = "two blind drivers"
-baseline = "blind"
+title = "the driver that ships"
+baseline = "float"
 routes = "1"
 [[variant]]
-name = "blind"
-policy = "blind"
-[[variant]]
-name = "faster"
-policy = "blind:12"
+name = "float"
+policy = "highway"
 [[condition]]
 name = "ideal"
 latency = "none"
@@ -58,7 +55,7 @@ USES = (
     f"search highway {FRAMES} --max-mb 5 -o found.toml",
     f"compare highway small.onnx {FRAMES}",
     f"profile highway {FRAMES} -o trace.json --samples 20",
-    "evaluate blind --routes 1 -o driven",
+    "evaluate highway --routes 1 -o driven",
     "evaluate small.onnx --check",
     "score real",
     "study study.toml -o study",

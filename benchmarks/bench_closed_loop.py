@@ -38,6 +38,7 @@ from me2e_compress.metrics.scores import Scores, score
 from me2e_compress.simulator.routes import Route, load_routes, pick_routes
 from me2e_compress.workflows.result import SILENT
 from models.driver.expert import Expert
+from models.driver.expert.blind import BlindDriver
 
 EXPERT = "models.driver.expert:Expert"
 LATENCIES_S = (0.0, 0.05, 0.15, 0.25, 0.45, 0.85)
@@ -155,9 +156,10 @@ def bench_drivers(out: Path, workers: int) -> None:
     columns = ["DS", "room", "SR", *ABILITIES, "DE", "DC", "DE b2d", "DC b2d"]
     print("| driver | " + " | ".join(columns) + " |")
     print("|---" * (len(columns) + 1) + "|")
-    for name in (EXPERT, "blind:4", "blind:8", "blind:12"):
-        folder = out / name.replace(":", "-")
-        found, _ = evaluate(folder, driver_named(name), routes, workers)
+    drivers = {"expert": driver_named(EXPERT)}
+    drivers |= {f"blind-{speed}": BlindDriver(speed) for speed in (4, 8, 12)}
+    for name, driver in drivers.items():
+        found, _ = evaluate(out / name, driver, routes, workers)
         each = [found.each_ability[ability] for ability in ABILITIES]
         shown = (
             *(found.driving_score, found.safety.room_kept, found.success_rate, *each),
@@ -205,7 +207,7 @@ def bench_throughput(out: Path, _: int) -> None:
     routes = pick_routes(load_routes(), "22")
     light = model_of(1, out / "light.onnx")
     drivers = {
-        "blind:8, no cameras": driver_named("blind:8"),
+        "blind:8, no cameras": BlindDriver(),
         "expert, no cameras": driver_named(EXPERT),
         "expert and six cameras 96x160": ShadowDriver(light),
     }
@@ -248,8 +250,8 @@ def bench_resume(out: Path, workers: int) -> None:
         os.killpg(running.pid, signal.SIGKILL)
     before = len(list(folder.glob("routes/*.json")))
     routes = pick_routes(load_routes(), "44")
-    evaluate(folder, driver_named("blind"), routes, workers)
-    evaluate(whole, driver_named("blind"), routes, 1)
+    evaluate(folder, BlindDriver(), routes, workers)
+    evaluate(whole, BlindDriver(), routes, 1)
     driven = [row["route"] for row in log_of(folder)]
     same = all(
         (folder / p.relative_to(whole)).read_bytes() == p.read_bytes()
@@ -281,7 +283,7 @@ def main() -> None:
     given.out.mkdir(parents=True, exist_ok=True)
     if given.drive_resume:
         routes = pick_routes(load_routes(), "44")
-        evaluate(given.out / "resume", driver_named("blind"), routes, given.workers)
+        evaluate(given.out / "resume", BlindDriver(), routes, given.workers)
         return
     for name in given.part or PARTS:
         print(f"\n## {name}\n")

@@ -30,7 +30,6 @@ from typing import Self
 
 from me2e_compress.driving.latency import FixedLatency
 from me2e_compress.evaluators.contract import Drive
-from me2e_compress.evaluators.highway.blind import Blind
 from me2e_compress.evaluators.highway.driven_frames import propose, seed_of
 from me2e_compress.evaluators.highway.runner import Listeners, drive
 from me2e_compress.metrics.measure import Estimate, mean_estimate
@@ -45,6 +44,7 @@ from me2e_compress.simulator.routes import (
 from me2e_compress.simulator.scene import EventKind, Scene, SignalKind, SignalState
 from me2e_compress.simulator.world import World
 from me2e_compress.study.drive_record import DriveRecord
+from models.driver.expert.blind import Blind
 from models.driver.expert.privileged import privileged
 
 NEAR_M, MOVING_MPS = 80.0, 0.3

@@ -46,16 +46,15 @@ compress seven.onnx --scheme full --target tensorrt --ranges seven.ranges.json \
 --method percentile:99.9 -o seven.ranges.onnx
 calibrate highway frames -o ranges.json
 plan highway --scheme prediction -o prediction.plan.json
-evaluate blind --routes 44 -o blind
-evaluate blind:9 --routes 2 --latency trace{trace=trace.json,in_order=true} \
--o blind-in-order
+evaluate highway --routes 2 --latency trace{trace=trace.json,in_order=true} \
+-o highway-in-order
 evaluate highway --routes HardBreakRoute_R2_1 --render HardBreakRoute_R2_1 -o rendered
 evaluate highway --routes 20 -o highway
 evaluate highway --routes HazardAtSideLane_R2_0,Accident_R2_0 --latency fps:2 \
 -o highway-fps
 evaluate highway --routes HazardAtSideLane_R2_0,Accident_R2_0 --latency \
 trace:trace.json --seed 3 --weather fog_m=80,noise=0.02,dropped=BACK -o highway-trace
-score blind highway highway-fps highway-trace --json > scores.json
+score highway highway-fps highway-trace --json > scores.json
 study study.toml -o study
 """
 """Command lines; what follows `>` is the file that gets the standard output."""

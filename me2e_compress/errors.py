@@ -121,6 +121,7 @@ FORMER = {
     "study road": "the key road is gone since 0.3.0: there is one road, with traffic",
     "study record.road": "the key road is gone since 0.3.0: there is one road",
     "model expert": f"expert {_NOW} models.driver.expert:Expert, in the repository",
+    "model blind": f"blind {_NOW} models.driver.expert:Blind, in the repository",
     "policy highway-2": f"highway-2 {_NOW} highway",
     "model highway-2": f"highway-2 {_NOW} highway",
     "pass static-geometry": f"static-geometry {_NOW} freeze-inputs, with --frames",

@@ -153,10 +153,14 @@ def test_modules_of_extras_are_what_the_project_says() -> None:
 def commands() -> Mapping[str, tuple[str, ...]]:
     """Return words that need an extra, by the module of it that is broken."""
     return {
-        "highway_env": ("evaluate", "blind", "--routes", "1", "-o", "out"),
+        "highway_env": ("evaluate", "highway", "--routes", "1", "-o", "out"),
         "cv2": ("evaluate", "highway", "--routes", "1", "-o", "out"),
         "jinja2": ("study", "smoke", "-o", "out", "--dry-run"),
-        "ray": (*("evaluate", "blind", "--routes", "1", "--engine", "ray"), "-o", "o"),
+        "ray": (
+            *("evaluate", "highway", "--routes", "1", "--engine", "ray"),
+            "-o",
+            "o",
+        ),
         "tensorrt_rtx": ("lint", "highway", "--target", "tensorrt", "--trt-check"),
     }
 

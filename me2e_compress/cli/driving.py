@@ -32,7 +32,7 @@ def evaluate(
     could not drive.
 
     Args:
-        policy: M.onnx, highway, blind:8, onnx{path=M.onnx,...}; see list
+        policy: M.onnx, highway, onnx{path=M.onnx,...}; see list
         output: the results folder
         check: say what fits and what is missing, drive nothing
     """

@@ -80,7 +80,6 @@ POLICIES: Registry[Driver] = Registry(
     "me2e_compress.policies",
     EvaluationError,
     {
-        "blind": f"{_HIGHWAY}:BlindDriver",
         "onnx": f"{_HIGHWAY}:OnnxDriver",
         "highway": f"{_SHIPPED}:ShippedDriver",
         "python": "me2e_compress.driving.policies:PythonDriver",
@@ -152,7 +151,7 @@ def driver_named(
     """Build the driver of a text: a policy with its options, or an ONNX file's path.
 
     Args:
-        text: ``blind:8``, ``onnx{path=M.onnx, adapter=A.toml}``,
+        text: ``onnx{path=M.onnx, adapter=A.toml}``,
             ``highway`` for the driver that ships, the name of another package's policy,
             ``package.module:function`` for a Python function's result, or else a path.
         adapter: TOML file that adapts a model; a policy without models ignores it.

@@ -63,7 +63,8 @@ def model_path(text: str | Path, beside: Path = Path()) -> Path:
     if str(text) in SHIPPED:
         return shipped(str(text))
     line = f"{text}: no such file; models that ship: {', '.join(SHIPPED)}"
-    gone = FORMER.get(f"model {text}", FORMER.get(f"stack {text}", line))
+    name = str(text).partition(":")[0]
+    gone = FORMER.get(f"model {name}", FORMER.get(f"stack {name}", line))
     raise GraphError(gone)
 
 

@@ -116,8 +116,8 @@ def evaluate(
 ) -> EvaluateResult:
     """Drive a policy over routes of an evaluator; run again, it goes on.
 
-    The policy is an ONNX file, the name of a model that ships, or ``blind:MPS``; None
-    for an evaluator that drives none.
+    The policy is an ONNX file, the name of a model that ships, or another
+    policy; None for an evaluator that drives none.
 
     Raises:
         EvaluationError: A policy, evaluator or option does not exist or fit, the policy

@@ -18,7 +18,6 @@ from pydantic import TypeAdapter
 
 from me2e_compress.driving.realtime import HeldControl
 from me2e_compress.errors import EvaluationError
-from me2e_compress.evaluators.highway.blind import SPEEDS_MPS, Blind
 from me2e_compress.evaluators.highway.controller import AnchoredPlan
 from me2e_compress.evaluators.highway.driven_frames import propose, seed_of
 from me2e_compress.evaluators.highway.episode_recorder import EpisodeRecorder
@@ -40,6 +39,7 @@ from me2e_compress.simulator.traffic.stage import TRAFFIC
 from me2e_compress.simulator.world import World
 from me2e_compress.version import __version__
 from models.driver.expert import Expert
+from models.driver.expert.blind import SPEEDS_MPS, Blind
 
 ENDS_ONLY = (
     InfractionKind.ROUTE_TIMEOUT,

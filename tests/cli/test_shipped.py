@@ -85,7 +85,7 @@ def test_evaluate_drives_it_and_names_everything_that_could_drive(
     found = cli.document(f"evaluate {name} --routes routes.json -o results")
     assert found["routes"]["driven"] == 1
     said = cli.refused("evaluate nobody -o others")
-    could = "models that ship: highway; policies: blind, onnx"
+    could = "models that ship: highway; policies: onnx, highway"
     assert f"nobody: no such file; {could}" in said
 
 

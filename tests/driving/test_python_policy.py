@@ -11,16 +11,16 @@ import pytest
 from me2e_compress.driving.contract import Policy
 from me2e_compress.driving.policies import Driver, PythonDriver, driver_named, opened
 from me2e_compress.errors import EvaluationError
-from me2e_compress.evaluators.highway.blind import Blind
-from me2e_compress.evaluators.highway.drivers import BlindDriver, OnnxDriver
+from me2e_compress.evaluators.highway.drivers import OnnxDriver
 from me2e_compress.testing import check_policy
+from models.driver.expert.blind import Blind, BlindDriver
 from tests.installed import install
 
 Write = Callable[[str], str]
 
 BLIND = """
-from me2e_compress.evaluators.highway.blind import Blind
-from me2e_compress.evaluators.highway.drivers import BlindDriver
+from models.driver.expert.blind import Blind
+from models.driver.expert.blind import BlindDriver
 
 def make():
     return Blind(5.0)

@@ -246,7 +246,7 @@ def test_the_study_of_the_documents_is_one(tmp_path: Path) -> None:
 
     study = load_study(write(tmp_path, whole))
 
-    assert [variant.name for variant in study.variants] == ["blind", "float", "int8"]
+    assert [variant.name for variant in study.variants] == ["float", "int8"]
     assert study.conditions[1].traced
 
     folders = re.compile(r"^(frames|held_out) = .*$", re.MULTILINE)

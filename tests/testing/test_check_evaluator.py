@@ -10,11 +10,12 @@ from me2e_compress.driving.policies import Driver
 from me2e_compress.errors import VerificationError
 from me2e_compress.evaluators import Drive, Evaluator
 from me2e_compress.evaluators.contract import Listener
-from me2e_compress.evaluators.highway.drivers import BlindDriver, OnnxDriver
+from me2e_compress.evaluators.highway.drivers import OnnxDriver
 from me2e_compress.evaluators.highway.evaluator import Highway
 from me2e_compress.metrics.episode import Episode
 from me2e_compress.simulator.routes import save_routes
 from me2e_compress.testing import check_evaluator
+from models.driver.expert.blind import BlindDriver
 from tests.evaluators.highway.drivers import EXIT, straight_on
 from tests.evaluators.lanes import Lanes
 from tests.metrics.drives import drive as by_hand

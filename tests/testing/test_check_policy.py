@@ -17,10 +17,11 @@ from me2e_compress.driving.contract import (
 )
 from me2e_compress.driving.policies import Driver
 from me2e_compress.errors import VerificationError
-from me2e_compress.evaluators.highway.drivers import BlindDriver, OnnxDriver
+from me2e_compress.evaluators.highway.drivers import OnnxDriver
 from me2e_compress.simulator.scene import Control
 from me2e_compress.simulator.world import World
 from me2e_compress.testing import check_policy
+from models.driver.expert.blind import BlindDriver
 from tests.evaluators.highway.drivers import straight_on
 
 DENSE = np.array([0.1, 0.2])

@@ -1,4 +1,4 @@
-"""Drivers of this evaluator: the blind one, an ONNX file.
+"""The driver of an ONNX file.
 
 A driver imports its simulator or runtime only when it is opened.
 """
@@ -15,31 +15,6 @@ from me2e_compress.errors import EvaluationError
 from me2e_compress.graph import load, sha256_of
 from me2e_compress.graph.modules.module_map import ModuleMap
 from me2e_compress.runtime.providers import CPU, Provider
-
-
-@dataclass(frozen=True)
-class BlindDriver(Driver):
-    """Follows the centre of the route at one speed, whatever stands there.
-
-    Attributes:
-        speed_mps: The speed in m/s; None for 8.
-
-    Raises:
-        EvaluationError: A speed that is not positive.
-    """
-
-    name: ClassVar[str] = "blind"
-    speed_mps: float | None = None
-
-    def __post_init__(self) -> None:
-        if self.speed_mps is not None and not 0.0 < self.speed_mps < float("inf"):
-            raise EvaluationError(f"blind: {self.speed_mps:g} is not a speed in m/s")
-
-    def open(self) -> Policy:
-        """Return the blind driver."""
-        from me2e_compress.evaluators.highway.blind import Blind
-
-        return Blind() if self.speed_mps is None else Blind(self.speed_mps)
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,6 @@ import numpy.typing as npt
 
 from me2e_compress.driving.contract import EgoKinematics, Observation, Policy
 from me2e_compress.driving.input_sources import can_bus_between
-from me2e_compress.errors import EvaluationError
 from me2e_compress.simulator.camera_rig import CameraRig
 from me2e_compress.simulator.cameras.renderer import Cameras
 from me2e_compress.simulator.plane_geometry import RoutePath
@@ -106,16 +105,6 @@ def road_users(scene: Scene) -> npt.NDArray[np.float64]:
     """Return [N, 2] positions of road users, metres in the ego frame."""
     found = [(each.x, each.y) for each in scene.actors if each.kind in ROAD_USERS]
     return scene.ego.seen(*np.array(found, np.float64).reshape(-1, 2).T)
-
-
-def scene_and_world(observation: Observation, who: str) -> tuple[Scene, World]:
-    """Return scene and world, which only privileged policies of highway get."""
-    scene, world = observation.scene, observation.world
-    if isinstance(scene, Scene) and isinstance(world, World):
-        return scene, world
-    raise EvaluationError(
-        f"{who} needs a highway-env world, and the observation has none"
-    )
 
 
 def can_bus_of(ego: Ego, last: Ego | None) -> npt.NDArray[np.float32]:

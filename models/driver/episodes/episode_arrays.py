@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from me2e_compress.evaluators.highway.controller import beyond
 from me2e_compress.evaluators.highway.observe import can_bus_of
 from me2e_compress.simulator.camera_rig import CameraRig
 from me2e_compress.simulator.plane_geometry import Floats, RoutePath
@@ -25,6 +24,7 @@ from models.driver.episodes.jpeg import pictures
 from models.driver.episodes.recording_policy import LabelledFrame, cameras_of
 from models.driver.expert.expert_policy import decide
 from models.driver.expert.privileged import Privileged
+from models.driver.expert.reentry import beyond
 
 SIGNALS = 4
 SIGNAL_COLUMNS = 8

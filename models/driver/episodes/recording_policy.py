@@ -19,10 +19,7 @@ from me2e_compress.driving.contract import (
     RouteInfo,
     six_waypoints,
 )
-from me2e_compress.evaluators.highway.observe import (
-    ObservationBuilder,
-    scene_and_world,
-)
+from me2e_compress.evaluators.highway.observe import ObservationBuilder
 from me2e_compress.runtime.plan_adapter import Trajectory
 from me2e_compress.simulator.camera_rig import CameraRig
 from me2e_compress.simulator.cameras.ground import paint_texture
@@ -36,7 +33,7 @@ from models.driver.expert.expert_policy import (
     ceiling,
     decide,
 )
-from models.driver.expert.privileged import Phase, privileged
+from models.driver.expert.privileged import Phase, privileged, scene_and_world
 from models.driver.expert.visibility import seen
 
 BURST_S = (0.4, 1.5)

@@ -6,8 +6,6 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from me2e_compress.driving.contract import Observation, Plan, RouteInfo
-from me2e_compress.evaluators.highway.controller import slope_of
-from me2e_compress.evaluators.highway.observe import scene_and_world
 from me2e_compress.simulator.plane_geometry import Floats, RoutePath
 from me2e_compress.simulator.scene import Scene, SignalKind, SignalState
 from models.driver.expert.forecast import (
@@ -27,7 +25,13 @@ from models.driver.expert.futures import (
     rule_cost,
     sample,
 )
-from models.driver.expert.privileged import Phase, Privileged, privileged
+from models.driver.expert.privileged import (
+    Phase,
+    Privileged,
+    privileged,
+    scene_and_world,
+)
+from models.driver.expert.reentry import slope_of
 from models.driver.expert.visibility import seen
 
 LATERAL_MPS2 = 2.2

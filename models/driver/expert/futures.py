@@ -8,11 +8,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from me2e_compress.evaluators.highway.controller import beyond, reentry
 from me2e_compress.simulator.plane_geometry import Command, Floats, RoutePath
 from me2e_compress.simulator.scene import Ego
 from me2e_compress.simulator.traffic.bodies import ACCELERATION_LAG_S
 from models.driver.expert.forecast import TIMES_S, Flags, Forecast
+from models.driver.expert.reentry import beyond, reentry
 
 NUDGES_M = (0.5, -0.5, 1.0, -1.0)
 """Small shifts within the drivable width: past a door, away from a car that cuts the

@@ -5,8 +5,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from me2e_compress.driving.contract import Observation
+from me2e_compress.errors import EvaluationError
 from me2e_compress.simulator.plane_geometry import Floats
-from me2e_compress.simulator.scene import SignalState
+from me2e_compress.simulator.scene import Scene, SignalState
 from me2e_compress.simulator.traffic.bodies import Car, Walker
 from me2e_compress.simulator.world import World
 
@@ -92,4 +94,14 @@ def privileged(world: World, actors: Collection[int] | None = None) -> Privilege
             if actors is None or body.id in actors
         ),
         tuple(Phase(sign.id, sign.line_s or 0.0, sign.state) for sign in signs),
+    )
+
+
+def scene_and_world(observation: Observation, who: str) -> tuple[Scene, World]:
+    """Return scene and world, which only privileged policies of highway get."""
+    scene, world = observation.scene, observation.world
+    if isinstance(scene, Scene) and isinstance(world, World):
+        return scene, world
+    raise EvaluationError(
+        f"{who} needs a highway-env world, and the observation has none"
     )

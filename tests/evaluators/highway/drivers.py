@@ -19,8 +19,8 @@ from me2e_compress.driving.contract import (
     RouteInfo,
 )
 from me2e_compress.driving.policies import Driver
-from me2e_compress.evaluators.highway.blind import Blind
 from me2e_compress.simulator.routes import Route
+from models.driver.expert.blind import Blind
 
 CROSSING = Route("crossing", "DynamicObjectCrossing", "Emergency_Brake", 1)
 PARKED = Route("parked", "ParkedObstacle", "Overtaking", 1)

@@ -9,12 +9,12 @@ from me2e_compress.driving.latency import TraceLatency
 from me2e_compress.driving.policies import Driver
 from me2e_compress.evaluators import Drive
 from me2e_compress.evaluators.contract import Engine
-from me2e_compress.evaluators.highway.drivers import BlindDriver
 from me2e_compress.evaluators.highway.evaluator import Highway
 from me2e_compress.evaluators.results import drive_routes
 from me2e_compress.metrics.episode import Episode
 from me2e_compress.simulator.routes import Route
 from me2e_compress.workflows.result import SILENT, Listener
+from models.driver.expert.blind import BlindDriver
 from tests.evaluators.highway.drivers import ROUTES
 
 BLIND = BlindDriver()

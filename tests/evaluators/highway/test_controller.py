@@ -8,7 +8,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from me2e_compress.driving.contract import PedalsAndWheel, Trajectory
-from me2e_compress.evaluators.highway.blind import centre_plan
 from me2e_compress.evaluators.highway.controller import (
     AnchoredPlan,
     control_of,
@@ -22,6 +21,7 @@ from me2e_compress.simulator.bicycle import (
     steering_through,
 )
 from me2e_compress.simulator.plane_geometry import RoutePath
+from models.driver.expert.blind import centre_plan
 from tests.evaluators.highway.tiny_world import (
     DT_US,
     TinyWorld,

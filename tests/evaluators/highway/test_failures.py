@@ -22,6 +22,8 @@ from tests.command import contents
 from tests.evaluators.highway.drivers import CROSSING, EXIT, PARKED, MisbehavingDriver
 from tests.evaluators.highway.evaluations import driven, made_by
 
+BLIND = "models.driver.expert:Blind"
+
 
 def test_a_killed_run_goes_on_with_nothing_lost_or_repeated(tmp_path: Path) -> None:
     manifest, folder = tmp_path / "routes.json", tmp_path / "results"
@@ -29,9 +31,9 @@ def test_a_killed_run_goes_on_with_nothing_lost_or_repeated(tmp_path: Path) -> N
     save_routes(routes, manifest)
     program = (
         "import sys; from me2e_compress import EvaluateOptions, evaluate;"
-        "evaluate('blind:5', sys.argv[2], EvaluateOptions(routes=sys.argv[1]))"
+        "evaluate(sys.argv[3], sys.argv[2], EvaluateOptions(routes=sys.argv[1]))"
     )
-    command = [sys.executable, "-c", program, str(manifest), str(folder)]
+    command = [sys.executable, "-c", program, str(manifest), str(folder), BLIND]
     with subprocess.Popen(command, start_new_session=True) as running:
         written = folder / "routes"
         while len(list(written.glob("*.json")) if written.exists() else ()) < 1:
@@ -42,7 +44,7 @@ def test_a_killed_run_goes_on_with_nothing_lost_or_repeated(tmp_path: Path) -> N
     assert 1 <= len(finished) < len(routes)
 
     options = EvaluateOptions(routes=str(manifest))
-    evaluate("blind:5", folder, options)
+    evaluate(BLIND, folder, options)
     log = (tmp_path / "results.log").read_text().splitlines()
     logged = [json.loads(line)["route"] for line in log]
 
@@ -50,7 +52,7 @@ def test_a_killed_run_goes_on_with_nothing_lost_or_repeated(tmp_path: Path) -> N
     now = contents(folder)
     assert all(now[f"routes/{name}"] == data for name, data in finished.items())
     undisturbed = tmp_path / "undisturbed"
-    evaluate("blind:5", undisturbed, options)
+    evaluate(BLIND, undisturbed, options)
     assert contents(undisturbed) == now
 
 
@@ -135,7 +137,7 @@ def watch(event, given):
 sys.addaudithook(watch)
 """
 START = "import sys; from me2e_compress.cli import main; sys.exit(main())"
-WORDS = ("evaluate", "blind", "-o", "out", "--routes", "2", "--workers", "2")
+WORDS = ("evaluate", "highway", "-o", "out", "--routes", "2", "--workers", "2")
 
 
 @pytest.mark.slow

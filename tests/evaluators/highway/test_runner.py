@@ -12,7 +12,6 @@ import pytest
 from me2e_compress.driving.contract import Observation, PedalsAndWheel, RouteInfo
 from me2e_compress.driving.latency import FixedLatency, parse_latency
 from me2e_compress.evaluators import Drive
-from me2e_compress.evaluators.highway.blind import Blind
 from me2e_compress.evaluators.highway.drivers import OnnxDriver
 from me2e_compress.evaluators.highway.observe import can_bus_of, road_users
 from me2e_compress.evaluators.highway.runner import EndingRules, Listeners, drive
@@ -23,6 +22,7 @@ from me2e_compress.simulator.pictures.route import Moment
 from me2e_compress.simulator.routes import load_routes, pick_routes
 from me2e_compress.simulator.scene import ActorKind, Ego
 from me2e_compress.simulator.world import EndReason, World
+from models.driver.expert.blind import Blind
 from tests.evaluators.highway.drivers import CROSSING, EXIT, GREEN, PARKED, Misbehaving
 
 IDEAL = Drive()

@@ -2,7 +2,6 @@
 
 from me2e_compress.driving.latency import FixedLatency
 from me2e_compress.evaluators import Drive
-from me2e_compress.evaluators.highway.blind import Blind
 from me2e_compress.evaluators.highway.runner import drive
 from me2e_compress.metrics.episode import Infraction, InfractionKind
 from me2e_compress.simulator.routes import SCENARIO_ABILITIES, Parameter, Route
@@ -10,6 +9,7 @@ from me2e_compress.simulator.scenarios.roads import two_way
 from me2e_compress.simulator.scene import Control
 from me2e_compress.simulator.traffic.stage import Stage
 from me2e_compress.simulator.world import World
+from models.driver.expert.blind import Blind
 
 ENDS_ONLY = (
     InfractionKind.ROUTE_TIMEOUT,

@@ -4,6 +4,7 @@ A route that it solves tests nothing, so it is not admitted.
 """
 
 from dataclasses import dataclass, field
+from typing import ClassVar
 
 import numpy as np
 
@@ -12,12 +13,15 @@ from me2e_compress.driving.contract import (
     PLAN_STEP_US,
     Observation,
     Plan,
+    Policy,
     RouteInfo,
 )
-from me2e_compress.evaluators.highway.controller import beyond, reentry, slope_of
-from me2e_compress.evaluators.highway.observe import scene_and_world
+from me2e_compress.driving.policies import Driver
+from me2e_compress.errors import EvaluationError
 from me2e_compress.simulator.plane_geometry import RoutePath
 from me2e_compress.simulator.scene import Ego
+from models.driver.expert.privileged import scene_and_world
+from models.driver.expert.reentry import beyond, reentry, slope_of
 
 SPEEDS_MPS = (4.0, 8.0, 12.0)
 """Speeds at which the admission gate tries the blind driver."""
@@ -67,3 +71,26 @@ def centre_plan(ego: Ego, path: RoutePath, near_m: float, speed_mps: float) -> P
     offsets = reentry(travel[None], lateral, slope, np.zeros(1), length)[0]
     x, y, _ = beyond(path, s + travel, offsets)
     return ego.seen(x, y)
+
+
+@dataclass(frozen=True)
+class BlindDriver(Driver):
+    """Follows the centre of the route at one speed, whatever stands there.
+
+    Attributes:
+        speed_mps: The speed in m/s; None for 8.
+
+    Raises:
+        EvaluationError: A speed that is not positive.
+    """
+
+    name: ClassVar[str] = "blind"
+    speed_mps: float | None = None
+
+    def __post_init__(self) -> None:
+        if self.speed_mps is not None and not 0.0 < self.speed_mps < float("inf"):
+            raise EvaluationError(f"blind: {self.speed_mps:g} is not a speed in m/s")
+
+    def open(self) -> Policy:
+        """Return the blind driver."""
+        return Blind() if self.speed_mps is None else Blind(self.speed_mps)
