@@ -84,6 +84,7 @@ FORMER = {
     "study like": f"like {_NOW} a study with keys of its own",
     "study questions": f"questions {_NOW} benchmarks/paper/questions.toml",
     "study report": f"report {_NOW} python -m benchmarks.paper of its folder",
+    "latency source agents": f"agents {_NOW} examples/third_party",
     "energy counter rapl": f"rapl {_NOW} examples/energy_counters",
     "energy counter ina3221": f"ina3221 {_NOW} examples/energy_counters",
     "--modelled-energy": f"--modelled-energy {_NOW} the MACs and MB of `inspect`",

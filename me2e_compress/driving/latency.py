@@ -122,7 +122,6 @@ LATENCY_SOURCES: Registry[LatencySource] = Registry(
         "trace": f"{_HERE}:TraceLatency",
         "measured": f"{_HERE}:MeasuredLatency",
         "limited": f"{_HERE}:LimitedLatency",
-        "agents": f"{_HERE}:AgentsLatency",
         "host-stage": f"{_HERE}:HostStageLatency",
     },
 )
@@ -333,7 +332,7 @@ def with_draws(
     return LATENCY_SOURCES.with_options(source, options) if options else source
 
 
-# Sources on top of others: a frame limiter, costs that depend on the scene. A latency
+# Sources on top of others: a frame limiter, costs that depend on the work. A latency
 # spike hurts most in a critical frame (the paper's finding on multi-frame stability),
 # but a recorded trace has its spikes anywhere. These put spikes where the work is; they
 # draw nothing themselves.
@@ -404,57 +403,6 @@ class LimitedLatency(LayeredLatency):
     def to_json(self) -> dict[str, Any]:
         """Return the period in microseconds, and the source below."""
         return {"limit_us": round(1e6 / self.fps), "of": self.source.to_json()}
-
-
-@dataclass(frozen=True)
-class AgentsLatency(LayeredLatency):
-    """Another source's latency plus a constant for every road user in view.
-
-    Jitter is that of the source below: a trace has its own.
-
-    Attributes:
-        source: The latency without anybody in view: another source, or its text.
-        per_agent_us: Microseconds for each road user in view.
-        range_m: How far the policy looks, from the centre of the ego to theirs.
-        fov_deg: Field of view, half of it on each side of straight ahead; 360 is all
-            round, as six cameras look.
-
-    Raises:
-        EvaluationError: An option is out of its range; in a drive, the simulator does
-            not tell where others are.
-    """
-
-    name: ClassVar[str] = "agents"
-    per_agent_us: int
-    range_m: float = 50.0
-    fov_deg: float = 360.0
-
-    def __post_init__(self) -> None:
-        if self.per_agent_us < 0:
-            raise EvaluationError(
-                f"latency agents: per_agent_us {self.per_agent_us}: must be 0 or more"
-            )
-        check_positive("agents: range_m", self.range_m)
-        if not 0.0 < self.fov_deg <= 360.0:
-            raise EvaluationError(
-                f"latency agents: fov_deg {self.fov_deg:g}: above 0, at most 360"
-            )
-
-    def layered(self, latency_us: int, facts: DecisionFacts) -> int:
-        """Charge for the road users in view."""
-        return latency_us + self.per_agent_us * self.in_view(facts)
-
-    def in_view(self, facts: DecisionFacts) -> int:
-        """Count the road users within range and field of view."""
-        if facts.agents_m is None:
-            raise EvaluationError(
-                "latency agents: what drives here does not tell where others are"
-            )
-        # within range and field of view
-        x, y = facts.agents_m.T
-        near = np.hypot(x, y) <= self.range_m
-        ahead = np.abs(np.arctan2(y, x)) <= np.radians(self.fov_deg) / 2
-        return int(np.count_nonzero(near & ahead))
 
 
 @dataclass(frozen=True)

@@ -42,7 +42,7 @@ class Condition:
         name: Follows the rules of a variant's name.
         latency: Latency of decisions, as for ``evaluate``: ``none``, ``fps:F``, or
             ``trace``, each model's own latencies, also within another source:
-            ``agents{source=trace, per_agent_us=3000}``.
+            ``limited{source=trace, fps=10}``.
         mean_of: Instead of a latency: every decision takes the mean of this drive,
             ``VARIANT.CONDITION``, whose condition comes earlier.
         in_order: Replay a trace in its order, which keeps bursts.

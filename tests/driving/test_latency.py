@@ -4,14 +4,12 @@ from itertools import islice
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from me2e_compress.driving.latency import (
     LATENCY_SOURCES,
-    AgentsLatency,
     DecisionFacts,
     FrameRate,
     LatencySource,
@@ -115,9 +113,7 @@ def test_a_route_does_not_depend_on_what_drove_before() -> None:
         ("limited{source=fps:5, fps=0}", "limited: fps 0 is not a positive number"),
         ("limited{source=often, fps=10}", "no latency source 'often'"),
         ("limited{source=10, fps=10}", "limited: source: Input should be an instance"),
-        ("agents{source=none, per_agent_us=-1}", "per_agent_us -1: must be 0 or more"),
-        ("agents{source=none, per_agent_us=1, fov_deg=0}", "fov_deg 0: above 0"),
-        ("agents{source=none, per_agent_us=1, range_m=inf}", "range_m inf is not a"),
+        ("agents{source=none, per_agent_us=1}", "agents is gone since 0.3.0: use exam"),
         ("host-stage{source=none, per_iteration_us=-2}", "a cost of -2 us"),
     ],
 )
@@ -165,10 +161,6 @@ def test_the_fingerprint_of_a_trace_is_its_samples() -> None:
     assert list(islice(other, 1)) == ["trace_sha256"]
 
 
-AROUND = np.array([(10.0, 0.0), (0.0, 30.0), (-5.0, 0.0), (60.0, 0.0)])
-"""Ahead, to the left, behind, and far ahead."""
-
-
 def charged(source: LatencySource, facts: DecisionFacts) -> int:
     return source.on_route("r")(facts)
 
@@ -187,25 +179,6 @@ def test_a_limiter_charges_the_longer_of_latency_and_period(
     assert charged(parse_latency(text), DecisionFacts(123_000)) == expected
 
 
-@pytest.mark.parametrize(
-    ("options", "in_view"),
-    [({}, 3), ({"fov_deg": 120.0}, 1), ({"range_m": 100.0}, 4), ({"range_m": 9.0}, 1)],
-)
-def test_agents_in_range_and_view_cost_extra(
-    options: dict[str, Any], in_view: int
-) -> None:
-    source = AgentsLatency(parse_latency("fps:10"), 3_000, **options)
-
-    assert charged(source, DecisionFacts(0, AROUND)) == 100_000 + 3_000 * in_view
-
-
-def test_a_simulator_that_does_not_tell_where_others_are() -> None:
-    source = parse_latency("agents{source=none, per_agent_us=1}")
-
-    with pytest.raises(EvaluationError, match="does not tell where others are"):
-        charged(source, DecisionFacts(0))
-
-
 def test_a_host_stage_is_charged_for_what_it_did() -> None:
     text = "host-stage{source=fps:10, per_iteration_us=500, per_cell_us=10,"
     source = parse_latency(f"{text} per_call_us=2000}}")
@@ -220,7 +193,7 @@ def test_a_host_stage_is_charged_for_what_it_did() -> None:
     [
         *("none", "fps:10", "fixed:3", "measured"),
         "limited{source=fps:20, fps=10}",
-        "agents{source=limited{source=measured, fps=30}, per_agent_us=3000}",
+        "host-stage{source=limited{source=measured, fps=30}, per_iteration_us=3000}",
         "host-stage{source=none, per_iteration_us=5}",
     ],
 )
@@ -229,12 +202,12 @@ def test_ours_have_the_form_of_a_latency_source(text: str) -> None:
 
 
 def test_options_of_a_trace_reach_it_through_layers() -> None:
-    text = "limited{source=agents{source=trace, per_agent_us=1}, fps=10}"
+    text = "limited{source=host-stage{source=trace, per_iteration_us=1}, fps=10}"
     source = with_draws(parse_latency(text), in_order=True, seed=3)
 
     assert source == parse_latency(
-        "limited{source=agents{source=trace{in_order=true, seed=3},"
-        " per_agent_us=1}, fps=10}"
+        "limited{source=host-stage{source=trace{in_order=true, seed=3},"
+        " per_iteration_us=1}, fps=10}"
     )
     assert source.lacks_trace
     assert not source.with_trace((1, 2), 3.0).lacks_trace

@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 
-from me2e_compress.driving.latency import AgentsLatency, LimitedLatency, TraceLatency
+from me2e_compress.driving.latency import HostStageLatency, LimitedLatency, TraceLatency
 from me2e_compress.driving.realtime import LatencyModel
 from me2e_compress.errors import Me2eError, StudyError
 from me2e_compress.manager import recipe
@@ -14,6 +14,8 @@ from me2e_compress.study import Condition, Study, Timing, Variant, run_study
 from me2e_compress.study.definition import FramesToRecord, StudyBlock
 from me2e_compress.study.drive_record import DriveRecord
 from me2e_compress.study.workload import held_frames, workload
+from tests.docs.pages import EXAMPLE
+from tests.installed import install
 from tests.study.conftest import BLIND, FASTER, IDEAL, ROUTES, SLOW, Here, Make
 
 
@@ -110,7 +112,7 @@ def test_a_timing_that_measures_nothing(numbers: tuple[int, int, float | None]) 
         ({"latency": "none", "weather": "hail=1"}, "weather option 'hail'"),
         ({"latency": "none", "latency_model": "lifo"}, "there are drop, fifo"),
         ({"latency": "trace", "seed": -1}, "seed -1: must be 0 or more"),
-        ({"latency": "agents{source=trace:t.json, per_agent_us=1}"}, "is a variant's"),
+        ({"latency": "limited{source=trace:t.json, fps=1}"}, "is a variant's"),
         ({"latency": "limited{source=measured, fps=10}"}, "a study knows none"),
         ({"latency": "measured"}, "none, fps:F and trace"),
         ({"latency": "trace:t.json"}, "none, fps:F and trace"),
@@ -146,14 +148,14 @@ def test_a_condition_that_names_one_that_is_not_there(
 
 
 def test_own_latencies_may_be_limited_and_grow_with_the_scene() -> None:
-    text = "agents{source=trace, per_agent_us=3000}"
+    text = "host-stage{source=trace, per_iteration_us=3000}"
     condition = Condition("busy", text, limit_fps=10.0, in_order=True, seed=5)
 
     found = condition.source(0).with_trace((70_000, 80_000), 2.0)
 
     trace = TraceLatency((70_000, 80_000), in_order=True, scale=2.0, seed=5)
     assert condition.traced
-    assert found == LimitedLatency(AgentsLatency(trace, 3_000), 10.0)
+    assert found == LimitedLatency(HostStageLatency(trace, 3_000), 10.0)
 
 
 def test_every_option_reaches_the_drive(make: Make, tmp_path: Path) -> None:
