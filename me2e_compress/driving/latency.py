@@ -8,7 +8,7 @@ import functools
 import hashlib
 import zlib
 from collections.abc import Callable
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from itertools import cycle
 from pathlib import Path
 from typing import Any, ClassVar, Self
@@ -134,26 +134,7 @@ def check_positive(what: str, value: float) -> None:
 
 
 @dataclass(frozen=True)
-class ConstantLatency(LatencySource):
-    """The same time for every decision: derive a class that says which."""
-
-    @property
-    @abc.abstractmethod
-    def period_us(self) -> int:
-        """Microseconds of a decision."""
-
-    def on_route(self, route: str) -> Charge:
-        """Charge the same on every route."""
-        period_us = self.period_us
-        return lambda _: period_us
-
-    def to_json(self) -> dict[str, Any]:
-        """Return the microseconds."""
-        return {"fixed_us": self.period_us}
-
-
-@dataclass(frozen=True)
-class FixedLatency(ConstantLatency):
+class FixedLatency(LatencySource):
     """The same time for every decision.
 
     Attributes:
@@ -169,26 +150,25 @@ class FixedLatency(ConstantLatency):
                 f"latency fixed: {self.latency_us} us: must be 0 or more"
             )
 
-    @property
-    def period_us(self) -> int:
-        """What was given."""
-        return self.latency_us
+    def on_route(self, route: str) -> Charge:
+        """Charge the same on every route."""
+        return lambda _: self.latency_us
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the microseconds."""
+        return {"fixed_us": self.latency_us}
 
 
 @dataclass(frozen=True)
-class NoLatency(ConstantLatency):
+class NoLatency(FixedLatency):
     """No time at all: the ideal."""
 
     name: ClassVar[str] = "none"
-
-    @property
-    def period_us(self) -> int:
-        """Nothing."""
-        return 0
+    latency_us: int = field(default=0, init=False)
 
 
 @dataclass(frozen=True)
-class FrameRate(ConstantLatency):
+class FrameRate(FixedLatency):
     """The period of a frame rate for every decision: at 10 fps, 100 ms.
 
     Attributes:
@@ -196,15 +176,12 @@ class FrameRate(ConstantLatency):
     """
 
     name: ClassVar[str] = "fps"
+    latency_us: int = field(default=0, init=False)
     fps: float
 
     def __post_init__(self) -> None:
         check_positive("fps", self.fps)
-
-    @property
-    def period_us(self) -> int:
-        """The period of the rate."""
-        return round(1e6 / self.fps)
+        object.__setattr__(self, "latency_us", round(1e6 / self.fps))
 
 
 @dataclass(frozen=True)
