@@ -2,11 +2,10 @@
 
 For every step, Bench2Drive's agents write acceleration (m/s2, world), angular velocity
 (degrees per second), forward and right vector, location (m) and rotation (degrees), in
-CARLA's left-handed world. They write no time; it is inferred from the motion.
+CARLA's left-handed world. They write no time; it follows from the route's duration.
 """
 
 import re
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -26,13 +25,7 @@ INTERVALS_S = (0.05, 0.1, 0.2, 0.25, 0.5, 1.0)
 _PARTS = ("acceleration", "angular_velocity", "forward_vector", "right_vector")
 _LOCATION = "location"
 _STEP = re.compile(r"-?\d{1,15}")
-_LIKENESS, _SURE = 0.3, 0.95
-"""Correlations above which two signals describe the same motion, and above
-which no other source is asked."""
-_STOOD_M = 1.0
-_LEAST_MPS2, _LEAST_RADPS = 0.05, 0.01
-"""Root mean squares below which a signal is noise."""
-_AGREES, _EQUALS = float(np.log(2.5)), float(np.log(1.1))
+_EQUALS = float(np.log(1.1))
 
 Floats = npt.NDArray[np.float64]
 
@@ -99,72 +92,21 @@ class RecordedRoute:
     def interval_s(self, duration_s: float | None = None) -> float:
         """Return the seconds from one step to the next.
 
-        Position and acceleration describe the same motion, and so do heading and yaw
-        rate: where such a pair correlates, their ratio gives the interval. With a weak
-        correlation, as at 2 Hz, the route's duration divided by the steps decides if it
-        is near a usual interval and roughly agrees; it decides alone for an ego that
-        drove straight at constant speed. Without any of these, as for an ego that
-        stood, the agent's steps are taken as ticks.
+        That is the usual interval within 10 % of the route's duration divided by the
+        steps; without one, the agent's steps are taken as ticks.
         """
-        # the best correlated pair of signals
-        likeness, interval_s = max(self._correlations(), key=lambda pair: pair[0])
-        # the usual interval within 10 % of the duration's, if there is one
-        lasted = None
         if duration_s is not None:
             mean_s = duration_s / len(self.steps)
-            nearest = _nearest(mean_s)
-            lasted = nearest if abs(np.log(nearest / mean_s)) < _EQUALS else None
-        # no motion to infer from: duration, or the agent's steps
-        if likeness <= _LIKENESS:
-            stood = float(np.ptp(self.position_m, axis=0).max()) < _STOOD_M
-            if not stood and lasted is not None:
-                return lasted
-            between = np.diff(self.steps)
-            ticks = float(np.median(between)) if between.size else 1.0
-            return TICK_S * max(1.0, min(ticks, 20.0))
-        # a weak correlation yields to a duration that agrees
-        apart = abs(np.log(lasted / interval_s)) if lasted else np.inf
-        if lasted and likeness < _SURE and apart < _AGREES:
-            return lasted
-        return _nearest(interval_s)
-
-    def _correlations(self) -> Iterator[tuple[float, float]]:
-        """Compare pairs of signals that differ by a power of the interval.
-
-        Second differences of the position are dt^2 times the acceleration. CARLA's
-        belongs to the step that led to a moment, a computed one to the moment in
-        between, so both are tried. First differences of the heading are dt times the
-        yaw rate.
-        """
-        bends, turns = np.diff(self.position_m, 2, axis=0), np.diff(self.heading_rad)
-        between = (self.yaw_rate_radps[1:] + self.yaw_rate_radps[:-1]) / 2.0
-        for part in (slice(2, None), slice(1, -1)):
-            pulls = self.acceleration_mps2[part]
-            yield _correlation(bends.ravel(), pulls.ravel(), 0.5, _LEAST_MPS2)
-        yield _correlation(turns, between, 1.0, _LEAST_RADPS)
-
-
-def _correlation(
-    of: Floats, over: Floats, power: float, least: float
-) -> tuple[float, float]:
-    """Return the correlation of two signals, -1 to 1, and the interval they imply.
-
-    It follows from root mean squares, which are least sensitive to noise.
-    """
-    if not over.size:
-        return 0.0, 0.0
-    left, right = (float(np.sqrt((each * each).mean())) for each in (of, over))
-    if right < least or left == 0.0:
-        return 0.0, 0.0
-    return float((of * over).mean()) / (left * right), (left / right) ** power
+            nearest = min(INTERVALS_S, key=lambda each: abs(np.log(each / mean_s)))
+            if abs(np.log(nearest / mean_s)) < _EQUALS:
+                return nearest
+        between = np.diff(self.steps)
+        ticks = float(np.median(between)) if between.size else 1.0
+        return TICK_S * max(1.0, min(ticks, 20.0))
 
 
 def _lengths(vectors: Any) -> Floats:
     return np.asarray(np.hypot(vectors[:, 0], vectors[:, 1]))
-
-
-def _nearest(interval_s: float) -> float:
-    return min(INTERVALS_S, key=lambda each: abs(np.log(each / interval_s)))
 
 
 def read_recording(raw: object) -> RecordedRoute:

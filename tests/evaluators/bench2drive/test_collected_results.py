@@ -335,7 +335,7 @@ def test_recordings_in_both_folders_are_one_and_may_lie_apart(tmp_path: Path) ->
     results, saved = tmp_path / "results", tmp_path / "saved"
     for folder in (results, saved):
         write(folder / "r.json", checkpoint(GOOD))
-    write(saved / NAME / "m.json", recording(25, 0.5))
+    write(saved / NAME / "m.json", recording(25, 0.5, every=10))
 
     for place in (saved, results):
         found = Bench2DriveResults(place, saved).collect()

@@ -1,7 +1,6 @@
 import math
 from typing import Any
 
-import numpy as np
 import pytest
 
 from me2e_compress.evaluators.bench2drive.recordings import (
@@ -165,41 +164,24 @@ def test_a_turn_to_the_right_is_clockwise() -> None:
     assert second.steering_rad is None
 
 
-def brake(interval_s: float) -> Json:
-    """Straight ahead from 20 m/s with an acceleration that wavers."""
-    raw = recording(steps=80, yaw_degps=0.0)
-    times = interval_s * np.arange(80)
-    places = 20.0 * times - 2.0 * np.sin(times)
-    for step, place, pull in zip(
-        raw.values(), places, 2.0 * np.sin(times), strict=True
-    ):
-        step["location"] = [float(place), 0.0, 0.0]
-        step["acceleration"] = [float(pull), 0.0, 9.8]
-    return raw
-
-
-@pytest.mark.parametrize("interval_s", [0.05, 0.1, 0.5])
-def test_the_rate_follows_from_the_motion_or_from_braking_alone(
-    interval_s: float,
+@pytest.mark.parametrize(
+    ("every", "duration_s", "interval_s"),
+    [
+        (1, 40 * 0.5, 0.5),
+        (1, 40 * 0.11, 0.1),
+        # near no usual interval: the steps are ticks
+        (1, 40 * 0.14, 0.05),
+        (10, 1000.0, 0.5),
+        (10, None, 0.5),
+        (90, None, 1.0),
+    ],
+)
+def test_the_rate_follows_from_the_duration_or_from_the_steps(
+    every: int, duration_s: float | None, interval_s: float
 ) -> None:
-    read = read_recording(recording(interval_s=interval_s))
+    read = read_recording(recording(steps=40, every=every))
 
-    assert read.interval_s() == interval_s
-    # a duration of something else does not decide
-    assert read.interval_s(duration_s=1000.0) == interval_s
-    assert read_recording(brake(interval_s)).interval_s() == interval_s
-
-
-def test_a_duration_decides_at_one_speed() -> None:
-    steady = read_recording(recording(steps=40, interval_s=0.5, yaw_degps=0.0))
-
-    assert steady.interval_s(duration_s=40 * 0.5) == 0.5
-
-
-def test_for_who_stood_the_steps_are_ticks() -> None:
-    every_tenth = recording(steps=40, yaw_degps=0.0, speed_mps=0.0, every=10)
-
-    assert read_recording(every_tenth).interval_s(duration_s=40 * 0.1) == 0.5
+    assert read.interval_s(duration_s) == interval_s
     assert read_recording(recording(steps=1)).interval_s() == 0.05
 
 
