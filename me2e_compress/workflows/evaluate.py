@@ -8,7 +8,7 @@ from typing import cast
 from me2e_compress import graph
 from me2e_compress.display import table
 from me2e_compress.driving.adapter.adapter import Adapter
-from me2e_compress.driving.adapter.outputs import OutputUses, PortUse, input_uses
+from me2e_compress.driving.adapter.outputs import PortUse, input_uses, output_uses
 from me2e_compress.driving.contract import RouteInfo
 from me2e_compress.driving.latency import parse_latency
 from me2e_compress.driving.onnx_policy import OnnxPolicy, recurrent_of
@@ -206,20 +206,18 @@ class ModelCheck(Result):
     """Which ports of a policy fit, and what is missing.
 
     Attributes:
-        drives_by: the kind of its answer, in words; empty where nothing names one.
         inputs: of the graph, in order; empty if the policy is not a graph.
         outputs: of the graph, likewise.
         problems: why it could not drive; one line each.
     """
 
     policy: str
-    drives_by: str
     inputs: tuple[PortUse, ...]
     outputs: tuple[PortUse, ...]
     problems: tuple[str, ...]
 
     def shown(self) -> Shown:
-        """Return every port of the graph, whether it could drive, and by what."""
+        """Return every port of the graph, and whether it could drive."""
         ports = [("input", each) for each in self.inputs]
         ports += [("output", each) for each in self.outputs]
         rows = list[tuple[str, ...]]()
@@ -230,7 +228,7 @@ class ModelCheck(Result):
         columns = ("", "name", "shape", "type", "fed by, or used as")
         tables = [table(self.policy, columns, rows, words=5)] if rows else []
         if not self.problems:
-            return Shown(f"{self.policy} could drive, by {self.drives_by}", tables)
+            return Shown(f"{self.policy} could drive", tables)
         could_not = f"{self.policy} could not drive"
         error = EvaluationError(f"{could_not}: {self.problems[0]}")
         return Shown(could_not, tables, alerts=self.problems, error=error)
@@ -258,7 +256,7 @@ def check_model(
     # a policy without a graph has no ports: opening it is the check
     if not isinstance(driver, OnnxDriver):
         opened(driver)
-        return ModelCheck(named, "what its code answers", (), (), ())
+        return ModelCheck(named, (), (), ())
     # the ports are read without a policy, which would refuse at the first problem
     try_first(
         driver.path, driver.path.name, listener=listener, provider=options.runs_on
@@ -271,14 +269,14 @@ def check_model(
     except (GraphError, FramesError) as error:
         raise EvaluationError(str(error)) from error
     recurrent = recurrent_of(session, read)
-    fed, used = input_uses(session, read, recurrent), OutputUses.of(session, read)
-    outputs = used.ports(session, recurrent)
+    fed = input_uses(session, read, recurrent)
+    outputs, unread = output_uses(session, read, recurrent)
     # problems are listed once each; only a model without any is run
-    found = [each.problem for each in (*fed, *outputs) if each.problem]
-    problems = dict.fromkeys([*found, *used.problems])
+    found = [*(each.problem for each in fed), unread]
+    problems = dict.fromkeys(filter(None, found))
     if not problems:
         try:
             OnnxPolicy.of(session, read)  # it runs the model on zeros
         except (GraphError, FramesError, EvaluationError) as error:
             problems[str(error)] = None
-    return ModelCheck(named, used.drives_by, fed, outputs, tuple(problems))
+    return ModelCheck(named, fed, outputs, tuple(problems))

@@ -69,12 +69,11 @@ def test_every_port_and_its_part(tmp_path: Path) -> None:
         ("memory", "memory_out of the frame before"),
     ]
     assert [(each.name, each.use) for each in found.outputs] == [
-        ("wp", "plan: 4 waypoints 0.5 s apart"),
+        ("wp", "the plan"),
         ("action", None),
         ("memory_out", "fed back to memory"),
         ("value", None),
     ]
-    assert found.drives_by == "its plan"
 
 
 def test_all_that_is_missing_is_told_at_once(tmp_path: Path) -> None:

@@ -18,7 +18,7 @@ from me2e_compress.errors import EvaluationError, GraphError
 from me2e_compress.graph.modules.module_map import ModuleMap, Ports
 from me2e_compress.graph.recurrence import SETS, declared_pairs, recurrence, sides
 from me2e_compress.runtime.frames import Array
-from me2e_compress.runtime.plan_adapter import CONTRACT_STEP_S, PLAN, PlanAdapter
+from me2e_compress.runtime.plan_adapter import PLAN, PlanAdapter
 from me2e_compress.runtime.session import DTYPES, Session
 
 COMMAND = "command"
@@ -226,58 +226,26 @@ def input_uses(
     )
 
 
-@dataclass(frozen=True)
-class OutputUses:
-    """Which outputs drive, and how they are read.
+def output_uses(
+    session: Session, adapter: Adapter, recurrent: Mapping[str, str]
+) -> tuple[tuple[PortUse, ...], str]:
+    """List the outputs of a graph, in its order; say why none is the plan, or nothing.
 
-    ``drives_by`` names the plan in words, and is empty if there is none; ``uses`` is by
-    output; ``problems`` are names that do not exist.
+    The reason is one line, empty where the plan can be read.
     """
-
-    drives_by: str
-    uses: Mapping[str, str]
-    problems: tuple[str, ...]
-
-    @classmethod
-    def of(cls, session: Session, adapter: Adapter) -> Self:
-        """Find the uses of a graph's outputs."""
-        try:
-            found = ModelOutputs.of(session, adapter)
-        except (EvaluationError, GraphError) as error:
-            return cls("", {}, (str(error),))
-        output = found.plan.output
-        uses = {output: plan_words(found.plan, session.outputs[output].shape)}
-        if found.plan.scores is not None:
-            uses[found.plan.scores] = "scores, which pick the plan's mode"
-        return cls("its plan", uses, ())
-
-    def ports(
-        self, session: Session, recurrent: Mapping[str, str]
-    ) -> tuple[PortUse, ...]:
-        """List the outputs of the graph, in its order."""
-        back = {answer: f"fed back to {name}" for name, answer in recurrent.items()}
-        listed = list[PortUse]()
-        for name, port in session.outputs.items():
-            words = [each[name] for each in (self.uses, back) if name in each]
-            use = "; ".join(words) or None
-            listed.append(PortUse(name, port.shape, element_type(port.type), use))
-        return tuple(listed)
-
-
-def plan_words(plan: PlanAdapter, shape: Shape) -> str:
-    """Tell how a plan is read: how many waypoints, how far apart, by which mode."""
-    sides = plan.shape or shape
-    count = sides[-2] if len(sides) > 1 else None
-    step_s = CONTRACT_STEP_S if plan.step_s is None else plan.step_s
-    many = f"{count} waypoints" if isinstance(count, int) else "waypoints"
-    words = f"plan: {many} {step_s:g} s apart"
-    if plan.deltas:
-        words += ", as steps"
-    # how the mode is picked, if there are several
-    if plan.command_input is not None:
-        words += f", mode by {plan.command_input}"
-    elif plan.default_mode is not None and len(sides) > (
-        3 if plan.shape is None else 2
-    ):
-        words += f", mode {plan.default_mode}"
-    return words
+    uses = {answer: f"fed back to {name}" for name, answer in recurrent.items()}
+    problem = ""
+    try:
+        plan = ModelOutputs.of(session, adapter).plan
+    except (EvaluationError, GraphError) as error:
+        problem = str(error)
+    else:
+        uses[plan.output] = "the plan"
+        if plan.scores is not None:
+            uses[plan.scores] = "scores, which pick the plan's mode"
+    ports = session.outputs.items()
+    listed = (
+        PortUse(name, port.shape, element_type(port.type), uses.get(name))
+        for name, port in ports
+    )
+    return tuple(listed), problem
