@@ -116,21 +116,17 @@ def test_a_profile_is_a_latency_trace(cli: Cli, manifest: Path) -> None:
 
 JOULES = (
     "profile dense.onnx frames -o trace.json --samples 2 --by-module"
-    " --energy recorded:orin.json"
+    " --energy recorded:orin.csv"
 )
 
 
 def write_power(folder: Path, watts: float = 30.0) -> None:
     """Write six minutes at ten frames a second, ten seconds idle around them."""
-    seconds = range(381)
-    found = {
-        "time_s": list(seconds),
-        "frames": [10 * min(max(0, second - 10), 360) for second in seconds],
-        "watts": [watts if 10 < second <= 370 else 12.0 for second in seconds],
-        "device": "Orin NX",
-        "scope": "VDD_IN",
-    }
-    (folder / "orin.json").write_text(json.dumps(found))
+    rows = ["time_s,frames,watts"]
+    for second in range(381):
+        frames = 10 * min(max(0, second - 10), 360)
+        rows.append(f"{second},{frames},{watts if 10 < second <= 370 else 12.0}")
+    (folder / "orin.csv").write_text("\n".join(rows))
 
 
 def test_joules_are_shown_and_written(cli: Cli, dense: Path) -> None:
@@ -140,7 +136,7 @@ def test_joules_are_shown_and_written(cli: Cli, dense: Path) -> None:
     found = EnergyResult.load(dense / "trace.energy.json")
     assert found.j_per_frame == pytest.approx(3.0, rel=0.01)
     assert "energy: 3 J a frame (2.995 to 3.005)" in shown
-    assert "recorded-power-integrated of Orin NX (VDD_IN)" in shown
+    assert "recorded-power-integrated of orin.csv (as recorded)" in shown
     document = cli.document(JOULES)
     written = json.loads((dense / "trace.energy.json").read_text())
     assert written == IN_JSON | document["energy"]
@@ -150,7 +146,7 @@ def test_no_counter_is_no_figure_and_one_that_stands_still_is_an_error(
     cli: Cli, dense: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     Driver(monkeypatch, init=-pynvml.NVML_ERROR_LIBRARY_NOT_FOUND)
-    shown = cli.document(JOULES.replace("recorded:orin.json", "nvml"))
+    shown = cli.document(JOULES.replace("recorded:orin.csv", "nvml"))
     reason = "no energy counter answers (nvml: NVML Shared Library Not Found)"
     assert (shown["energy"]["joules"], shown["energy"]["reason"]) == (None, reason)
     assert f"energy: not measured: {reason}" in shown["verdict"]

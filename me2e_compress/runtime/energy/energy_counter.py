@@ -242,9 +242,8 @@ _COLUMNS = "time_s, frames, and joules or watts"
 class Recorded(EnergyCounter):
     """A file of the energy or the power that was recorded on the target device.
 
-    CSV with a header, or JSON with an array for each column: ``time_s``, ``frames``
-    (inferences done so far), and ``joules`` (so far) or ``watts`` (at that time). JSON
-    may add the texts ``device``, ``scope`` and ``counter``.
+    CSV with a header: ``time_s``, ``frames`` (inferences done so far), and ``joules``
+    (so far) or ``watts`` (at that time).
 
     Attributes:
         file: the recording.
@@ -257,27 +256,18 @@ class Recorded(EnergyCounter):
     def open(self) -> EnergyRecording:
         """Read the file and check it."""
         try:
-            columns, words = _read(self.file)
-            return _recording(columns, words, self.file.name)
+            return _recording(_read(self.file), self.file.name)
         except OSError as error:
             raise EnergyError(f"{self.file}: {error.strerror}") from error
-        except (documents.MalformedError, ValueError, TypeError, csv.Error) as error:
+        except (documents.MalformedError, ValueError, csv.Error) as error:
             raise EnergyError(
                 f"{self.file}: not an energy recording: {error}"
             ) from error
 
 
-def _read(path: Path) -> tuple[Mapping[str, Sequence[Any]], Mapping[str, str]]:
-    """Return the columns, and the texts that describe the device."""
+def _read(path: Path) -> Mapping[str, Sequence[str]]:
+    """Return the columns; every row must have as many values as the header."""
     content = documents.content(path)
-    # JSON: arrays are columns, texts describe the device.
-    if path.suffix.lower() == ".json":
-        record = documents.from_json(content)
-        if not isinstance(record, dict):
-            raise ValueError(f"an object with {_COLUMNS} is expected")
-        columns = {k: v for k, v in record.items() if isinstance(v, list)}
-        return columns, {k: v for k, v in record.items() if isinstance(v, str)}
-    # CSV: every row must have as many values as the header.
     rows = csv.reader(io.StringIO(content.decode("utf-8-sig")))
     header = [name.strip() for name in next(rows, [])]
     lines = [line for line in rows if line]
@@ -287,12 +277,10 @@ def _read(path: Path) -> tuple[Mapping[str, Sequence[Any]], Mapping[str, str]]:
                 f"line {number} has {len(line)} values, the header {len(header)}"
             )
     values = zip(*lines, strict=True) if lines else [()] * len(header)
-    return dict(zip(header, values, strict=True)), {}
+    return dict(zip(header, values, strict=True))
 
 
-def _recording(
-    columns: Mapping[str, Sequence[Any]], words: Mapping[str, str], name: str
-) -> EnergyRecording:
+def _recording(columns: Mapping[str, Sequence[str]], name: str) -> EnergyRecording:
     times, frames = _numbers(columns, "time_s"), _numbers(columns, "frames")
     if np.any(np.diff(times) <= 0):
         raise ValueError(f"time_s does not ascend at row {_row(np.diff(times) <= 0)}")
@@ -309,20 +297,11 @@ def _recording(
         raise ValueError(f"watts are negative at row {_row(found < 0)}")
     # Power is integrated to joules.
     joules = found if counts else integrated(times, found)
-    counter = words.get(
-        "counter", "recorded" if counts else "recorded-power-integrated"
-    )
-    return EnergyRecording(
-        times,
-        joules,
-        frames,
-        words.get("device", name),
-        words.get("scope", "as recorded"),
-        counter,
-    )
+    counter = "recorded" if counts else "recorded-power-integrated"
+    return EnergyRecording(times, joules, frames, name, "as recorded", counter)
 
 
-def _numbers(columns: Mapping[str, Sequence[Any]], name: str) -> Floats:
+def _numbers(columns: Mapping[str, Sequence[str]], name: str) -> Floats:
     if name not in columns:
         there = ", ".join(columns) or "none"
         raise ValueError(f"no column {name}; there are {there}, wanted: {_COLUMNS}")

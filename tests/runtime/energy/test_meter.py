@@ -1,6 +1,5 @@
 """The meter finds what a device takes, in turn, and refuses a counter that fails."""
 
-import json
 from dataclasses import replace
 from itertools import groupby
 from pathlib import Path
@@ -240,25 +239,15 @@ def written(path: Path, text: str) -> Recorded:
 
 
 @pytest.mark.parametrize("joules", [False, True])
-@pytest.mark.parametrize("name", ["r.csv", "r.json"])
-def test_joules_a_frame(name: str, joules: bool, tmp_path: Path) -> None:
+def test_joules_a_frame(joules: bool, tmp_path: Path) -> None:
     table = counting(columns()) if joules else columns()
-    text = as_csv(table) if name.endswith("csv") else json.dumps(table)
-    found = written(tmp_path / name, text).open().measured(CUT)
+    found = written(tmp_path / "r.csv", as_csv(table)).open().measured(CUT)
 
     assert found.j_per_frame == pytest.approx(3.0, rel=0.01)
     assert found.net_j_per_frame == pytest.approx(2.0, rel=0.02)
     assert found.idle_w == pytest.approx(10.0, rel=0.05)
     assert (found.windows, found.frames) == (13, 13 * 40)
     assert found.counter_step_s == pytest.approx(0.1)
-
-
-def test_json_says_what_was_recorded(tmp_path: Path) -> None:
-    words = {"device": "Orin NX", "scope": "VDD_IN", "counter": "tegrastats"}
-    text = json.dumps({**columns(), **words})
-    found = written(tmp_path / "r.json", text).open().measured(CUT)
-
-    assert (found.device, found.scope, found.counter) == tuple(words.values())
 
 
 def changed(column: str, row: int, value: float, *, joules: bool = False) -> str:
@@ -290,12 +279,6 @@ def test_what_is_no_recording_is_one_line(
         written(tmp_path / "r.csv", text).open()
 
 
-@pytest.mark.parametrize("text", ["[]", '{"time_s": 1}', '{"time_s": [{}]}'])
-def test_json_that_is_no_recording(text: str, tmp_path: Path) -> None:
-    with pytest.raises(EnergyError, match="not an energy recording"):
-        written(tmp_path / "r.json", text).open()
-
-
 @pytest.mark.parametrize(
     ("table", "schedule", "fault"),
     [
@@ -313,11 +296,11 @@ def test_a_recording_that_cannot_be_measured(
         recording.measured(schedule)
 
 
-@given(content=st.binary(max_size=60), ending=st.sampled_from(["csv", "json"]))
+@given(content=st.binary(max_size=60))
 def test_any_bytes_are_one_line(
-    content: bytes, ending: str, tmp_path_factory: pytest.TempPathFactory
+    content: bytes, tmp_path_factory: pytest.TempPathFactory
 ) -> None:
-    path = tmp_path_factory.getbasetemp() / f"any.{ending}"
+    path = tmp_path_factory.getbasetemp() / "any.csv"
     path.write_bytes(content)
 
     with pytest.raises(EnergyError) as caught:
