@@ -76,14 +76,6 @@ ENOUGH_FOR_A_BEND = 8
 UNSURE = 2e-4
 """Share by which the time between two updates of a counter may be off."""
 
-# Student's t, both sides 95 %, by degrees of freedom (any table of statistics); beyond,
-# it is nearly linear in their inverse.
-_T = (
-    *(12.706, 4.303, 3.182, 2.776, 2.571, 2.447, 2.365, 2.306, 2.262, 2.228),
-    *(2.201, 2.179, 2.160, 2.145, 2.131, 2.120, 2.110, 2.101, 2.093, 2.086),
-)
-_Z = 1.960
-
 
 @dataclass(frozen=True)
 class Window:
@@ -120,6 +112,8 @@ def estimate(windows: Sequence[Window], step_s: float) -> tuple[float, float, fl
     a standard deviation of power x sqrt(r (step - r)), for the worst r that the step,
     which is `UNSURE`, leaves open. At least :data:`FEWEST_WINDOWS` are needed.
     """
+    from scipy.special import stdtrit  # takes a moment to import
+
     frames = np.array([each.frames for each in windows], float)
     taken = np.array([each.taken_s for each in windows])
     watts = np.array([each.watts for each in windows])
@@ -134,16 +128,10 @@ def estimate(windows: Sequence[Window], step_s: float) -> tuple[float, float, fl
     beyond = np.minimum(from_whole + UNSURE * taken, step_s / 2)
     ends = watts / frames * np.sqrt(beyond * (step_s - beyond))
     variance = max(float(left @ left) / free, float(np.mean(ends**2)))
-    half = student_t(free) * math.sqrt(variance / len(windows))
+    quantile = float(stdtrit(free, 0.975))  # both sides 95 %
+    half = quantile * math.sqrt(variance / len(windows))
     mean = float(spent.mean())
     return mean, max(0.0, mean - half), mean + half
-
-
-def student_t(free: int) -> float:
-    """Return the two-sided 95 % quantile of Student's t distribution."""
-    if free <= len(_T):
-        return _T[free - 1]
-    return _Z + (_T[-1] - _Z) * len(_T) / free
 
 
 Finite: TypeAlias = Annotated[float, Field(allow_inf_nan=False)]
