@@ -68,7 +68,7 @@ FORMER = {
     "--seed": "--seed is of compress, evaluate and frames since 0.3.0",
     "--tensorrt-cache": f"--tensorrt-cache {_NOW} compress: int8 pairs have the scales",
     "--onnxruntime-table": f"--onnxruntime-table {_NOW} compress, whose file is int8",
-    "--against": f"--against {_NOW} plan -o of both: a decision is a line",
+    "--against": f"--against {_NOW} plan -o for both, and compare the two files",
     "--save-weights": f"score --save-weights {_NOW} one call that names all folders",
     "score --weights": f"--weights {_NOW} one call that names all folders",
     "--unproven": f"--unproven {_NOW} --verify-frames 0, which asks for no proof",
