@@ -71,10 +71,6 @@ def _length(value: ir.Value) -> int:
 class PluginKnowledge(Protocol):
     """Answers for the nodes that it knows."""
 
-    def knows(self, node: ir.Node) -> bool:
-        """Return whether it knows a node's operator."""
-        ...
-
     def infer(self, node: ir.Node) -> bool:
         """Write type and shape of what a node gives; return whether anything is new."""
         ...

@@ -48,19 +48,6 @@ def macs(node: ir.Node) -> int | None:
     return 0 if rule is None else rule(node)
 
 
-def why_uncounted(node: ir.Node) -> str:
-    """Name a node's operator, and why nobody knows its MACs."""
-    if is_plugin(node):
-        known = knowledge().knows(node)
-        return f"{node.op_type} ({'open shape' if known else 'plugin or function'})"
-    if node.op_type in _LOOPS:
-        return f"{node.op_type} (a loop)"
-    values = [each for each in (*node.inputs, *node.outputs) if each and each.name]
-    open_shape = any(static_shape(each) is None for each in values)
-    no_rule = node.op_type in _UNCOUNTED or not open_shape
-    return f"{node.op_type} ({'no rule' if no_rule else 'open shape'})"
-
-
 def macs_counter(model: ir.Model) -> Counter:
     """Return :func:`macs` for the nodes of a model: calls of its functions count too.
 

@@ -221,10 +221,6 @@ class DialectKnowledge:
     A node that its dialect refuses counts as unknown.
     """
 
-    def knows(self, node: ir.Node) -> bool:
-        """Return whether a dialect has the node's operator."""
-        return find(node) is not None
-
     def infer(self, node: ir.Node) -> bool:
         """Write the type and shape of a node's output; return whether any is new."""
         found = find(node)

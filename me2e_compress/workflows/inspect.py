@@ -17,7 +17,7 @@ from me2e_compress.graph.modules.module_map import ModuleMap
 from me2e_compress.graph.nodes import is_read
 from me2e_compress.graph.opset import read_as
 from me2e_compress.graph.recurrence import recurrent_inputs
-from me2e_compress.graph.summary import Port, macs_counter, why_uncounted
+from me2e_compress.graph.summary import Port, macs_counter
 from me2e_compress.manager import PassManager, recipe
 from me2e_compress.passes import Context
 from me2e_compress.passes.fix_shapes import FixShapes, open_dimensions
@@ -43,7 +43,7 @@ class InspectResult(Result):
         map: the module map that was used.
         rules: nodes placed, by rule of the map.
         macs: multiply-accumulates, those known; None if none is.
-        uncounted: nodes that ``macs`` leaves out, by reason.
+        uncounted: nodes that ``macs`` leaves out, by operator.
         open_dimensions: of the inputs; MACs depend on them.
         lowered: what was changed for onnxruntime; empty if nothing.
         hint: what the graph lacks; empty if nothing.
@@ -111,7 +111,7 @@ class InspectResult(Result):
         if not self.unknown_macs_nodes:
             return total
         known = "" if self.macs is None else f"at least {total}, "
-        found = [f"{count} {reason}" for reason, count in self.uncounted.items()]
+        found = [f"{count} {op_type}" for op_type, count in self.uncounted.items()]
         why = ", ".join(found[:_SHOWN]) + (", ..." if len(found) > _SHOWN else "")
         ways = ""
         if self.open_dimensions:
@@ -156,7 +156,8 @@ def inspect(model: str | Path, options: InspectOptions | None = None) -> Inspect
     items = tuple(_with_macs(item, costs) for item in items)
     # say what is unknown, and why
     count, fed_back, wrong = macs_counter(folded), dict[str, str](), ""
-    uncounted = [node for node in folded.graph.all_nodes() if count(node) is None]
+    nodes = folded.graph.all_nodes()
+    uncounted = Counter(node.op_type for node in nodes if count(node) is None)
     try:
         fed_back = recurrent_inputs(loaded)
     except GraphError as error:
@@ -178,7 +179,7 @@ def inspect(model: str | Path, options: InspectOptions | None = None) -> Inspect
         {str(rule): count for rule, count in placed.rules().items()},
         total if total or not unknown else None,
         unknown,
-        dict(Counter(map(why_uncounted, uncounted)).most_common()),
+        dict(uncounted.most_common()),
         tuple(open_dimensions(loaded)),
         read_as(loaded),
         "; ".join(filter(None, hints)),

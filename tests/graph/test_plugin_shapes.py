@@ -1,7 +1,6 @@
 import onnx_ir as ir
 
 from me2e_compress.graph import infer_shapes, macs, static_shape
-from me2e_compress.graph.summary import why_uncounted
 
 # the second sampler's queries come from what the first gives; neither has a shape
 CHAIN = """
@@ -28,6 +27,4 @@ def test_plugins_in_a_row_tell_what_they_give() -> None:
     assert model.graph[4].outputs[0].dtype == ir.DataType.FLOAT
     assert macs(model.graph[0]) == 4 * (4 * 2 * 2 * 2) * 3
     text = CHAIN.replace("float[1,8,2,3] v", "float[n,s,2,d] v")
-    node = ir.from_onnx_text(text).graph[0]
-    assert macs(node) is None
-    assert why_uncounted(node) == "MultiScaleDeformableAttnTRT (open shape)"
+    assert macs(ir.from_onnx_text(text).graph[0]) is None
