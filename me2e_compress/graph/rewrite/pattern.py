@@ -24,7 +24,6 @@ from me2e_compress.errors import GraphError
 from me2e_compress.graph import array_of, is_standard
 from me2e_compress.graph.nodes import (
     FLOATS,
-    LAYOUT_OPERATORS,
     Array,
     Numbers,
     is_close,
@@ -251,29 +250,6 @@ class Product(Pattern):
             yield Way(tuple(zip(self.factors, factors, strict=True)), nodes, inner)
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class Moved(Pattern):
-    """An expression, or its elements behind operators that only move them."""
-
-    source: Pattern
-    shared: bool
-
-    def ways(self, value: ir.Value) -> Iterator[Way]:
-        """Try the value itself, then what each operator before it moves."""
-        nodes: list[ir.Node] = []
-        inner: list[ir.Value] = []
-        source: ir.Value | None = value
-        while source is not None:
-            yield Way(((self.source, source),), tuple(nodes), tuple(inner))
-            node = maker(source, *LAYOUT_OPERATORS)
-            if node is None:
-                return
-            nodes.append(node)
-            if not self.shared:
-                inner.append(source)
-            source = node.inputs[0]
-
-
 def var(name: str, *, computed: bool = False) -> Variable:
     """Build the pattern of any value, or of any value that is not a constant."""
     return Variable(name, computed)
@@ -311,14 +287,6 @@ def op(
 def either(*options: Pattern) -> Either:
     """Build the pattern of one of several expressions, tried in this order."""
     return Either(options)
-
-
-def moved(source: Pattern, *, shared: bool = False) -> Moved:
-    """Build the pattern of an expression that Reshape and Transpose may have moved.
-
-    Others may read what these make if it is ``shared``.
-    """
-    return Moved(source, shared)
 
 
 def product(*factors: Pattern, scale: float = 1.0) -> Product:

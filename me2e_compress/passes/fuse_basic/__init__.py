@@ -18,10 +18,9 @@ __all__ = ["FuseBasic"]
 class FuseBasic(Pass):
     """Fuse patterns of standard operators into fewer standard operators.
 
-    Given:   Conv -> BatchNormalization -> Relu;  x * 0.5 * (1 + Erf(x / sqrt 2));
-             Reshape(x W + b) / c
+    Given:   Conv -> BatchNormalization -> Relu;  x * 0.5 * (1 + Erf(x / sqrt 2))
 
-    Result:  Conv -> Relu;  Gelu(x) where the opset has it;  Reshape(x (W / c) + b / c)
+    Result:  Conv -> Relu;  Gelu(x) where the opset has it
 
     Outputs are equal up to rounding. A residual Conv + Add stays, in the form that
     TensorRT and onnxruntime fuse with the next activation.
