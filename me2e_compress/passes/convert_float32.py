@@ -37,7 +37,7 @@ class ConvertFloat32(Pass):
         types = ElementTypes(model, HALF, FLOAT)
         nodes = [n for n in model.graph if types.inputs(n) or types.outputs(n)]
         retyping = Retyping(model, types, self.name)
-        retyping.run(nodes, keep_io=True)
+        retyping.run(nodes)
         # Casts that cast to what they read have become idle
         changes = retyping.changed + sum(
             rewrite.bypass(node.outputs[0], source)

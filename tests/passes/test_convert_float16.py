@@ -12,7 +12,7 @@ import pytest
 
 from me2e_compress import graph
 from me2e_compress.calibration.dataset import CalibrationSet
-from me2e_compress.errors import ModuleMapError, PreconditionError, ProviderError
+from me2e_compress.errors import PreconditionError, ProviderError
 from me2e_compress.graph.modules.module_map import ModuleMap
 from me2e_compress.manager.verification_inputs import relative
 from me2e_compress.passes import Context
@@ -67,27 +67,19 @@ def test_the_frames_run_on_the_provider(tmp_path: Path) -> None:
         ConvertFloat16().run(model, context)
 
 
-@pytest.mark.parametrize(
-    "step",
-    [
-        ConvertFloat16(keep_ops=("Conv",)),
-        ConvertFloat16(keep_modules=("backbone",)),
-        ConvertFloat16(keep_nodes=("/b*",)),
-    ],
-    ids=["ops", "modules", "nodes"],
-)
-def test_what_the_options_keep(step: ConvertFloat16) -> None:
+@pytest.mark.parametrize("pattern", ["Conv", "backbone", "/b*"])
+def test_what_the_option_keeps(pattern: str) -> None:
+    step = ConvertFloat16(keep=(pattern,))
     found = check_pass(step, conv_attention(), Context(MODULES))
 
     assert found.model.graph.initializers["w"].dtype == FLOAT
     assert found.model.graph.initializers["l"].dtype == HALF
 
 
-def test_no_such_module() -> None:
-    with pytest.raises(ModuleMapError):
-        check_pass(
-            ConvertFloat16(keep_modules=("wheels",)), conv_attention(), Context(MODULES)
-        )
+def test_what_keep_does_not_find_is_an_error() -> None:
+    step = ConvertFloat16(keep=("Conv", "wheels"))
+    with pytest.raises(PreconditionError, match="no node, operator or module is 'whe"):
+        check_pass(step, conv_attention(), Context(MODULES))
 
 
 def test_int8_takes_float16_scales_from_opset_19() -> None:
@@ -116,17 +108,15 @@ d (float[2] x, bool seen, float[2] w = {1, 2}, float[2] v = {3, 4}, float[2] u =
 }"""
 
 
-@pytest.mark.parametrize("keep_io", [True, False])
-def test_an_input_and_its_default_are_of_one_type(*, keep_io: bool) -> None:
-    half = check_pass(ConvertFloat16(keep_io=keep_io), bare(DEFAULTS, {})).model
+def test_an_input_and_its_default_are_of_one_type() -> None:
+    half = check_pass(ConvertFloat16(), bare(DEFAULTS, {})).model
     io = {value.name: value.dtype for value in half.graph.inputs}
-    x = np.array([1, 2], FLOAT.numpy() if keep_io else HALF.numpy())
+    x = np.array([1, 2], FLOAT.numpy())
 
     onnx.checker.check_model(ir.to_proto(half), full_check=True)
     y, z = compute(half, {"x": x, "seen": np.array(True)})
 
-    assert io["w"] == (FLOAT if keep_io else HALF)  # only float16 reads it
-    assert io["v"] == io["u"] == FLOAT  # so do an Exp, and a body
+    assert io["w"] == io["v"] == io["u"] == FLOAT
     np.testing.assert_allclose(y, [20, 48], rtol=2e-3)
     np.testing.assert_allclose(z, [4 + np.exp(3), 8 + np.exp(4)], rtol=2e-3)
 
@@ -198,12 +188,9 @@ def test_no_two_nodes_have_one_name() -> None:
 def converted(
     text: str,
     weights: Mapping[str, npt.ArrayLike] | None = None,
-    *,
-    keep_io: bool = True,
 ) -> ir.Model:
     arrays = {n: np.array(each, np.float32) for n, each in (weights or {}).items()}
-    step = ConvertFloat16(keep_io=keep_io)
-    return check_pass(step, bare(OPSET + text, arrays)).model
+    return check_pass(ConvertFloat16(), bare(OPSET + text, arrays)).model
 
 
 TYPES: dict[str, tuple[str, dict[str, str]]] = {
@@ -325,18 +312,6 @@ def test_what_a_half_and_a_float_reader_share_is_moved_in_half() -> None:
 
     assert types_of(once)["Concat"] == "FLOAT16"
     assert ConvertFloat16().run(once, Context(MODULES)).changes == 0
-
-
-def test_an_input_that_only_float32_reads_stays_float32() -> None:
-    half = converted(
-        "k (float[4] x, float[4] z) => (float[4] y, float[4] u)"
-        " { y = Relu(x)\n u = Exp(z) }",
-        keep_io=False,
-    )
-
-    assert [v.dtype for v in half.graph.inputs] == [HALF, FLOAT]
-    assert [v.dtype for v in half.graph.outputs] == [HALF, FLOAT]
-    assert casts(half) == 0
 
 
 @pytest.mark.parametrize(

@@ -127,29 +127,15 @@ class ConvertFloat16(Pass):
     float16: its scales become float16, which needs opset 19.
 
     Attributes:
-        keep_io: whether inputs, outputs and recurrent state stay in float32; else they
-            are what reads and makes them.
-        keep_ops: operators that stay in float32.
-        keep_modules: modules that stay in float32.
-        keep_nodes: globs over names of nodes that stay in float32.
+        keep: globs over nodes that stay in float32, by name, operator or module.
     """
 
     name: ClassVar[str] = "convert-float16"
     exact: ClassVar[bool] = False
-    keep_io: bool = True
-    keep_ops: tuple[str, ...] = ()
-    keep_modules: tuple[str, ...] = ()
-    keep_nodes: tuple[str, ...] = ()
-
-    @property
-    def changes_interface(self) -> bool:  # type: ignore[override]
-        """Whether inputs and outputs become float16."""
-        return not self.keep_io
+    keep: tuple[str, ...] = ()
 
     def run(self, model: ir.Model, context: Context) -> PassResult:
         """Choose the nodes, then change their type."""
-        for name in self.keep_modules:
-            context.modules.module(name)
         if describe_quantized(model) and opset_of(model) < SCALES_SINCE:
             raise PreconditionError(
                 f"the int8 graph is of opset {opset_of(model)}: float16 scales need"
@@ -157,21 +143,14 @@ class ConvertFloat16(Pass):
             )
         # Collect the nodes that must stay in float32
         types, frames = ElementTypes(model, FLOAT, HALF), context.frames
-        wide = wide_nodes(
-            model, types, frames, keep_io=self.keep_io, provider=context.provider
-        )
-        wide |= {
-            node: "the options keep it"
-            for node in model.graph
-            if node.op_type in self.keep_ops
-            or provenance.module_of(node) in self.keep_modules
-            or any(fnmatch.fnmatchcase(node.name or "", g) for g in self.keep_nodes)
-        }
+        wide = wide_nodes(model, types, frames, provider=context.provider)
+        for pattern in self.keep:
+            wide |= dict.fromkeys(_matches(model, pattern), "the option keeps it")
         # Everything else that can be float16 becomes float16
         narrow = [n for n in model.graph if n not in wide and types.inputs(n)]
         hold_scales(model, set(narrow))
         retyping = Retyping(model, types, self.name)
-        retyping.run(narrow, keep_io=self.keep_io)
+        retyping.run(narrow)
         reasons = Counter(
             reason
             for node, reason in wide.items()
@@ -190,6 +169,22 @@ class ConvertFloat16(Pass):
 
 
 # The nodes that stay in float32, and why.
+
+
+def _matches(model: ir.Model, pattern: str) -> list[ir.Node]:
+    """Return the nodes whose name, operator or module a glob matches; at least one."""
+    nodes = [
+        node
+        for node in model.graph
+        if any(
+            fnmatch.fnmatchcase(word or "", pattern)
+            for word in (node.name, node.op_type, provenance.module_of(node))
+        )
+    ]
+    if not nodes:
+        raise PreconditionError(f"keep: no node, operator or module is {pattern!r}")
+    return nodes
+
 
 LARGEST = float(np.finfo(np.float16).max)
 """65504."""
@@ -235,8 +230,6 @@ def wide_nodes(
     model: ir.Model,
     types: ElementTypes,
     frames: CalibrationSet | None,
-    *,
-    keep_io: bool,
     provider: Provider = CPU,
 ) -> dict[ir.Node, str]:
     """Map the nodes of the main graph that must stay in float32 to the reason.
@@ -255,7 +248,7 @@ def wide_nodes(
     # Measured ranges and the nodes in between come last
     if frames is not None:
         found |= _by_ranges(model, types, found, frames, provider)
-    return found | _between(model, found, keep_io=keep_io)
+    return found | _between(model, found)
 
 
 def _by_operator(node: ir.Node) -> str | None:
@@ -334,26 +327,18 @@ def _by_ranges(
     }
 
 
-def _between(
-    model: ir.Model, wide: Mapping[ir.Node, str], *, keep_io: bool
-) -> dict[ir.Node, str]:
+def _between(model: ir.Model, wide: Mapping[ir.Node, str]) -> dict[ir.Node, str]:
     """Find nodes that only move elements between float32 nodes, inputs and outputs."""
     moves = {node: None for node in model.graph if node.op_type in _MOVES}
 
     def from_wide(node: ir.Node) -> bool:
         data = node.inputs if node.op_type == "Concat" else node.inputs[:1]
         makers = [None if value is None else value.producer() for value in data]
-        return all(
-            keep_io if each is None else each in wide or each in moves
-            for each in makers
-        )
+        return all(each is None or each in wide or each in moves for each in makers)
 
     def to_wide(node: ir.Node) -> bool:
-        outside = any(value.is_graph_output() for value in node.outputs)
         readers = itertools.chain(*(value.consumers() for value in node.outputs))
-        return (keep_io or not outside) and all(
-            each in wide or each in moves for each in readers
-        )
+        return all(each in wide or each in moves for each in readers)
 
     # Strike out moves next to float16 nodes until nothing changes
     before = -1

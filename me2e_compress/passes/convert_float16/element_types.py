@@ -112,7 +112,7 @@ class Retyping:
         self._casts: dict[tuple[ir.Value, ir.DataType], ir.Value] = {}
         self.changed = 0
 
-    def run(self, nodes: Collection[ir.Node], *, keep_io: bool) -> None:
+    def run(self, nodes: Collection[ir.Node]) -> None:
         """Retype nodes of the main graph and the constants that only they read."""
         # Choose the inputs and results that change type
         types = self._types
@@ -122,15 +122,6 @@ class Retyping:
         }
         wanted = {(n, index) for n, indices in chosen.items() for index in indices}
         self._leave_casts(nodes, results, wanted)
-        if not keep_io:
-            given = [
-                value
-                for value in self._graph.inputs
-                if (read := [(node, index) for node, index in value.uses()])
-                and wanted.issuperset(read)
-            ]
-            results.update(given)
-            self.changed += len(given)
         # Record the readers before types and inputs change
         made = (value for node in self._graph for value in node.outputs)
         every = (*self._graph.inputs, *self._graph.initializers.values(), *made)
@@ -141,8 +132,6 @@ class Retyping:
         }
         for value in results:
             value.type = ir.TensorType(types.wanted)  # clones share the old one
-            if value.is_initializer():  # an input and its default are of one type
-                self._convert(value)
         # Update Casts and provenance of the retyped nodes
         for node in nodes:
             if node.op_type == "Cast" and node.outputs[0] in results:
@@ -154,8 +143,7 @@ class Retyping:
         # Insert Casts for the readers, then for the graph outputs
         for value, users in uses.items():
             self._serve(value, users, wanted)
-        if keep_io:
-            self._restore_outputs(results)
+        self._restore_outputs(results)
 
     def _leave_casts(
         self,
