@@ -28,6 +28,12 @@ FORMER = {
     "rules=safe{without=[gemv]}",
     "quantize-int8 without": f"without {_NOW} rules=safe{{without=[gemv]}}",
     "quantize-int8 attention_limit": f"attention_limit {_NOW} rules=NAME{{...}}",
+    "convert-float16 keep_io": "keep_io is gone since 0.3.0: inputs stay float32",
+    **{
+        f"convert-float16 {name}": f"{name} {_NOW} keep, globs over all three"
+        for name in ("keep_ops", "keep_modules", "keep_nodes")
+    },
+    "ablate-modules means": f"means {_NOW} frames (--frames)",
     "fold-constants growth": f"growth {_NOW} bytes_per_node",
     "command build": f"build {_NOW} trtexec --onnx=M.onnx --saveEngine=M.engine",
     "command ranges": f"ranges {_NOW} calibrate, which says what deserves a look",

@@ -2,14 +2,12 @@
 
 import dataclasses
 from collections.abc import Sequence
-from pathlib import Path
 from typing import cast
 
 import numpy as np
 import numpy.typing as npt
 import onnx_ir as ir
 
-from me2e_compress.calibration.dataset import load_arrays
 from me2e_compress.errors import FramesError, GraphError
 from me2e_compress.runtime.frames import Array, Frames
 from me2e_compress.runtime.providers import CPU, Provider
@@ -53,17 +51,6 @@ def token_means(
         for name, average in averages.items():
             average.take(index, found[name])
     return {name: average.result() for name, average in averages.items()}
-
-
-def load_means(path: Path, values: Sequence[str]) -> dict[str, Array]:
-    """Read means from an ``.npz`` keyed by value name."""
-    found = load_arrays(path)
-    if missing := [name for name in values if name not in found]:
-        raise FramesError(
-            f"{path}: holds no mean of {missing[0]}; there is"
-            f" {', '.join(found) or 'none'}"
-        )
-    return {name: found[name] for name in values}
 
 
 @dataclasses.dataclass

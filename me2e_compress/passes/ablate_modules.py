@@ -2,7 +2,6 @@
 
 import dataclasses
 from collections.abc import Callable
-from pathlib import Path
 from typing import ClassVar, Literal
 
 import onnx_ir as ir
@@ -18,7 +17,6 @@ from me2e_compress.passes.edges import Edge, add_edge
 from me2e_compress.passes.parts import (
     Part,
     Substitution,
-    layout_of,
     means_of,
     module_of,
     replace_readers,
@@ -64,7 +62,6 @@ class AblateModules(Pass):
             (``*.lane_encoder``).
         drop_outputs: True removes the graph outputs that only a dropped module makes;
             False refuses to drop such a module.
-        means: an ``.npz`` of means by value name, for ``fill="means"`` without frames.
         edges: what reads what besides, or instead; ``drop=[]`` adds them alone.
     """
 
@@ -74,13 +71,12 @@ class AblateModules(Pass):
     fill: Literal["zeros", "substitute", "means"] = "substitute"
     keep: tuple[str, ...] = ()
     drop_outputs: bool = False
-    means: Path | None = None
     edges: tuple[Edge, ...] = ()
 
     @property
     def needs_frames(self) -> bool:
         """Whether means must be measured."""
-        return self.fill == "means" and self.means is None
+        return self.fill == "means"
 
     def run(self, model: ir.Model, context: Context) -> PassResult:
         """Substitute, add edges, fill the rest, and remove dead nodes.
@@ -89,12 +85,10 @@ class AblateModules(Pass):
             ModuleMapError: the map has no such module.
             PreconditionError: a module, substitute, mean or edge does not fit the
                 graph, or the plan would be lost or no longer depend on the cameras.
-            RecipeError: ``means`` without ``fill="means"``, or nothing to do.
-            FramesError: means have no source, or it belongs to another graph.
+            RecipeError: nothing to do.
+            FramesError: means have no frames, or they belong to another graph.
         """
         # Check the options against the graph and the module map
-        if self.means is not None and self.fill != "means":
-            raise RecipeError(f"{self.name}: means goes with fill=means only")
         if not self.drop and not self.edges:
             raise RecipeError(f"{self.name}: drop is empty, and there are no edges")
         known = [context.modules.module(name) for name in self.drop]
@@ -168,15 +162,9 @@ class AblateModules(Pass):
             for value in exits:
                 replace_readers(value, self._instead(model, value).zeros(value))
             return [f"{value.name} reads as zeros" for value in exits]
-        means, how = means_of(model, exits, context, self.means)
+        means, how = means_of(model, exits, context)
         for value in exits:
-            array, (shape, dtype) = means[str(value.name)], layout_of(value)
-            if array.dtype != dtype or array.shape != shape:
-                raise PreconditionError(
-                    f"a constant {array.dtype} {list(array.shape)} cannot stand for"
-                    f" {value.name}, which is {dtype} {list(shape)}"
-                )
-            name = f"{value.name}_mean"
+            array, name = means[str(value.name)], f"{value.name}_mean"
             replace_readers(value, rewrite.add_constant(model.graph, array, name))
         return [f"{value.name} reads as {how}" for value in exits]
 

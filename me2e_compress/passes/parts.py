@@ -3,14 +3,13 @@
 import dataclasses
 import math
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Self
 
 import numpy as np
 import onnx_ir as ir
 
 from me2e_compress import graph
-from me2e_compress.calibration.means import load_means, token_means
+from me2e_compress.calibration.means import token_means
 from me2e_compress.display import counted
 from me2e_compress.errors import FramesError, PreconditionError
 from me2e_compress.graph import provenance, rewrite
@@ -243,23 +242,20 @@ class Substitution:
 
 
 def means_of(
-    model: ir.Model, values: Sequence[ir.Value], context: Context, file: Path | None
+    model: ir.Model, values: Sequence[ir.Value], context: Context
 ) -> tuple[dict[str, Array], str]:
-    """Read means by value name from a file, or measure them; also name their source.
+    """Measure means by value name; also name their source.
 
     Raises:
-        FramesError: neither frames nor a file, or they are of another graph.
+        FramesError: no frames, or they are of another graph.
     """
     for value in values:
         layout_of(value)
     names = [str(value.name) for value in values]
-    if file is not None:
-        return load_means(file, names), f"its mean in {file}"
     frames = context.frames
     if frames is None:
         raise FramesError(
-            "fill=means needs recorded frames (--frames) or a file (means=FILE.npz):"
-            " a mean is never made up"
+            "fill=means needs recorded frames (--frames): a mean is never made up"
         )
     count = counted(len(frames), "frame")
     means = token_means(model, frames, names, provider=context.provider)

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from me2e_compress import graph
 from me2e_compress.calibration.dataset import CalibrationSet
-from me2e_compress.calibration.means import load_means, token_means
+from me2e_compress.calibration.means import token_means
 from me2e_compress.errors import FramesError, GraphError
 from me2e_compress.runtime.frames import Frame
 from me2e_compress.runtime.session import run_once
@@ -113,27 +113,3 @@ def test_one_value_one_shape() -> None:
 
     with pytest.raises(FramesError, match=r"frame 1 makes where \[2, 1\], it was"):
         token_means(model, rows([1, 2, 3, 4], [0, 0, 0, 4]), ["where"])
-
-
-def test_means_are_read_by_the_names_of_exporters(tmp_path: Path) -> None:
-    file, name = tmp_path / "means.npz", "/occ/head/Sigmoid_output_0"
-    arrays = {name: np.arange(3.0), "other": np.zeros(1)}
-    np.savez(file, **arrays)  # type: ignore[arg-type]
-
-    found = load_means(file, [name])
-    assert {key: array.tolist() for key, array in found.items()} == {name: [0, 1, 2]}
-    with pytest.raises(FramesError, match=r"means\.npz: holds no mean of a; .* other"):
-        load_means(file, ["a"])
-
-
-@pytest.mark.parametrize("content", [None, b"no archive"])
-def test_a_file_that_is_none(tmp_path: Path, content: bytes | None) -> None:
-    file = tmp_path / "means.npz"
-    if content is not None:
-        file.write_bytes(content)
-
-    with pytest.raises(
-        FramesError, match=r"means\.npz: not a readable \.npz"
-    ) as caught:
-        load_means(file, ["a"])
-    assert "\n" not in str(caught.value)

@@ -12,7 +12,6 @@ from me2e_compress.errors import (
     FramesError,
     ModuleMapError,
     PreconditionError,
-    RecipeError,
 )
 from me2e_compress.graph import provenance
 from me2e_compress.passes.ablate_modules import AblateModules
@@ -111,12 +110,11 @@ def test_what_does_not_fit_the_graph_is_refused(
     [
         (NO_AGENTS, OPEN, PreconditionError, r"agents has shape .*fold-constants"),
         (NO_MAP, SIZED, PreconditionError, "size is arithmetic on shapes"),
-        (replace(NO_AGENTS, fill="means"), STACK, FramesError, r"frames .*means=FILE"),
         (
-            replace(NO_AGENTS, means=Path("m.npz")),
+            replace(NO_AGENTS, fill="means"),
             STACK,
-            RecipeError,
-            "means goes with fill=means only",
+            FramesError,
+            r"needs recorded frames",
         ),
     ],
 )
@@ -193,49 +191,6 @@ def test_means_leave_substitutes_aside(recording: CalibrationSet) -> None:
     met = np.sqrt(np.array([0, 0, 4, 9], "f"))
     np.testing.assert_allclose(plan_of(result.model), seen + met, rtol=1e-6)
     assert result.removed_outputs == ("lanes",)
-
-
-def test_means_from_a_file_go_before_frames(
-    recording: CalibrationSet, tmp_path: Path
-) -> None:
-    file = tmp_path / "means.npz"
-    np.savez(file, agents=np.array([[4, 9, 16, 25]], np.float32))
-    chosen = AblateModules(drop=("agents",), fill="means", means=file)
-
-    result = chosen.run(net(STACK, {}), replace(context(), frames=recording))
-
-    expected = np.exp(np.array([0, 0, -4, -9], "f")) + np.array([2, 3, 4, 5], "f")
-    np.testing.assert_allclose(plan_of(result.model), expected, rtol=1e-6)
-    assert f"agents reads as its mean in {file}" in result.notes
-
-
-@pytest.mark.parametrize(
-    ("name", "array", "error", "words"),
-    [
-        ("boxes", np.zeros((1, 4), "f"), FramesError, "no mean of agents; .* boxes"),
-        (
-            "agents",
-            np.zeros((1, 5), "f"),
-            PreconditionError,
-            r"float32 \[1, 5\] cannot stand for agents, which is float32 \[1, 4\]",
-        ),
-        (
-            "agents",
-            np.zeros((1, 4), "d"),
-            PreconditionError,
-            "a constant float64 .* agents, which is float32",
-        ),
-    ],
-)
-def test_means_of_another_graph(
-    tmp_path: Path, name: str, array: np.ndarray, error: type[Exception], words: str
-) -> None:
-    file = tmp_path / "means.npz"
-    np.savez(file, **{name: array})  # type: ignore[arg-type]
-    chosen = AblateModules(drop=("agents",), fill="means", means=file)
-
-    with pytest.raises(error, match=words):
-        chosen.run(net(STACK, {}), context())
 
 
 def test_shapes_have_no_mean(recording: CalibrationSet) -> None:

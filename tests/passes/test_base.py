@@ -18,7 +18,7 @@ def test_files_are_the_paths_that_are_set() -> None:
     [
         (Sample(), False),
         (AblateModules(drop=("occ",), fill="means"), True),
-        (AblateModules(drop=("occ",), fill="means", means=Path("m.npz")), False),
+        (AblateModules(drop=("occ",)), False),
         (QuantizeInt8(), True),
         (QuantizeInt8(ranges=Path("r.json")), False),
     ],

@@ -62,7 +62,6 @@ def test_passes_that_need_frames_and_none_are_given(
     [
         "quantize-int8{ranges=r.json}",
         "ablate-modules{drop=[occ]}",
-        "ablate-modules{drop=[occ],fill=means,means=m.npz}",
         "lower-int8",
     ],
 )

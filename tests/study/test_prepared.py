@@ -135,37 +135,22 @@ def test_the_same_is_made_once_and_an_altered_model_again(
     assert warnings == ([] if damage in ("", "no report") else told)
 
 
-def with_means(study: Study, file: Path) -> Study:
-    passes = recipe.parse(
-        f'ablate-modules{{drop=[map],drop_outputs=true,fill=means,means="{file}"}}'
-    )
+def with_overrides(study: Study, file: Path) -> Study:
+    passes = recipe.parse(f'quantize-int8{{overrides="{file}"}}')
     variant = dataclasses.replace(study.variants[0], passes=passes)
     return dataclasses.replace(study, variants=(variant,), baseline=variant.name)
-
-
-def write_means(study: Study, file: Path, value: float) -> None:
-    """One number everywhere that the map module is read."""
-    loaded = graph.load(Path(study.variants[0].policy))
-    graph.infer_shapes(loaded)
-    means = {
-        str(output.name): np.full(shape, value, np.float32)
-        for node in loaded.graph
-        for output in node.outputs
-        if (shape := graph.static_shape(output)) is not None
-    }
-    np.savez(file, allow_pickle=False, **means)
 
 
 def test_a_file_that_a_pass_reads_decides_the_model(
     study: Study, tmp_path: Path
 ) -> None:
-    file = tmp_path / "means.npz"
-    asked = with_means(study, file)
-    write_means(asked, file, 1.0)
+    file = tmp_path / "overrides.toml"
+    asked = with_overrides(study, file)
+    file.write_text("")
     first = made(asked, tmp_path)
     assert made(asked, tmp_path) == first
 
-    write_means(asked, file, 2.0)
+    file.write_text('[[override]]\nnodes = "/neck/MatMul"\ndtype = "int8"\n')
     second = made(asked, tmp_path)
 
     assert second.model != first.model
@@ -175,10 +160,10 @@ def test_a_file_that_a_pass_reads_decides_the_model(
 def test_a_file_that_a_pass_reads_and_that_is_gone(
     study: Study, tmp_path: Path
 ) -> None:
-    asked = with_means(study, tmp_path / "gone.npz")
+    asked = with_overrides(study, tmp_path / "gone.toml")
 
     with pytest.raises(
-        StudyError, match=r"minus-occ: \S+gone\.npz: cannot be read: No"
+        StudyError, match=r"minus-occ: \S+gone\.toml: cannot be read: No"
     ):
         made(asked, tmp_path)
 
