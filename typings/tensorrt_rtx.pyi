@@ -18,9 +18,6 @@ class ILogger:
 class ComputeCapability(IntEnum):
     NONE = 0
 
-class ProfilingVerbosity(IntEnum):
-    DETAILED = 2
-
 class INetworkDefinition:
     num_layers: int
 
@@ -28,7 +25,6 @@ class IHostMemory(bytes): ...
 
 class IBuilderConfig:
     num_compute_capabilities: int
-    profiling_verbosity: ProfilingVerbosity
     def set_compute_capability(self, which: ComputeCapability, index: int) -> bool: ...
 
 class Builder:

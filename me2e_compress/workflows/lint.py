@@ -106,11 +106,6 @@ class LintResult(Result):
             parsed = "parsed" if build.parsed else "not parsed"
             version = f"TensorRT-RTX {build.version}, on this CPU"
             answer.append(f"{version}: {parsed}{where}")
-            int8 = Counter(each.kind for each in build.kernels if each.is_int8)
-            kinds = Counter(each.kind for each in build.kernels)
-            kernels = ", ".join(f"{int8[k]} of {n} {k}s" for k, n in kinds.items())
-            if kernels:
-                answer.append(f"kernels with int8 operands: {kernels}")
             if cut := build.cut:
                 answer.append(f"cut at {len(cut)} plugins: {', '.join(cut[:5])}")
         reason = self.refusal or self.miscomputed

@@ -1,6 +1,6 @@
 """Run TensorRT-RTX in a separate process, because its parser may abort.
 
-python rtx_main.py MODEL.onnx ANSWER.json SM [PLAN]
+python rtx_main.py MODEL.onnx ANSWER.json SM build|parse
 """
 
 import json
@@ -23,8 +23,8 @@ class _Log(trt.ILogger):  # type: ignore[misc]
             self.lines.append(f"{severity.name.lower()}: {message}")
 
 
-def work(model: Path, sm: int, plan: Path | None) -> dict[str, object]:
-    """Parse a file, and build it for a GPU generation if a plan is wanted."""
+def work(model: Path, sm: int, *, build: bool) -> dict[str, object]:
+    """Parse a file, and build it for a GPU generation if asked to."""
     log = _Log()
     builder = trt.Builder(log)
     network = builder.create_network(0)
@@ -43,25 +43,21 @@ def work(model: Path, sm: int, plan: Path | None) -> dict[str, object]:
         "built": None,
     }
     # Build for the generation without a GPU.
-    if parsed and plan is not None:
+    if parsed and build:
         config = builder.create_builder_config()
         config.num_compute_capabilities = 1
         config.set_compute_capability(getattr(trt.ComputeCapability, f"SM{sm}"), 0)
-        config.profiling_verbosity = trt.ProfilingVerbosity.DETAILED
         built = builder.build_serialized_network(network, config)
         answer["built"] = built is not None
-        if built is not None:
-            plan.write_bytes(bytes(built))
     answer["log"] = log.lines
     return answer
 
 
 def main() -> None:
     """Read the arguments, write the answer."""
-    model, answer, sm = sys.argv[1:4]
-    plan = Path(sys.argv[4]) if len(sys.argv) > 4 else None
-    found = work(Path(model), int(sm), plan)
-    Path(answer).write_text(json.dumps(found), encoding="utf-8")
+    model, answer, sm, until = sys.argv[1:]
+    result = work(Path(model), int(sm), build=until == "build")
+    Path(answer).write_text(json.dumps(result), encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -18,13 +18,10 @@ from me2e_compress.quantization.scheme import QuantScheme
 from me2e_compress.shipped.drivers import shipped
 from me2e_compress.targets.tensorrt import TensorRT
 from me2e_compress.targets.tensorrt.rtx_check import (
-    Kernel,
     check,
     cut,
-    read_kernels,
-    without_int8,
 )
-from tests.nets import FULL, PAPER, conv_attention, net, parsed, placed
+from tests.nets import FULL, conv_attention, net, parsed, placed
 from tests.targets.tensorrt.layers import layers
 
 RTX = pytest.mark.skipif(
@@ -42,13 +39,10 @@ def quantized(
 
 
 @RTX
-def test_what_we_place_is_built_with_int8_kernels() -> None:
+def test_what_we_place_is_built() -> None:
     found = check(quantized(conv_attention()))
 
-    assert found.passed
-    assert (found.parsed, found.built, found.missing) == (True, True, ())
-    convolutions = [each for each in found.kernels if each.kind == "convolution"]
-    assert [each.is_int8 for each in convolutions] == [True]
+    assert (found.passed, found.parsed, found.built) == (True, True, True)
 
 
 @RTX
@@ -56,7 +50,7 @@ def test_every_kind_of_layer_is_taken_with_its_channels() -> None:
     """Conv, grouped ConvTranspose, MatMul, turned Gemm, a residual Add; no names."""
     for model in (layers(), residual()):
         found = check(quantized(model))
-        assert (found.passed, found.missing) == (True, ())
+        assert (found.passed, found.built) == (True, True)
 
 
 def residual() -> ir.Model:
@@ -69,26 +63,6 @@ def residual() -> ir.Model:
     }
     """
     return net(text, {"w": np.ones((4, 4, 3, 3))})
-
-
-@RTX
-def test_a_float_graph_has_no_int8_kernel() -> None:
-    found = check(conv_attention())
-
-    assert found.passed
-    assert found.missing is None
-    assert not any(each.is_int8 for each in found.kernels)
-
-
-@RTX
-def test_a_plan_that_the_graph_does_not_keep_is_found_out() -> None:
-    model = conv_attention()
-    stamp_plan(model, make_plan(model, FULL, PAPER))
-
-    found = check(model)
-
-    assert not found.passed
-    assert found.missing == ("/backbone/Conv",)
 
 
 @RTX
@@ -196,33 +170,6 @@ def test_a_plugin_of_unknown_result_cannot_be_cut_at() -> None:
         cut(ir.from_onnx_text(ROTATED))
 
 
-PLAN = (
-    b'\x00\x01 t={ name="in" shape={ 1 3 } type=int8 } t={ name="w" type=int8 }'
-    b' t={ name="f" type=float }'
-    b' corrltn={ name="/a/Conv" output={"o" } input={"in" "w" } pad={ 1 } }'
-    b' fully_connected={ name="/q/MatMul+/k/MatMul" output={"o" } input={"f" "w" } }'
-    b' corrltn={ name="/b/Conv" output={"o" } input={"lost" "w" } }\xff'
-)
-
-
-def test_kernels_are_read_off_the_text_of_a_plan() -> None:
-    assert read_kernels(PLAN) == (
-        Kernel("convolution", ("/a/Conv",), ("int8", "int8")),
-        Kernel("product", ("/q/MatMul", "/k/MatMul"), ("float", "int8")),
-        Kernel("convolution", ("/b/Conv",), ("?", "int8")),
-    )
-
-
-def test_nodes_without_an_int8_kernel_are_named() -> None:
-    nodes = ("/a/Conv", "/b/Conv", "/k/MatMul", "/c/Conv")
-
-    assert without_int8(nodes, read_kernels(PLAN)) == (
-        "/b/Conv",
-        "/k/MatMul",
-        "/c/Conv",
-    )
-
-
 # The driver that ships, in every scheme, as TensorRT gets it.
 
 
@@ -257,10 +204,8 @@ def test_every_scheme_passes_the_lint(
 @pytest.mark.slow
 @RTX
 @pytest.mark.parametrize("scheme", SCHEMES)
-def test_every_scheme_is_built_with_int8_convolutions(
-    driver: ir.Model, scheme: str
-) -> None:
+def test_every_scheme_is_built(driver: ir.Model, scheme: str) -> None:
     found = check(driver_in_int8(driver, scheme, "paper"))
 
-    assert found.passed, found.errors or found.missing
-    assert (found.cut, found.missing) == ((), ())
+    assert found.passed, found.errors
+    assert found.cut == ()
