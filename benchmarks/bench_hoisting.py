@@ -1,4 +1,4 @@
-"""What ``hoist-linear``, ``flatten-matmul`` and the factors of ``fuse-basic`` save.
+"""What ``hoist-linear`` and ``flatten-matmul`` save.
 
     python -m benchmarks.bench_hoisting
 
@@ -28,7 +28,6 @@ from me2e_compress.graph import provenance
 from me2e_compress.graph.modules.module_map import ModuleMap
 from me2e_compress.passes.base import Context
 from me2e_compress.passes.flatten_matmul import FlattenMatmul
-from me2e_compress.passes.fuse_basic import FuseBasic
 from me2e_compress.passes.hoist_linear import HoistLinear
 
 ROUNDS = 10
@@ -109,7 +108,7 @@ def hoisted(text: str, weights: Arrays) -> ir.Model:
     context = Context(ModuleMap.whole())
     model = HoistLinear().run(model, context).model
     graph.infer_shapes(model)
-    return FuseBasic().run(model, context).model
+    return model
 
 
 def session_of(model: ir.Model) -> onnxruntime.InferenceSession:
