@@ -165,7 +165,9 @@ def modules(name: str, ready: PreparedGraph) -> None:
 def by_module(ready: PreparedGraph, target: Target) -> dict[str, str]:
     """Describe what each module would be, alone in int8 on a target."""
     step = QuantizeInt8(
-        modules=ready.modules.names(), target="tensorrt", without=("cost",)
+        modules=ready.modules.names(),
+        target="tensorrt",
+        rules="safe{without=[cost]}",
     )
     plan = step.plan(ready.model, Context(ready.modules))
     nodes = {str(node.outputs[0].name): node for node in ready.model.graph}

@@ -14,8 +14,6 @@ from me2e_compress.study import Condition, Study, Timing, Variant, run_study
 from me2e_compress.study.definition import FramesToRecord, StudyBlock
 from me2e_compress.study.drive_record import DriveRecord
 from me2e_compress.study.workload import held_frames, workload
-from tests.docs.pages import EXAMPLE
-from tests.installed import install
 from tests.study.conftest import BLIND, FASTER, IDEAL, ROUTES, SLOW, Here, Make
 
 
