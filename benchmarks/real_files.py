@@ -336,7 +336,8 @@ def slim(model: Path, made: Path) -> None:
     sys.path.insert(0, str(made.parents[2] / "peers"))
     import onnxslim
 
-    onnx.save(onnxslim.slim(onnx.load(model)), made)
+    slimmed: Any = onnxslim.slim(onnx.load(model))
+    onnx.save(slimmed, made)
 
 
 PEER_WORK = {"quantize_static": quantize_static, "onnxsim": simplify, "onnxslim": slim}

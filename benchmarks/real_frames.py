@@ -138,7 +138,7 @@ def voice_activity(model: Path, rng: np.random.Generator) -> Iterator[Frame]:
             frame = {"input": np.stack(pieces)} | states
             if "sr" in ports:
                 frame["sr"] = np.array(RATE)
-            _, *answers = session.run(None, frame)
+            _, *answers = run(session, frame)
             states = dict(zip(states, answers, strict=True))
             # neighbours are alike: four of a voice say as much
             if rows > 1 or place // 512 % 40 == 20:
@@ -241,13 +241,18 @@ def signal_heads(model: Path, rng: np.random.Generator) -> Iterator[Frame]:
     """Yield what the network of pairs makes of a crossing: 6 detectors, 4 phases."""
     pair = opened(model.with_name(model.name.replace("_head", "_pair")))
     while True:
-        logit, vectors = pair.run(None, {"x": rasters(rng, 24)})
+        logit, vectors = run(pair, {"x": rasters(rng, 24)})
         active = rng.uniform(0, 600, 6).astype(np.float32)
         yield {
             "logit": logit.reshape(6, 4),
             "Z": vectors.reshape(6, 4, 128),
             "act": active,
         }
+
+
+def run(session: onnxruntime.InferenceSession, frame: Frame) -> list[Any]:
+    """Run one frame; return all outputs."""
+    return list(session.run(None, frame))
 
 
 def opened(model: Path) -> onnxruntime.InferenceSession:
