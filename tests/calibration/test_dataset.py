@@ -199,9 +199,7 @@ def recording(folder: Path, count: int, scenes: tuple[int, ...]) -> CalibrationS
         (2, 1, [1], [1]),
         (16, 1, [1, 4, 6, 9, 12, 14], [1, 4, 6, 9, 12, 14]),
         (96, 1, [*range(3, 96, 6)], [*range(3, 96, 6)]),
-        # a state grows along runs, each within a scene
         (16, 3, [1, 2, 3, 9, 10, 11], [1, 9]),
-        # one frame is all there is
         (1, 1, [0], [0]),
     ],
 )
