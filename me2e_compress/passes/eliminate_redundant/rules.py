@@ -350,45 +350,6 @@ def _casts(node: ir.Node, site: MergeSite) -> ir.Node | None:
     return put(node, "Cast", read, by=site.by, sources=[inner], attributes=options)
 
 
-def _slices(node: ir.Node, site: MergeSite) -> ir.Node | None:
-    inner = _before(node)
-    if inner is None or inner.op_type != "Slice" or site.opset < 10:
-        return None
-    if sole_reader(inner.outputs[0]) is None:
-        return None
-    first, second = _window(inner), _window(node)
-    if first is None or second is None or set(first[2]) & set(second[2]):
-        return None
-    # Concatenate starts, ends, axes and steps; drop steps of 1
-    name = node.outputs[0].name or ""
-    inputs = [
-        add_constant(site.graph, np.array([*one, *two], np.int64), f"{name}_{part}")
-        for part, one, two in zip(
-            ("starts", "ends", "axes", "steps"), first, second, strict=True
-        )
-    ]
-    if all(step == 1 for step in (*first[3], *second[3])):
-        del site.graph.initializers[inputs.pop().name or ""]
-    return put(node, "Slice", [inner.inputs[0], *inputs], by=site.by, sources=[inner])
-
-
-def _window(node: ir.Node) -> list[list[int]] | None:
-    """Return starts, ends, axes (from the front) and steps, if all are constant."""
-    rank = 0 if node.outputs[0].shape is None else len(node.outputs[0].shape)
-    given: list[list[int] | None] = []
-    for value in node.inputs[1:]:
-        given.append(integers_of(value))
-        if value is not None and given[-1] is None:
-            return None
-    # Fill in the defaults of axes and steps
-    starts, ends, axes, steps = [*given, None, None, None, None][:4]
-    if not rank or starts is None or ends is None:
-        return None
-    axes = list(range(len(starts))) if axes is None else axes
-    steps = [1] * len(starts) if steps is None else steps
-    return [starts, ends, [axis % rank for axis in axes], steps]
-
-
 def _concats(node: ir.Node, site: MergeSite) -> ir.Node | None:
     axis = node.attributes.get_int("axis", 0)
     inputs: list[ir.Value | None] = []
@@ -441,4 +402,4 @@ def _drop_expand(node: ir.Node, site: MergeSite) -> ir.Node | None:
     return None
 
 
-PAIRS: dict[str, Rule] = {"Cast": _casts, "Concat": _concats, "Slice": _slices}
+PAIRS: dict[str, Rule] = {"Cast": _casts, "Concat": _concats}
