@@ -55,7 +55,8 @@ FORMER = {
     "--records": f"study --records {_NOW} python -m benchmarks.paper in the repository",
     "--weigh": f"study --weigh {_NOW} python -m benchmarks.paper in the repository",
     "--plugins": f"--plugins {_NOW} --provider 'cpu{{plugins=[LIB.so]}}'",
-    "--set-dim": f"--set-dim {_NOW} compress --set-dim, and the graph that it writes",
+    "--set-dim": f"--set-dim {_NOW} compress M.onnx -r exact --set-dim DIM=N -o"
+    " FIXED.onnx, and FIXED.onnx here",
     "sensitivity --drive": f"sensitivity --drive {_NOW} a study of the recipes",
     "sensitivity --workers": f"sensitivity --workers {_NOW} a study of the recipes",
     "--drive-limit": f"--drive-limit {_NOW} a study of the recipes",

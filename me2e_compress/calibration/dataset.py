@@ -204,6 +204,8 @@ class PixelInputs(BaseModel):
 
 T = TypeVar("T", Array, Declared)
 
+_KEYS = ("scenes", "pixels", "generator", "stack", "seed", "log", "count")
+"""Keys of ``scenes.json``: two are read, the others say who wrote it."""
 FROZEN_INPUTS = "me2e.static_inputs"
 """Metadata key of a graph: JSON with a digest of every input that became constant."""
 
@@ -241,6 +243,10 @@ class CalibrationSet:
         index = content if isinstance(content, dict) else {}
         self.places: Sequence[int] = range(len(self.files))
         self._starts = _scenes(path, index, len(self.files))
+        if unknown := [key for key in index if key not in _KEYS]:
+            raise FramesError(
+                f"{path}: unknown key {unknown[0]!r}; there are {', '.join(_KEYS)}"
+            )
         # Old recordings, and those without pixels, have no such entry.
         pixels = index.get("pixels")
         version = pixels.get("version") if isinstance(pixels, dict) else None
@@ -332,6 +338,13 @@ class CalibrationSet:
                 finite.
         """
         frozen = frozen_inputs(model)
+        inputs = [str(each.name) for each in model.graph.inputs]
+        for name in self.pixels:
+            if name not in inputs and name not in frozen:
+                raise FramesError(
+                    f"{self.folder / 'scenes.json'}: pixels: {name} is not an input of"
+                    f" the model; it takes {', '.join(inputs)}"
+                )
         for path in self.files:
             # Compare headers before any array is read.
             held = self._as_fed(path, declared(path), PixelInput.fed)

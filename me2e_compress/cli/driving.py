@@ -68,7 +68,7 @@ def score(
     real runs in CARLA.
 
     Args:
-        results: folders of results, ours or Bench2Drive's
+        results: folders of results, ours or Bench2Drive's; ROUTES.xml, their set
         metrics: a folder of metric_info.json apart from RESULTS
         joules: NAME=JOULES or NAME=FILE: of an inference; gives EER_AV
         budget_ms: what a decision may take; 20 Hz: 50

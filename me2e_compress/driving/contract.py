@@ -58,17 +58,6 @@ DEFAULT_IMAGE_SIZE = (96, 160)
 """Rows and columns for a model that takes any size."""
 
 
-def zeros(name: str, port: SessionPort) -> Array:
-    """Return the first value of a recurrent input."""
-    shape = tuple(side for side in port.shape if isinstance(side, int))
-    if len(shape) != len(port.shape):
-        raise EvaluationError(
-            f"recurrent input {name} has shape {list(port.shape)}: an open shape has "
-            "no first value"
-        )
-    return np.zeros(shape, DTYPES[port.type])
-
-
 def fed(array: Array, port: SessionPort) -> Array:
     """Return an array with the rank and type of a port."""
     missing = len(port.shape) - array.ndim

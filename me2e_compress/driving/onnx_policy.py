@@ -16,13 +16,12 @@ from me2e_compress.driving.contract import (
     Trajectory,
     fits,
     six_waypoints,
-    zeros,
 )
 from me2e_compress.driving.host_stage import HostStage, HostWork
 from me2e_compress.errors import EvaluationError, FramesError, GraphError
 from me2e_compress.runtime.frames import Array
 from me2e_compress.runtime.providers import CPU, Provider
-from me2e_compress.runtime.session import Session, SessionPort
+from me2e_compress.runtime.session import Session, SessionPort, zeros
 
 Entries = Mapping[str, RecurrentEntry] | None
 

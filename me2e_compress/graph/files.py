@@ -17,7 +17,7 @@ from me2e_compress.display import reason
 from me2e_compress.errors import GraphError
 from me2e_compress.graph import provenance, structure
 from me2e_compress.graph.nodes import STANDARD, nodes_of
-from me2e_compress.graph.opset import fit
+from me2e_compress.graph.opset import fit, note_change
 from me2e_compress.graph.summary import weight_bytes
 from me2e_compress.graph.validity import PLAIN_INITIALIZERS_SINCE_IR
 from me2e_compress.registry import drafts
@@ -69,9 +69,21 @@ def load(path: str | Path) -> ir.Model:
     _name_standard(model)
     settle(model, path)
     fit(model, path)
-    common.RemoveInitializersFromInputsPass()(model)
+    _freeze_defaults(model)
     model.ir_version = max(model.ir_version, PLAIN_INITIALIZERS_SINCE_IR)
     return model
+
+
+def _freeze_defaults(model: ir.Model) -> None:
+    """Make constants of inputs that have initializers, and note that in the model.
+
+    Before IR version 4 every initializer had to be an input: nobody fed those.
+    """
+    names = [str(each.name) for each in model.graph.inputs if each.is_initializer()]
+    common.RemoveInitializersFromInputsPass()(model)
+    if names and model.ir_version >= PLAIN_INITIALIZERS_SINCE_IR:
+        held = f"{', '.join(names)} held a value: no input any more, but a constant"
+        note_change(model, held)
 
 
 def _built(proto: onnx.ModelProto, in_order: bool) -> ir.Model:

@@ -22,7 +22,10 @@ OLDEST_OPSET = 13
 """The oldest opset that a graph is written in, as *import-normalize* does."""
 
 _CHANGES = "me2e.read_as"
-"""Key of ``model.meta`` with what :func:`fit` changed, in words."""
+"""Key of ``model.meta`` with what was changed on reading, in words."""
+
+_ON_DISK = "me2e.on_disk"
+"""Key of ``model.meta`` with IR version and opset of a file that is read as another."""
 
 _NO_NEWER = "onnxruntime reads no newer"
 
@@ -41,7 +44,7 @@ def fit(model: ir.Model, path: Path) -> None:
         GraphError: the graph is newer than onnxruntime, and its opset is unknown or an
             operator cannot be written in an older one.
     """
-    changes = []
+    changes, on_disk = [], (model.ir_version, opset_of(model))
     if model.ir_version > newest_ir():
         version = f"IR version {model.ir_version} became {newest_ir()}"
         changes.append(f"{version}: {_NO_NEWER}")
@@ -49,12 +52,24 @@ def fit(model: ir.Model, path: Path) -> None:
     if change := _fit_opset(model, path):
         changes.append(change)
     if changes:
-        model.meta[_CHANGES] = ", ".join(changes)
+        note_change(model, ", ".join(changes))
+        model.meta[_ON_DISK] = on_disk
 
 
 def read_as(model: ir.Model) -> str:
     """Say what was changed when a graph was read, and why; empty if nothing was."""
     return str(model.meta.get(_CHANGES, ""))
+
+
+def note_change(model: ir.Model, words: str) -> None:
+    """Note what was changed when a graph was read."""
+    model.meta[_CHANGES] = "; ".join(filter(None, [read_as(model), words]))
+
+
+def on_disk(model: ir.Model) -> tuple[int, int]:
+    """Return IR version and opset of the file that a graph was read from."""
+    version, opset = model.meta.get(_ON_DISK, (model.ir_version, opset_of(model)))
+    return int(version), int(opset)
 
 
 def _fit_opset(model: ir.Model, path: Path) -> str:

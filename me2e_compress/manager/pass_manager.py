@@ -27,6 +27,7 @@ from me2e_compress.manager.report import LossyPass, Report, Step, Verification
 from me2e_compress.manager.verification_inputs import (
     VerificationInputs,
     first_seeded,
+    sized_as,
 )
 from me2e_compress.passes.base import Context, Pass
 from me2e_compress.passes.import_normalize import ImportNormalize, needs_import
@@ -182,6 +183,8 @@ class _Run:
             self.verifications.append(equivalence.skipped(names, NOT_ASKED))
         if not stretch:
             return
+        # a size that a pass gave to an input holds before it, too
+        stretch = [(current, sized_as(before, model)) for current, before in stretch]
         # what onnxruntime dies of is refused here, not merely unproven
         if self.manager.try_first is not None:
             what = f"the graph after {stretch[-1][0].name}"
@@ -214,7 +217,7 @@ class _Run:
             names = tuple(current.name for current, _ in stretch[first:])
             try:
                 inputs = VerificationInputs.of(
-                    before, frames, context.seed, count, model, context.provider
+                    before, frames, context.seed, count, context.provider
                 )
                 found = equivalence.verify(names, before, model, inputs)
             except (GraphError, PreconditionError) as error:

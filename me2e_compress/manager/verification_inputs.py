@@ -15,7 +15,7 @@ import onnx_ir as ir
 
 from me2e_compress.calibration.dataset import CalibrationSet, synthetic
 from me2e_compress.errors import FramesError, GraphError, PreconditionError
-from me2e_compress.graph.shapes import is_static, static_shape
+from me2e_compress.graph.shapes import static_shape
 from me2e_compress.passes.fix_shapes import open_dimensions, sized_inputs
 from me2e_compress.runtime.frames import Frame
 from me2e_compress.runtime.providers import CPU, Provider
@@ -76,7 +76,6 @@ class VerificationInputs:
         frames: CalibrationSet | None,
         seed: int,
         count: int,
-        successor: ir.Model | None = None,
         provider: Provider = CPU,
     ) -> "VerificationInputs":
         """Take the first recorded frames, or make seeded inputs where none are given.
@@ -88,8 +87,6 @@ class VerificationInputs:
             frames: the recording; None makes inputs up.
             seed: of those.
             count: how many frames; of drawn sizes that many each.
-            successor: what passes made of the graph: where its inputs have the sizes
-                that the graph leaves open, those are taken.
             provider: what runs the graphs.
 
         Raises:
@@ -100,14 +97,13 @@ class VerificationInputs:
         if frames is not None:
             first = [frames[index] for index in range(min(count, len(frames)))]
             return cls(first, "recorded", provider)
-        shaped = model if successor is None or is_static(model) else successor
-        if open_dimensions(shaped):
-            scenes = _runnable_scenes(model, shaped, seed, count, provider)
+        if open_dimensions(model):
+            scenes = _runnable_scenes(model, seed, count, provider)
             made = [frame for _, scene in scenes for frame in scene]
             sizes = tuple(sizes for sizes, _ in scenes)
             return cls(made, "synthetic", provider, sizes)
         return cls(
-            list(synthetic(shaped, seed=seed, count=count)), "synthetic", provider
+            list(synthetic(model, seed=seed, count=count)), "synthetic", provider
         )
 
     def run(self, model: ir.Model, level: Level = "all") -> Iterator[Outputs]:
@@ -142,6 +138,24 @@ class VerificationInputs:
         return dataclasses.replace(self, frames=frames)
 
 
+def sized_as(model: ir.Model, other: ir.Model) -> ir.Model:
+    """Return a graph, its open inputs of the sizes that they have in another."""
+    sized = {each.name: each.shape for each in other.graph.inputs}
+    wanted = {
+        at: shape
+        for at, each in enumerate(model.graph.inputs)
+        if static_shape(each) is None
+        and (shape := sized.get(each.name)) is not None
+        and shape != each.shape
+    }
+    if not wanted:
+        return model
+    copy = model.clone()
+    for at, shape in wanted.items():
+        copy.graph.inputs[at].shape = shape
+    return copy
+
+
 def first_seeded(model: ir.Model, seed: int) -> tuple[Frame, ...] | None:
     """Return the frame that a graph without frames is run on first, if it has sizes."""
     try:
@@ -161,13 +175,13 @@ def nudge(
 
 
 def _runnable_scenes(
-    model: ir.Model, shaped: ir.Model, seed: int, count: int, provider: Provider
+    model: ir.Model, seed: int, count: int, provider: Provider
 ) -> list[tuple[Sizes, list[Frame]]]:
     """Search sizes that a graph runs at, and make a scene of frames of each."""
     session, reason = Session(model, provider=provider), ""
     scenes: list[tuple[Sizes, list[Frame]]] = []
-    for sizes in drawn_sizes(shaped):
-        inputs = sized_inputs(shaped, sizes)
+    for sizes in drawn_sizes(model):
+        inputs = sized_inputs(model, sizes)
         made = [math.prod(static_shape(each) or ()) for each in inputs.graph.inputs]
         if sum(made) > MOST_ELEMENTS:
             continue
@@ -182,7 +196,7 @@ def _runnable_scenes(
         if len(scenes) == TRIALS:
             break
     if not scenes:
-        names = ", ".join(open_dimensions(shaped))
+        names = ", ".join(open_dimensions(model))
         raise PreconditionError(
             f"the graph runs at none of the sizes that were tried for {names}{reason};"
             " give frames instead, or sizes (compress --set-dim)"

@@ -112,6 +112,9 @@ class Estimate:
 
 CONFIDENCE = 0.95
 RESAMPLES = 4_000
+FEWEST_TYPES = 8
+"""Of fewer types, drawing them anew gives intervals that are too narrow, often narrower
+than those over these types: there is none."""
 Floats = npt.NDArray[np.float64]
 Interval = tuple[float | None, float | None]
 Bounds = tuple[float, float]
@@ -158,7 +161,7 @@ def intervals(
     if is_a_point(here):
         here = unseen_interval(value, len(types), bounds)
     kinds = len(set(types))
-    if kinds < 2:
+    if kinds < FEWEST_TYPES:
         return here, (None, None)
     over_types = _middle(statistic(anew))
     if is_a_point(over_types):

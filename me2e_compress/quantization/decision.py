@@ -134,12 +134,13 @@ class QuantPlan:
         """Count int8, by rule."""
         counts = ", ".join(f"{rule} {count}" for rule, count in self.counts().items())
         kept = len(self.kept_float)
+        why = "; ".join(dict.fromkeys(each.reason for each in self.kept_float))
         return (
             f"scheme {self.scheme.name}, rules {self.rules}"
             + (f", for {self.target}" if self.target else "")
             + f": {len(self.chosen)} of"
-            f" {len(self.decisions)} nodes int8; {counts}"
-            + (f"; {kept} of them stay float on their target" if kept else "")
+            f" {len(self.decisions)} nodes int8{counts and '; '}{counts}"
+            + (f"; {kept} of them stay float on their target: {why}" if kept else "")
         )
 
     def tables(self) -> tuple[Table, ...]:

@@ -345,11 +345,22 @@ class Session:
     def first_state(self, held: Mapping[str, Array]) -> dict[str, Array]:
         """Return the first values of recurrent inputs: from ``held``, else zeros.
 
+        An open dimension has the size that it has in ``held``.
+
         Raises:
             GraphError: an input of unknown shape has no first value.
         """
+        sizes = {
+            dim: size
+            for name in self.inputs
+            if name in held
+            for dim, size in zip(
+                self.inputs[name].shape, held[name].shape, strict=False
+            )
+            if dim_name(dim)
+        }
         return {
-            name: held[name] if name in held else zeros(name, self.inputs[name])
+            name: held[name] if name in held else zeros(name, self.inputs[name], sizes)
             for name in self.recurrent
         }
 
@@ -458,15 +469,33 @@ def _ports(arguments: Sequence[ort.NodeArg]) -> dict[str, SessionPort]:
     return {each.name: SessionPort(each.type, tuple(each.shape)) for each in arguments}
 
 
-def zeros(name: str, port: SessionPort) -> Array:
-    """Return zeros for a recurrent input; GraphError if its shape is open."""
-    shape = [size for size in port.shape if isinstance(size, int)]
-    if len(shape) < len(port.shape) or port.type not in DTYPES:
+def dim_name(dim: int | str | None) -> str:
+    """Return the name of an open dimension; empty where it has none, or a size."""
+    return dim if isinstance(dim, str) and any(map(str.isalnum, dim)) else ""
+
+
+def zeros(
+    name: str, port: SessionPort, sizes: Mapping[int | str | None, int] | None = None
+) -> Array:
+    """Return zeros for a recurrent input, its open dimensions of the named sizes.
+
+    Raises:
+        GraphError: a size is not known; the message has the command that fixes it.
+    """
+    known = sizes or {}
+    shape = [each if isinstance(each, int) else known.get(each) for each in port.shape]
+    there = [size for size in shape if size is not None]
+    if len(there) < len(shape):
+        axis = shape.index(None)
+        dim = dim_name(port.shape[axis]) or f"{name}:{axis}"
         raise GraphError(
-            f"recurrent input {name} is {port.type} {list(port.shape)}: its first value"
-            " must stand in the frame that opens a scene"
+            f"recurrent input {name} is {port.type} {list(port.shape)}, and nothing"
+            f" gives {dim} a size: me2e-compress compress M.onnx -r exact"
+            f" --set-dim {dim}=1 -o FIXED.onnx, and go on with FIXED.onnx"
         )
-    return np.zeros(shape, DTYPES[port.type])
+    if port.type not in DTYPES:
+        raise GraphError(f"recurrent input {name} is {port.type}: it has no zeros")
+    return np.zeros(there, DTYPES[port.type])
 
 
 def _line(error: Exception) -> str:

@@ -2,7 +2,7 @@
 
 from me2e_compress.display import Cell
 from me2e_compress.display import number as plain_number
-from me2e_compress.metrics.measure import Estimate, Measure
+from me2e_compress.metrics.measure import FEWEST_TYPES, Estimate, Measure
 
 MISSING = "\N{EN DASH}"
 """Shown if nothing was measured."""
@@ -30,7 +30,7 @@ def anew_cell(estimate: Estimate) -> Cell:
     """Show the interval of a difference over types drawn anew, alone."""
     low, high = estimate.anew_low, estimate.anew_high
     if low is None or high is None:
-        return Cell(MISSING, reason="too few scenario types")
+        return Cell(MISSING, reason=f"fewer than {FEWEST_TYPES} scenario types")
     return Cell(f"{number(low, '+.1f')} to {number(high, '+.1f')}")
 
 

@@ -9,7 +9,7 @@ from google.protobuf.message import DecodeError
 
 from me2e_compress import graph
 from me2e_compress.calibration.dataset import CalibrationSet
-from me2e_compress.driving.adapter.outputs import adapted
+from me2e_compress.driving.adapter.outputs import stated
 from me2e_compress.driving.host_stage import HOST_STAGES
 from me2e_compress.driving.policies import Driver, driver_named
 from me2e_compress.errors import GraphError, Me2eError, StudyError
@@ -41,6 +41,7 @@ class PreparedVariant:
         weights: Origin of the weights in a line, such as a checkpoint; empty if
             unknown.
         said: What adapter and map state of plan and state, as metadata.
+        known: Which inputs are state and which output is the plan, and from where.
     """
 
     variant: Variant
@@ -53,6 +54,7 @@ class PreparedVariant:
     failure: str = ""
     weights: str = ""
     said: Mapping[str, str] = field(default_factory=dict)
+    known: str = ""
 
 
 def prepare_all(
@@ -99,12 +101,15 @@ def prepare_variant(
         origin = _reported_beside(model) or origin
     loaded = graph.load(model)
     weights = loaded.metadata_props.get(WEIGHTS, "")
-    said = adapted(loaded, variant.adapter, variant.module_map)
+    said, known = stated(loaded, model, variant.adapter, variant.module_map, {})
     if slow := slow_here(loaded, study.provider):
         listener.on_warning(f"variant {variant.name}: {slow}")
     size = graph.file_bytes(model)
     return PreparedVariant(
-        variant, driver, model, *origin, sha256, size, weights=weights, said=said
+        *(variant, driver, model, *origin, sha256, size),
+        weights=weights,
+        said=said,
+        known=known,
     )
 
 

@@ -104,8 +104,9 @@ def prepare_study(
                 folder.mkdir(parents=True, exist_ok=True)
                 by, provider = study.reference, study.provider
                 options = FramesOptions(
-                    count=count, seed=seed, adapter=by.adapter, provider=provider
-                )
+                    count=count, seed=seed, adapter=by.adapter, provider=provider,
+                    module_map=by.module_map,
+                )  # fmt: skip
                 record_frames(Path(by.policy), place, options, listener)
         study = replace(study, frames=frames, held_out=held_out, to_record=None)
     prepared = prepare_all(study, workspace, listener)

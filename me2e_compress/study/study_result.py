@@ -120,7 +120,7 @@ class StudyResult(Result):
             f" {counted(len(study.conditions), 'condition')} on {driven} of"
             f" {counted(whole, 'route')}",
             chain.from_iterable(self.tables_by_section.values()),
-            (),
+            [f"{each.variant.name}: {each.known}" for each in prepared if each.known],
             alerts,
         )
 

@@ -256,6 +256,7 @@ class Target(abc.ABC):
         """List all findings of a graph, errors first; the graph is not changed."""
         # The rules need inferred shapes.
         copy = model.clone()
+        copy.meta.update(model.meta)  # what the file is, beside what was read of it
         graph.infer_shapes(copy)
         found = [finding for rule in self.lint_rules() for finding in rule(copy)]
         return worst_first(found)

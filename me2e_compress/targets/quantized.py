@@ -40,6 +40,18 @@ def is_dequantized(value: ir.Value | None) -> bool:
     return maker(value, DEQUANTIZE) is not None
 
 
+def is_in_a_pair(node: ir.Node) -> bool:
+    """Return whether a node stands between a QuantizeLinear and its DequantizeLinears.
+
+    The integers that it reads must have no other reader.
+    """
+    before, after = node.inputs[0], node.outputs[0]
+    if before is None or not is_quantized(before) or after.is_graph_output():
+        return False
+    readers = {each.op_type for each in after.consumers()}
+    return readers == {DEQUANTIZE} and len(before.uses()) == 1
+
+
 def stored_type(node: ir.Node) -> ir.DataType:
     """Return the type of the numbers that a node of a pair writes or reads.
 

@@ -13,6 +13,7 @@ of this package: so it starts in 0.3 s, not in 1.6.
 """
 
 import contextlib
+import dataclasses
 import errno
 import fcntl
 import functools
@@ -20,7 +21,7 @@ import hashlib
 import os
 import signal
 import tempfile
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from time import perf_counter
 from typing import TypeAlias
@@ -32,11 +33,11 @@ import platformdirs
 from me2e_compress import graph
 from me2e_compress.calibration.dataset import CalibrationSet, archive_of
 from me2e_compress.display import counted
-from me2e_compress.driving.adapter.outputs import adapted
+from me2e_compress.driving.adapter.outputs import adapted, stated
 from me2e_compress.errors import FORMER, GraphError
 from me2e_compress.graph.modules.assign import map_of
 from me2e_compress.graph.modules.module_map import ModuleMap
-from me2e_compress.graph.nodes import is_standard
+from me2e_compress.graph.nodes import is_read, is_standard
 from me2e_compress.graph.opset import read_as
 from me2e_compress.graph.shapes import unshaped_plugins
 from me2e_compress.operators.kernels.trampoline import why_not
@@ -71,7 +72,7 @@ def model_path(text: str | Path, beside: Path = Path()) -> Path:
 def read_graph(
     path: Path, listener: Listener, adapter: Given = None, module_map: Given = None
 ) -> ir.Model:
-    """Read a graph; warn of another opset and of what is unseen.
+    """Read a graph; warn of another opset and of its shortcomings.
 
     What an adapter and a map state becomes metadata of the graph; see :func:`adapted`.
     """
@@ -79,14 +80,20 @@ def read_graph(
     adapted(model, adapter, module_map or own_map(path))
     if said := read_as(model):
         listener.on_warning(f"{path}: {said}")
-    if hint := unseen(model):
+    if hint := shortcomings(model):
         listener.on_warning(f"{path}: {hint}")
     return model
 
 
-def unseen(model: ir.Model) -> str:
-    """Describe what passes do not see: shapes behind plugins, layers in functions."""
-    return "; ".join(filter(None, (_lacking_shapes(model), _in_functions(model))))
+def shortcomings(model: ir.Model) -> str:
+    """Name what passes do not see, and inputs that nothing reads.
+
+    They see neither shapes behind unknown plugins nor layers in functions.
+    """
+    unread = [str(each.name) for each in model.graph.inputs if not is_read(each)]
+    idle = f"nothing reads input {', '.join(unread)}" if unread else ""
+    hints = _lacking_shapes(model), _in_functions(model), idle
+    return "; ".join(filter(None, hints))
 
 
 def _in_functions(model: ir.Model) -> str:
@@ -378,23 +385,40 @@ def try_first(
     listener.on_progress(STAGE, 1, 1, f"{name}: {perf_counter() - begun:.1f} s")
 
 
-def opened(
-    path: Path, recording: CalibrationSet, options: GraphOptions, listener: Listener
-) -> tuple[ir.Model, dict[str, str]]:
-    """Read a graph that takes the frames and opens in another process.
+@dataclasses.dataclass(frozen=True)
+class OpenedGraph:
+    """A graph that takes the frames, and opened in another process.
 
-    What the adapter and the map state is metadata of the graph; it is returned, too,
-    for sessions of the file, which lacks it.
+    Attributes:
+        said: what adapter, map and another file state of state and plan: metadata of
+            the model, and for sessions of the file, which lacks them.
+        known: which inputs are state and which output is the plan, and from where that
+            is known, in a line; empty if neither is.
     """
+
+    model: ir.Model
+    said: Mapping[str, str]
+    known: str
+
+
+def opened(
+    path: Path,
+    recording: CalibrationSet,
+    options: GraphOptions,
+    listener: Listener,
+    others: Iterable[Path] = (),
+) -> OpenedGraph:
+    """Read a graph, and open it apart; `others` lend what its own metadata lack."""
     model = graph.load(path)
     module_map = options.module_map or own_map(path)
-    said = adapted(model, options.adapter, module_map)
+    own = {each: graph.load(each).metadata_props for each in others if each != path}
+    known = stated(model, path, options.adapter, module_map, own)
     recording.check(model)
     provider = options.runs_on
     try_first(
         model, path.name, recording, listener=listener, file=path, provider=provider
     )
-    return model, said
+    return OpenedGraph(model, *known)
 
 
 def _end(code: int) -> str:

@@ -47,7 +47,8 @@ class CompareResult(Result):
     `agents` is None unless the metadata ``me2e.sets`` names outputs that both graphs
     have. `liveness` is None if it was not asked for; `runtime`, what onnxruntime's
     int8 answers otherwise, if there is none to ask.
-    `slow_here` tells by file name of int8 whose form is slow on this CPU.
+    `slow_here` tells by file name of int8 whose form is slow on this CPU, `known` from
+    where state and plan are known.
     """
 
     reference: Path
@@ -57,6 +58,7 @@ class CompareResult(Result):
     agents: SetFidelity | None = None
     runtime: RuntimeLoss | None = None
     slow_here: Mapping[str, str] = dataclasses.field(default_factory=dict)
+    known: str = ""
 
     def shown(self) -> Shown:
         """Return how far outputs, agents and the plan moved, and what is dead."""
@@ -77,6 +79,7 @@ class CompareResult(Result):
                 *([] if self.agents is None else [_agents(self.agents)]),
             ),
             (
+                *filter(None, [self.known]),
                 _plan_moved(fidelity),
                 *(() if liveness is None else liveness.lines()),
                 *(() if self.runtime is None else self.runtime.lines()),
@@ -94,6 +97,7 @@ class CompareResult(Result):
             "liveness": self.liveness,
             "runtime": self.runtime,
             "slow_here": self.slow_here,
+            "known": self.known,
         }
 
 
@@ -149,13 +153,13 @@ def compare(
     recording, provider = CalibrationSet(Path(frames)), options.runs_on
     # each graph must take the frames, and open in another process first
     graphs = {
-        path: opened(path, recording, options, listener)
+        path: opened(path, recording, options, listener, paths)
         for path in dict.fromkeys(paths)
     }
     slow = {
         path.name: why
-        for path, (model, _) in graphs.items()
-        if (why := slow_here(model, provider))
+        for path, each in graphs.items()
+        if (why := slow_here(each.model, provider))
     }
     total = len(recording)
 
@@ -167,7 +171,7 @@ def compare(
     def session(path: Path, *, optimize: bool = True, stock: bool = False) -> Session:
         return Session(
             path, optimize=optimize, stock=stock, release=True, provider=provider,
-            said=graphs[path][1],
+            said=graphs[path].said,
         )  # fmt: skip
 
     left = session(paths[0], optimize=not options.as_it_stands)
@@ -178,13 +182,14 @@ def compare(
     except GraphError as error:
         raise GraphError(f"{paths[0]}: {error}") from error
     # what onnxruntime's int8 answers, beside the nodes as they stand
-    kernels, judged = None, graphs[paths[1]][0]
+    kernels, judged = None, graphs[paths[1]].model
     if not options.as_it_stands and has_int8_kernels(judged, provider):
         kernels = session(paths[1], stock=True)
     shown = map(reported, recording)
     found = compared(left, right, shown, judged, kernels, sets, alive=options.alive)
+    known = "; ".join(dict.fromkeys(graphs[path].known for path in paths))
     return CompareResult(
-        *paths, found.fidelity, found.liveness, found.agents, found.runtime, slow
+        *paths, found.fidelity, found.liveness, found.agents, found.runtime, slow, known
     )
 
 
@@ -302,7 +307,7 @@ def first_difference(
     paths = model_path(reference), model_path(candidate)
     recording = CalibrationSet(Path(frames))
     models = {
-        path: with_modules(opened(path, recording, options, listener)[0])
+        path: with_modules(opened(path, recording, options, listener, paths).model)
         for path in dict.fromkeys(paths)
     }
     shown = tuple(itertools.islice(recording, FRAMES))

@@ -115,7 +115,8 @@ def compare_dump(
     recording, answered = CalibrationSet(Path(frames)), EngineDump(dump)
     answered.check(recording)
     notes, inner = _checked_names(answered, path, graph.load(path)), None
-    loaded, said = opened(path, recording, options, listener)
+    opening = opened(path, recording, options, listener)
+    loaded, said = opening.model, opening.said
     provider = options.runs_on
     session = Session(path, optimize=False, release=True, provider=provider, said=said)
     run = EngineRun(session, recording, answered)

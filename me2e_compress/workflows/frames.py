@@ -17,11 +17,12 @@ from me2e_compress.calibration.recording import (
 )
 from me2e_compress.display import counted
 from me2e_compress.driving.adapter import Adapter
+from me2e_compress.driving.adapter.outputs import adapted
 from me2e_compress.driving.onnx_policy import OnnxPolicy
 from me2e_compress.driving.shipped_adapters import adapter_file
 from me2e_compress.errors import FramesError
 from me2e_compress.extras import need_extra
-from me2e_compress.graph import sha256_of
+from me2e_compress.graph import load, sha256_of
 from me2e_compress.runtime.frames import Frame
 from me2e_compress.shipped.drivers import shipped
 from me2e_compress.version import __version__
@@ -124,7 +125,9 @@ def _recorded(
         pixels, about["log"] = log.pixels(request), LOGS.text(log)
     else:
         try_first(model, model.name, listener=listener, provider=options.runs_on)
-        make, about["seed"] = _driven(model, adapter, options), options.seed
+        said = adapted(load(model), None, options.module_map)
+        of += f" {said}" if said else ""
+        make, about["seed"] = _driven(model, adapter, said, options), options.seed
 
     def reported(begin: Begin) -> Iterator[Frame]:
         for frame in make(begin):
@@ -136,12 +139,14 @@ def _recorded(
     return write_recording(folder, reported, about, key, pixels)
 
 
-def _driven(model: Path, adapter: Path | None, options: FramesOptions) -> Source:
+def _driven(
+    model: Path, adapter: Path | None, said: Mapping[str, str], options: FramesOptions
+) -> Source:
     need_extra("highway", "recording frames of a driver")
     from me2e_compress.evaluators.highway.driven_frames import driven_frames
 
-    adapted = None if adapter is None else Adapter.load(adapter)
-    policy = OnnxPolicy.open(model, adapted, options.runs_on)
+    loaded = None if adapter is None else Adapter.load(adapter)
+    policy = OnnxPolicy.open(model, loaded, options.runs_on, said=said)
     driver = OnnxPolicy.open(shipped("highway"))
     length = options.scene_length
     return lambda begin: driven_frames(

@@ -14,7 +14,6 @@ from me2e_compress.errors import GraphError
 from me2e_compress.graph import provenance
 from me2e_compress.graph.modules.assign import Item, assign, itemise
 from me2e_compress.graph.modules.module_map import ModuleMap
-from me2e_compress.graph.nodes import is_read
 from me2e_compress.graph.opset import read_as
 from me2e_compress.graph.recurrence import recurrent_inputs
 from me2e_compress.graph.summary import Port, macs_counter
@@ -22,7 +21,7 @@ from me2e_compress.manager import PassManager, recipe
 from me2e_compress.passes import Context
 from me2e_compress.passes.fix_shapes import FixShapes, open_dimensions
 from me2e_compress.passes.freeze_inputs import advice
-from me2e_compress.workflows.checks import load_map, model_path, unseen
+from me2e_compress.workflows.checks import load_map, model_path, shortcomings
 from me2e_compress.workflows.options import InspectOptions
 from me2e_compress.workflows.result import Result, Shown
 
@@ -162,11 +161,9 @@ def inspect(model: str | Path, options: InspectOptions | None = None) -> Inspect
         fed_back = recurrent_inputs(loaded)
     except GraphError as error:
         wrong = str(error)
-    unread = [str(e.name) for e in loaded.graph.inputs if not is_read(e)]
-    idle = f"nothing reads input {', '.join(unread)}" if unread else ""
     total = sum(item.macs or 0 for item in costs.values())
     unknown = sum(item.unknown_macs_nodes or 0 for item in costs.values())
-    hints = unseen(loaded), wrong, idle, "" if wrong else advice(loaded)
+    hints = wrong, shortcomings(loaded), "" if wrong else advice(loaded)
     return InspectResult(
         path.name,
         graph.file_bytes(path),

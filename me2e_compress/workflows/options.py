@@ -193,6 +193,8 @@ class InspectOptions(MapOptions, AdapterOptions):
 class FramesOptions(WriteOptions, AdapterOptions, ProviderOptions):
     """Which frames are made."""
 
+    module_map: Annotated[File | None, Parameter(parse=False)] = None
+    """says plan and state of the model, as an adapter does"""
     count: Count = 256
     """number of frames"""
     seed: int = 0

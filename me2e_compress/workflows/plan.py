@@ -11,6 +11,7 @@ import onnx_ir as ir
 from me2e_compress import graph
 from me2e_compress.calibration.observers import DEFAULT_METHOD
 from me2e_compress.display import table
+from me2e_compress.driving.adapter.outputs import adapted
 from me2e_compress.errors import PreconditionError, RecipeError
 from me2e_compress.graph.modules.module_map import ModuleMap
 from me2e_compress.manager import PassManager, recipe
@@ -25,9 +26,10 @@ from me2e_compress.quantization.decision import (
     save_plan,
 )
 from me2e_compress.quantization.rules import DEFAULT_RULES, RULE_SETS
+from me2e_compress.shipped.drivers import own_map
 from me2e_compress.targets import DEFAULT_TARGET, TARGETS
 from me2e_compress.targets.quantized import describe_quantized
-from me2e_compress.workflows.checks import load_map, model_path, unseen, writing
+from me2e_compress.workflows.checks import load_map, model_path, shortcomings, writing
 from me2e_compress.workflows.options import PlanOptions
 from me2e_compress.workflows.result import Result, Shown
 
@@ -220,7 +222,8 @@ def _planned(file: Path, model: ir.Model, options: PlanOptions) -> PlanResult:
         target=options.target or DEFAULT_TARGET,
         overrides=None if options.overrides is None else Path(options.overrides),
     )
+    adapted(model, None, options.module_map or own_map(file))
     ready = PreparedGraph.of(file, model, options.module_map)
     made = quantizer.plan(ready.model, Context(ready.modules))
-    hints = filter(None, (unseen(model), advice(model)))
+    hints = filter(None, (shortcomings(model), advice(model)))
     return PlanResult(made, "; ".join(hints))

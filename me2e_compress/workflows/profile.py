@@ -45,6 +45,7 @@ class ProfileResult(Result):
         operators_us: microseconds of each operator, in inferences under a profiler.
         energy: joules, or why there are none; None if not asked for.
         slow_here: why the file is slow on this CPU, whose form is not its own.
+        known: which inputs are state, and from where that is known.
     """
 
     model: Path
@@ -55,6 +56,7 @@ class ProfileResult(Result):
     energy_output: Path | None = None
     budget_ms: float = BUDGET_MS
     slow_here: str | None = None
+    known: str = ""
 
     @property
     def deadlines(self) -> Deadlines:
@@ -86,7 +88,8 @@ class ProfileResult(Result):
             note = "; ".join(filter(None, (every.note, more)))
             few = dataclasses.replace(every, rows=every.rows[:_SHOWN], note=note)
             tables.append(few)
-        lines = [] if energy is None else [energy.headline]
+        joules = "" if energy is None else energy.headline
+        lines = [*filter(None, [self.known, joules])]
         count, needed = len(self.trace.samples_us), 100 * BEYOND_P99
         if count < needed:
             remedy = "" if load is None else f" (--samples {needed})"
@@ -109,6 +112,7 @@ class ProfileResult(Result):
             "operators": shares(self.operators_us),
             "energy": self.energy,
             "slow_here": self.slow_here,
+            "known": self.known,
             **(
                 {"others_cores": None, "cores": None}
                 if load is None
@@ -148,7 +152,8 @@ def profile(
     with writing([written, joules], inputs, force=options.force):
         # each measurement has inferences of its own: the profiler takes time itself
         recording, threads = CalibrationSet(Path(frames)), options.threads
-        loaded, said = opened(source, recording, options, listener)
+        opening = opened(source, recording, options, listener)
+        loaded, said = opening.model, opening.said
         provider = options.runs_on
         with OthersLoad() as others:
             trace = measure(
@@ -186,6 +191,7 @@ def profile(
         energy_output=joules,
         budget_ms=options.budget_ms,
         slow_here=slow_here(loaded, provider),
+        known=opening.known,
     )
 
 

@@ -131,15 +131,17 @@ class RealRun:
         return {**named, "stood": self.stood}
 
 
-def score_real_run(path: Path, metric_folder: Path | None = None) -> RealRun:
+def score_real_run(
+    path: Path, metric_folder: Path | None = None, routes: Path | None = None
+) -> RealRun:
     """Read and score the results of a real run.
 
     `metric_folder` holds recordings (``metric_info.json``) that do not lie below that
-    of the results.
+    of the results; `routes` is the routes file of a set of one's own.
     """
-    collected = Bench2DriveResults(path, metric_folder).collect()
+    collected = Bench2DriveResults(path, metric_folder, routes).collect()
     episodes = collected.episodes
-    set_size = metrics.FULL_SET * collected.repetitions
+    set_size = collected.set_size * collected.repetitions
     return RealRun(
         collected,
         metrics.score(episodes, set_size),
@@ -224,7 +226,8 @@ def score(
     The listener is told of damaged files, which are left out. With `joules`, a number
     or a file by folder, EER_AV of all folders together is scored too. `real_metrics` is
     a folder of recordings of real runs (``metric_info.json``) that do not lie below
-    their results.
+    their results. An ``.xml`` among the folders is the routes file of the set that real
+    runs are of.
 
     Raises:
         EvaluationError: A folder holds no results, EER_AV cannot compare the folders,
@@ -234,8 +237,11 @@ def score(
     check_budget(budget_ms)
     scores, runs = dict[str, Scores](), dict[str, RealRun]()
     driven, measured = dict[str, Sequence[Episode]](), dict[str, int | None]()
+    named = [Path(each) for each in results if Path(each).suffix == ".xml"]
+    if len(named) > 1:
+        raise EvaluationError(f"{named[1]}: one routes file names the set")
     # our own results have a manifest; anything else must be a real run
-    for path in map(Path, results):
+    for path in (Path(each) for each in results if Path(each) not in named):
         if (path / MANIFEST).exists():
             folder = ResultsFolder.open(path)
             driven[str(path)] = _episodes(folder, listener)
@@ -250,7 +256,7 @@ def score(
                 "records of a leaderboard"
             )
         apart = None if real_metrics is None else Path(real_metrics)
-        run = score_real_run(path, apart)
+        run = score_real_run(path, apart, *named)
         scores[str(path)], runs[str(path)] = run.scores, run
         driven[str(path)] = run.collected.episodes
     # it would be ignored without a word
@@ -258,6 +264,8 @@ def score(
         raise EvaluationError(
             f"{', '.join(scores)}: no results of a real run, which --metrics is about"
         )
+    if named and not runs:
+        raise EvaluationError(f"{named[0]}: it names the set of real runs: give one")
     # folders whose decisions cost nothing have no deadlines
     late = {
         name: found

@@ -76,7 +76,7 @@ class TrialFiles:
         rules = RULE_SETS.parse(options.rules or DEFAULT_RULES)
         place = TARGETS.parse(options.target or DEFAULT_TARGET)
         recording = CalibrationSet(self.frames)
-        loaded, _ = opened(self.model, recording, options, listener)
+        loaded = opened(self.model, recording, options, listener).model
         modules = load_map(options.module_map, loaded)
         scheme = QuantScheme.named(options.scheme or "full", modules)
         # the graph is prepared once; every trial starts from there

@@ -30,7 +30,7 @@ __all__ = ["cli", "command"]
         ("study s.toml -o out --records out/records", "python -m benchmarks.paper"),
         ("export vad-tiny --opset 13 -o m.onnx", "python -m models.export"),
         ("demo --stack vad-tiny", "python -m models.export"),
-        ("plan a.onnx --set-dim batch=1", "compress --set-dim"),
+        ("plan a.onnx --set-dim batch=1", "compress M.onnx -r exact --set-dim"),
         ("compress a.onnx -o b.onnx --allow-empty", "-r exact"),
         ("evaluate blind -o out --dt-ms 25", "a study's dt_ms"),
         ("routes --examine set.json", ""),

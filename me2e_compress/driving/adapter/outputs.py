@@ -1,5 +1,6 @@
 """Convert a graph's outputs to a policy's answer."""
 
+import contextlib
 import json
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
@@ -11,15 +12,22 @@ import onnx_ir as ir
 
 from me2e_compress.driving.adapter.adapter import ZEROS, Adapter
 from me2e_compress.driving.adapter.inputs import ModelInputs
-from me2e_compress.driving.contract import Observation, Shape, Trajectory, zeros
+from me2e_compress.driving.contract import Observation, Shape, Trajectory
 from me2e_compress.driving.input_sources import INPUT_SOURCES
 from me2e_compress.driving.shipped_adapters import adapter_file
 from me2e_compress.errors import EvaluationError, GraphError
 from me2e_compress.graph.modules.module_map import ModuleMap, Ports
-from me2e_compress.graph.recurrence import SETS, declared_pairs, recurrence, sides
+from me2e_compress.graph.recurrence import (
+    RECURRENT,
+    SETS,
+    declared_pairs,
+    recurrence,
+    recurrent_inputs,
+    sides,
+)
 from me2e_compress.runtime.frames import Array
 from me2e_compress.runtime.plan_adapter import PLAN, PlanAdapter
-from me2e_compress.runtime.session import DTYPES, Session
+from me2e_compress.runtime.session import DTYPES, Session, zeros
 
 COMMAND = "command"
 """Name of the navigator's command among the inputs."""
@@ -118,6 +126,69 @@ def adapted(
     return said
 
 
+def stated(
+    model: ir.Model,
+    path: Path,
+    adapter: Given,
+    module_map: Given,
+    others: Mapping[Path, Mapping[str, str]],
+) -> tuple[dict[str, str], str]:
+    """Return what is known of state and plan beside a graph's metadata, and from where.
+
+    What neither adapter, map nor own metadata state is taken from the metadata of
+    `others`, if the graph has what they name. It is written into the graph's metadata
+    and returned; see :func:`adapted`.
+    """
+    # in the order in which one overrides the others
+    sources = [(f"metadata of {path.name}", dict(model.metadata_props))]
+    for other, metadata in others.items():
+        lent = _lent(model, metadata)
+        model.metadata_props.update(lent)
+        sources.append((f"metadata of {other.name}", lent))
+    for origin, given in (("map", (None, module_map)), ("adapter", (adapter, None))):
+        named = Path(str(given[0] or given[1])).name
+        sources.append((f"{origin} {named}", adapted(model, *given)))
+    said = {key: text for _, own in sources[1:] for key, text in own.items()}
+    # what is known, by where it was said last
+    pairs, plan = dict[str, tuple[str | None, str]](), ("", "its name")
+    for origin, own in sources:
+        for name, answer in (declared_pairs(own) or {}).items():
+            if pairs.get(name, ("", ""))[0] != answer:
+                pairs[name] = answer, origin
+        if own.get(PLAN, plan[0]) != plan[0]:
+            plan = own[PLAN], origin
+    known = dict[str, list[str]]()
+    for name in recurrent_inputs(model):
+        _, origin = pairs.get(name, ("", "its name"))
+        there = known.setdefault(origin, [])
+        there.append(name if there else f"state {name}")
+    outputs = [str(each.name) for each in model.graph.outputs]
+    if (found := PlanAdapter.of(model.metadata_props, outputs)) is not None:
+        known.setdefault(plan[1], []).append(f"plan {found.output}")
+    line = "; ".join(f"{', '.join(each)}: {origin}" for origin, each in known.items())
+    return said, line
+
+
+def _lent(model: ir.Model, metadata: Mapping[str, str]) -> dict[str, str]:
+    """Return what another graph's metadata state, and this one's lack, that fits it."""
+    (inputs, outputs), own = sides(model), model.metadata_props
+    lent = dict[str, str]()
+    if RECURRENT not in own and (pairs := declared_pairs(metadata)) is not None:
+        there = {
+            name: answer
+            for name, answer in pairs.items()
+            if name in inputs and answer in (None, *outputs)
+        }
+        if there or not pairs:
+            lent[RECURRENT] = json.dumps(there)
+    if PLAN in metadata and PLAN not in own:
+        with contextlib.suppress(GraphError):  # it reads outputs that are not here
+            plan = PlanAdapter.of(metadata, list(outputs))
+            if plan is not None and plan.command_input in (None, COMMAND, *inputs):
+                lent[PLAN] = metadata[PLAN]
+    return lent
+
+
 def _stated(
     model: ir.Model, modules: ModuleMap, ports: Ports, before: Mapping[str, str]
 ) -> dict[str, str]:
@@ -162,7 +233,9 @@ def _check_stated(
             plan_of(plan, {}, outputs)
         recurrence({**model.metadata_props, **said}, *sides(model))
     except (EvaluationError, GraphError) as error:
-        raise EvaluationError(f"{origin}: {error}") from error
+        # whoever stated it is to blame, not the graph
+        words = str(error).replace(f"metadata {RECURRENT}", "[recurrent]")
+        raise EvaluationError(f"{origin}: {words}") from error
 
 
 # The use of each input and output of a graph, whether or not it could drive.
@@ -212,7 +285,7 @@ def input_uses(
             if entry is None or entry.first == ZEROS:
                 try:
                     zeros(name, port)
-                except EvaluationError as error:
+                except GraphError as error:
                     problems[name] = str(error)
     return tuple(
         PortUse(

@@ -1,11 +1,12 @@
 """Evaluator that turns results of real CARLA runs into episodes."""
 
 import json
+import re
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import ClassVar, Literal, Self
+from typing import ClassVar, Self
 
 from me2e_compress.driving.policies import Driver
 from me2e_compress.errors import EvaluationError
@@ -26,10 +27,8 @@ from me2e_compress.metrics.episode import EgoFrame, Episode, InferenceRecord
 from me2e_compress.metrics.scores import FULL_SET
 from me2e_compress.registry import documents
 
-RouteSet = Literal["0.0.3", "0.0.4"]
-
 _IDS = json.loads(Path(__file__).with_name("route_ids.json").read_bytes())
-ROUTE_SETS: dict[RouteSet, frozenset[str]] = {
+ROUTE_SETS: dict[str, frozenset[str]] = {
     version: frozenset(ids) for version, ids in _IDS.items()
 }
 """The ids of the 220 routes of each version of Bench2Drive: those of
@@ -37,12 +36,25 @@ leaderboard/data/bench2drive220.xml and of bench2drive_0.0.4_val.xml, which shar
 The ten routes of "dev10" belong to the first."""
 
 
+_ROUTE = re.compile(r"<route\b[^>]*?\bid\s*=\s*[\"']([^\"']+)[\"']")
+
+
+def _ids(routes: Path) -> frozenset[str]:
+    """Read the ids of a leaderboard's routes file."""
+    with documents.reading(routes, EvaluationError, "a routes file"):
+        ids = _ROUTE.findall(documents.content(routes).decode())
+    if not ids:
+        raise EvaluationError(f"{routes}: no <route id=...> stands in it")
+    return frozenset(ids)
+
+
 @dataclass
 class CollectedResults:
     """Every route once, in the order of numbers, and everything else below a folder.
 
     Attributes:
-        route_set: The version of Bench2Drive that the routes are from, if any.
+        route_set: The version of Bench2Drive that the routes are from, or the name of
+            one's own set, if any.
         missing: Numbers of the set's routes without a record.
         repeated: Routes with identical records, as when a merged file lies next to its
             parts.
@@ -58,7 +70,8 @@ class CollectedResults:
     """
 
     episodes: list[Episode] = field(default_factory=list)
-    route_set: RouteSet | None = None
+    route_set: str | None = None
+    set_size: int = FULL_SET
     crashed: list[str] = field(default_factory=list)
     missing: list[str] = field(default_factory=list)
     foreign: list[str] = field(default_factory=list)
@@ -73,10 +86,10 @@ class CollectedResults:
     notes: list[str] = field(default_factory=list)
 
     @classmethod
-    def of(cls, files: FoundFiles) -> Self:
+    def of(cls, files: FoundFiles, routes: Path | None = None) -> Self:
         """Choose one record of each route, and read the recordings that belong to it.
 
-        One of the files must hold a record.
+        One of the files must hold a record. `routes` names the set; None finds it.
         """
         # what the results files are, whole or not
         made, by_route = cls(), dict[str, list[RouteRecord]]()
@@ -108,8 +121,10 @@ class CollectedResults:
         # which routes of the set are missing, and which are foreign
         times = Counter(each.number for each in records)
         made.repetitions = max(times.values())
-        best = max(ROUTE_SETS, key=lambda name: len(ROUTE_SETS[name] & set(times)))
-        whole = ROUTE_SETS[best]
+        sets = dict(ROUTE_SETS) if routes is None else {routes.stem: _ids(routes)}
+        best = max(sets, key=lambda name: len(sets[name] & set(times)))
+        whole = sets[best]
+        made.set_size = len(whole)
         if whole & set(times):
             made.route_set = best
             made.missing = sorted(whole - set(times), key=_by_number)
@@ -189,16 +204,19 @@ class Bench2DriveResults(Evaluator):
             one results file.
         metrics: Recordings (``metric_info.json``) are found below it too; None has
             none apart.
+        route_file: A leaderboard's routes file, whose routes are the whole set; None
+            finds which of Bench2Drive's it is.
     """
 
     name: ClassVar[str] = "bench2drive"
     folder: Path
     metrics: Path | None = None
+    route_file: Path | None = None
 
     @property
     def set_size(self) -> int:
         """How many routes a whole benchmark has."""
-        return FULL_SET
+        return FULL_SET if self.route_file is None else len(_ids(self.route_file))
 
     def episodes(
         self, policy: Driver | None, drive: Drive, folder: Path, listener: Listener
@@ -230,7 +248,7 @@ class Bench2DriveResults(Evaluator):
                     whys.append(f"no whole record: {record}: {why}")
             whys += (f"no record: {e.path.name} holds none" for e in found.results)
             raise EvaluationError(f"{self.folder}: {[*whys, f'{none} below it'][0]}")
-        return CollectedResults.of(found)
+        return CollectedResults.of(found, self.route_file)
 
 
 def _by_number(number: str) -> tuple[int, str]:

@@ -33,7 +33,6 @@ _NUMBER = re.compile(r"_\d+$")
 _ROUTE = re.compile(r"[\w.-]{1,200}")
 _OUTSIDE_LANES = InfractionKind.OUTSIDE_ROUTE_LANES
 
-_FAILED = "Failed"
 ENDINGS: Mapping[str, Ending] = MappingProxyType(
     {
         "Completed": Ending.COMPLETED,
@@ -46,7 +45,7 @@ ENDINGS: Mapping[str, Ending] = MappingProxyType(
         "Failed - Agent couldn't be set up": Ending.POLICY_FAILED,
         "Failed - Agent's sensors were invalid": Ending.POLICY_FAILED,
         "Failed - Simulation crashed": Ending.SIMULATOR_FAILED,
-        _FAILED: Ending.SIMULATOR_FAILED,
+        "Failed": Ending.SIMULATOR_FAILED,
     }
 )
 """By status. Bench2Drive repeats a route whose status is just ``Failed``,
@@ -107,12 +106,8 @@ def read_record(raw: object) -> RouteRecord:
             notes.append(f"{each.kind.value}: {words}")
     ending = ENDINGS.get(record.status)
     if ending is None:
-        if not record.status.startswith(_FAILED):
-            status = record.status[:60]
-            raise BrokenRecordError(
-                f"status {status!r} is not that of a finished route"
-            )
-        ending = Ending.SIMULATOR_FAILED
+        status = record.status[:60]
+        raise BrokenRecordError(f"status {status!r} is not that of a finished route")
     scenario = _NUMBER.sub("", record.scenario_name or "")
     episode = Episode(
         route=record.route_id,
@@ -160,8 +155,8 @@ class _Part(BaseModel):
 
 class _Scores(_Part):
     score_route: Annotated[float, Field(ge=0.0, le=100.0)]
-    score_penalty: _Finite
-    score_composed: _Finite
+    score_penalty: Annotated[float, Field(ge=0.0, le=1.0)]
+    score_composed: Annotated[float, Field(ge=0.0, le=100.0)]
 
 
 class _Meta(_Part):

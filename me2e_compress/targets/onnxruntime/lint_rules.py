@@ -8,7 +8,6 @@ import dataclasses
 from collections.abc import Iterator, Mapping
 
 import numpy as np
-import onnx
 import onnx_ir as ir
 
 from me2e_compress.graph import (
@@ -30,6 +29,8 @@ from me2e_compress.graph.nodes import (
     sole_reader,
     unrenamed,
 )
+from me2e_compress.graph.opset import on_disk
+from me2e_compress.graph.runtime_operators import has_operator, newest_ir, reads
 from me2e_compress.graph.shapes import open_shape
 from me2e_compress.graph.validity import ORIGINAL_DOMAIN
 from me2e_compress.operators import find
@@ -46,7 +47,12 @@ from me2e_compress.targets import (
     warning,
 )
 from me2e_compress.targets.onnxruntime.region import never_negative
-from me2e_compress.targets.quantized import DEQUANTIZE, QUANTIZE, is_dequantized
+from me2e_compress.targets.quantized import (
+    DEQUANTIZE,
+    QUANTIZE,
+    is_dequantized,
+    pairs_of,
+)
 from me2e_compress.targets.weights import evaluate_constants, quantize_weight
 
 INT32_MAX = 2.0**31 - 1  # a bias of more steps becomes -2^31
@@ -323,10 +329,31 @@ _RULES = {"wrapped-bias": _wrapped, "bias-scale": _misread, "float-weight": _rou
 
 
 def opset(model: ir.Model) -> Iterator[LintFinding]:
-    """Find opsets that ONNX has not released."""
-    found, newest = opset_of(model), onnx.defs.onnx_opset_version()
-    if found > newest:
-        yield error("opset", None, f"opset {found}, the newest known is {newest}")
+    """Find files that onnxruntime cannot run as they lie on disk."""
+    (version, found), reasons = on_disk(model), list[str]()
+    if version > newest_ir():
+        reasons.append(f"onnxruntime reads IR version {newest_ir()} at most")
+    if not reads(found):
+        reasons.append(f"onnxruntime does not read opset {found}")
+    used = {node.op_type for node in nodes_of(model) if is_standard(node)}
+    lifted = opset_of(model) != found
+    for each in sorted(used) if lifted else ():
+        if has_operator(each, opset_of(model)) and not has_operator(each, found):
+            reasons.append(f"onnxruntime has no {each} in opset {found}")
+    if reasons:
+        file = f"the file is of opset {found} and IR version {version}"
+        cure = "compress -r exact writes it so that it runs"
+        yield error("opset", None, f"{file}: {', '.join(reasons)}; {cure}")
+
+
+def scale_shapes(model: ir.Model) -> Iterator[LintFinding]:
+    """Find scales of a rank that no kernel takes, though the file opens."""
+    for node in pairs_of(model):
+        shape = open_shape(node.inputs[1])
+        blocks = node.attributes.get_int("block_size", 0)
+        if shape and len(shape) > 1 and not blocks:
+            said = f"its scale is {list(shape)}: one number, or a row of one a channel"
+            yield error("scale-shape", node, said)
 
 
 def operators(model: ir.Model) -> Iterator[LintFinding]:
@@ -431,6 +458,7 @@ RULES: tuple[LintRule, ...] = (
     of_opset,
     divided_grids,
     opset,
+    scale_shapes,
     operators,
     kernels,
     signed_activations,

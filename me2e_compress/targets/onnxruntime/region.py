@@ -53,13 +53,13 @@ def objection(node: ir.Node) -> str | None:
         return reader and f"it writes uint8, whose rounding {reader} magnifies"
     if node.op_type == "Gemm":
         factors = [node.attributes.get_float(each, 1.0) for each in ("alpha", "beta")]
-        if (
-            factors == [1.0, 1.0]
-            and not node.attributes.get_int("transA", 0)
-            and (bias is None or is_bias(bias, 2, extent(node, weight=True).columns))
-        ):
+        if factors != [1.0, 1.0]:
+            return "QGemm takes neither alpha nor beta"
+        if node.attributes.get_int("transA", 0):
+            return "QGemm takes no transposed left operand (transA)"
+        if bias is None or is_bias(bias, 2, extent(node, weight=True).columns):
             return None
-        return "QGemm takes no factors, and one bias for all rows"
+        return "QGemm takes one bias for all rows"
     if (rank_of(node.inputs[0]) or 0) < 2:
         return "the left operand is a vector, or of unknown rank"
     return None if is_one_matrix(node) else "the weight is a batch of matrices"

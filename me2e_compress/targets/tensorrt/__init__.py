@@ -17,11 +17,12 @@ import onnx_ir as ir
 
 from me2e_compress.calibration.observers import scale_of
 from me2e_compress.calibration.ranges import Ranges
-from me2e_compress.graph import input_at, rewrite, static_shape
+from me2e_compress.graph import input_at, is_standard, nodes_of, rewrite, static_shape
 from me2e_compress.operators import find, int8_inputs
 from me2e_compress.quantization.decision import Decision, QuantPlan
 from me2e_compress.quantization.plan import share_scales, tensors_of
-from me2e_compress.targets import LintRule, Target
+from me2e_compress.targets import LintFinding, LintRule, Target
+from me2e_compress.targets.quantized import is_in_a_pair
 from me2e_compress.targets.tensorrt.lint.support import rules, version_of
 from me2e_compress.targets.weights import (
     QuantizedWeight,
@@ -97,6 +98,22 @@ class TensorRT(Target):
     def lint_rules(self) -> tuple[LintRule, ...]:
         """Return the rules of its parser and of explicit quantization."""
         return rules(version_of(self.version) if self.version else None)
+
+    def lint(self, model: ir.Model) -> tuple[LintFinding, ...]:
+        """List all findings, as if no Clip stood between the nodes of a pair.
+
+        brevitas writes one there. TensorRT-RTX 1.7 builds int8 kernels of it, for
+        weights in float, activations and narrow ranges (measured).
+        """
+        copy = model.clone()
+        copy.meta.update(model.meta)
+        for node in list(nodes_of(copy)):
+            if node.op_type == "Clip" and is_standard(node) and is_in_a_pair(node):
+                for reader, index in tuple(node.outputs[0].uses()):
+                    reader.replace_input_with(index, node.inputs[0])
+                assert node.graph is not None
+                node.graph.remove(node)
+        return super().lint(copy)
 
 
 def _with_room(
