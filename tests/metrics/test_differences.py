@@ -213,18 +213,21 @@ def test_the_same_seed_gives_the_same_intervals() -> None:
 @pytest.mark.parametrize(
     ("bounds", "interval"),
     [
-        ((0.0, 100.0), (100 - 100 * (1 - 0.05**0.1), 100.0)),
-        ((-100.0, 200.0), (100 - 200 * (1 - 0.05**0.1), 100 + 100 * (1 - 0.05**0.1))),
+        ((0.0, 100.0), (100 - 100 * (1 - 0.05**0.025), 100.0)),
+        (
+            (-100.0, 200.0),
+            (100 - 200 * (1 - 0.05**0.025), 100 + 100 * (1 - 0.05**0.025)),
+        ),
     ],
 )
 def test_routes_that_all_are_equal_have_no_interval_of_no_width(
     bounds: tuple[float, float], interval: tuple[float, float]
 ) -> None:
-    found = mean_estimate([100.0] * 10, TYPES[:10], "%", bounds=bounds)
+    found = mean_estimate([100.0] * 40, TYPES[:40], "%", bounds=bounds)
 
     assert (found.low, found.high) == pytest.approx(interval)
-    # two types: 1 - 0.05 ** (1 / 2)
-    low = 100 - (100 - bounds[0]) * (1 - 0.05**0.5)
+    # eight types: 1 - 0.05 ** (1 / 8)
+    low = 100 - (100 - bounds[0]) * (1 - 0.05**0.125)
     assert found.anew_low == pytest.approx(low)
 
 
@@ -237,9 +240,9 @@ def test_types_that_are_all_or_nothing_leave_routes_unseen() -> None:
 
 
 def test_what_has_no_interval() -> None:
-    """Equal values without bounds, one route; of one type none over others."""
+    """Equal values without bounds, one route; of seven types none over others."""
     equal, one = mean_estimate([7.0] * 6, TYPES[:6], "s"), mean_estimate([3.0], "a", "")
-    alone = mean_estimate([3.0, 4.0, 9.0], ["a"] * 3, "%")
+    alone = mean_estimate(alike(0.3)[:35], TYPES[:35], "%")
 
     assert (equal.low, equal.high, equal.anew_low, one.low) == (None,) * 4
     assert alone.low is not None

@@ -69,7 +69,6 @@ def test_a_record_becomes_an_episode() -> None:
         ("Failed - Agent's sensors were invalid", Ending.POLICY_FAILED, True),
         ("Failed - Simulation crashed", Ending.SIMULATOR_FAILED, True),
         ("Failed", Ending.SIMULATOR_FAILED, True),
-        ("Failed - for a reason of tomorrow", Ending.SIMULATOR_FAILED, True),
     ],
 )
 def test_every_status_has_an_ending(status: str, ending: Ending, crashed: bool) -> None:
@@ -124,6 +123,9 @@ def scored(value: object) -> Json:
         (scored("high"), "scores.score_composed: Input should be"),
         (record(score=(140.0, 1.0, 140.0)), "scores.score_route: Input should be less"),
         (record(status="Started"), "status 'Started' is not that of a finished route"),
+        (record(status="Failed - why"), "'Failed - why' is not that of a finished"),
+        (record(score=(80, 1.0, 101)), "score_composed: Input should be less than or"),
+        (record(score=(80, -0.5, 0)), "score_penalty: Input should be greater than"),
         ({**record(), "route_id": "../x"}, "route_id: '../x' is no name"),
         ([], "record: Input should be"),
         (
