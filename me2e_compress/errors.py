@@ -11,7 +11,6 @@ __all__ = [
     "GraphError",
     "Me2eError",
     "MissingExtraError",
-    "MissingPackageError",
     "ModuleMapError",
     "PassError",
     "PreconditionError",
@@ -220,15 +219,3 @@ class BrokenPackageError(Me2eError):
             f"{package} is installed, but cannot be imported: {reason}: pip install"
             f" --force-reinstall 'me2e-compress[{extra}]'"
         )
-
-
-class MissingPackageError(Me2eError):
-    """A package that none of our extras brings is not installed."""
-
-    def __init__(self, package: str) -> None:
-        super().__init__(package)
-
-    def __str__(self) -> str:
-        """Return the line that says what to install."""
-        (package,) = self.args
-        return f"{package} is not installed: pip install {package}"

@@ -20,7 +20,6 @@ from me2e_compress.cli.app import COMMANDS
 from me2e_compress.errors import (
     BrokenPackageError,
     MissingExtraError,
-    MissingPackageError,
 )
 from me2e_compress.extras import MODULES, explained, need_extra
 
@@ -259,7 +258,6 @@ def test_a_defect_of_ours_keeps_its_traceback(monkeypatch: pytest.MonkeyPatch) -
     [
         MissingExtraError("ray", "ray"),
         BrokenPackageError("cv2", "highway", "libGL.so.1"),
-        MissingPackageError("tensorrt"),
     ],
 )
 def test_errors_travel_between_processes(error: Exception) -> None:

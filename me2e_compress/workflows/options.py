@@ -190,11 +190,9 @@ class InspectOptions(MapOptions, AdapterOptions):
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class FramesOptions(WriteOptions, AdapterOptions, ProviderOptions):
+class FramesOptions(WriteOptions, GraphOptions):
     """Which frames are made."""
 
-    module_map: Annotated[File | None, Parameter(parse=False)] = None
-    """says plan and state of the model, as an adapter does"""
     count: Count = 256
     """number of frames"""
     seed: int = 0

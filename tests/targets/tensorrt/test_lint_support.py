@@ -149,7 +149,6 @@ def test_a_version_that_is_none(text: str) -> None:
         (20, "", None),
         (21, "", "warning"),
         (25, "", "warning"),
-        (8, "", "error"),
         (26, "", "warning"),
         (21, "10.13", "warning"),
         (24, "10.15", None),
