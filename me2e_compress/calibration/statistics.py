@@ -179,10 +179,10 @@ def first_maker(
             ends |= {str(each.name) for each in reads_of(node)} & names
     for value in made:
         if value.name in ends and (first := value.producer()) is not None:
+            behind = f"; {counted(len(ends) - 1, 'tensor')} behind it"
             return (
                 f"{first.name or value.name} ({first.op_type}) is first to make NaN or"
-                f" infinity, in {value.name}; {counted(len(ends) - 1, 'tensor')} behind"
-                " it"
+                f" infinity, in {value.name}{behind if len(ends) > 1 else ''}"
             )
     return ""
 

@@ -5,11 +5,20 @@ import itertools
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 
+import numpy as np
 import onnx_ir as ir
 
+from me2e_compress import graph
+from me2e_compress.calibration.calibrator import Extremes
 from me2e_compress.calibration.dataset import CalibrationSet
+from me2e_compress.calibration.statistics import first_maker, places_of
 from me2e_compress.display import Table, counted, number, table
-from me2e_compress.errors import EvaluationError, GraphError, ModuleMapError
+from me2e_compress.errors import (
+    EvaluationError,
+    FramesError,
+    GraphError,
+    ModuleMapError,
+)
 from me2e_compress.fidelity import ALIVE
 from me2e_compress.fidelity.compare import (
     Fidelity,
@@ -27,7 +36,7 @@ from me2e_compress.fidelity.liveness import Liveness, LivenessTally
 from me2e_compress.graph import provenance
 from me2e_compress.graph.modules.assign import assign, map_of
 from me2e_compress.graph.modules.module_map import ModuleMap
-from me2e_compress.runtime.frames import Frame
+from me2e_compress.runtime.frames import Array, Frame
 from me2e_compress.runtime.session import Session
 from me2e_compress.targets.onnxruntime import slow_here
 from me2e_compress.workflows.checks import model_path, opened
@@ -48,7 +57,7 @@ class CompareResult(Result):
     have. `liveness` is None if it was not asked for; `runtime`, what onnxruntime's
     int8 answers otherwise, if there is none to ask.
     `slow_here` tells by file name of int8 whose form is slow on this CPU, `known` from
-    where state and plan are known.
+    where state and plan are known, `not_finite` which node makes NaN first.
     """
 
     reference: Path
@@ -59,6 +68,7 @@ class CompareResult(Result):
     runtime: RuntimeLoss | None = None
     slow_here: Mapping[str, str] = dataclasses.field(default_factory=dict)
     known: str = ""
+    not_finite: tuple[str, ...] = ()
 
     def shown(self) -> Shown:
         """Return how far outputs, agents and the plan moved, and what is dead."""
@@ -85,7 +95,7 @@ class CompareResult(Result):
                 *(() if self.runtime is None else self.runtime.lines()),
                 *(f"{name}: {why}" for name, why in self.slow_here.items()),
             ),
-            (*fidelity.strays, *faults),
+            (*fidelity.strays, *self.not_finite, *faults),
             EvaluationError(f"{self.candidate}: {dead}") if dead else None,
         )
 
@@ -98,6 +108,7 @@ class CompareResult(Result):
             "runtime": self.runtime,
             "slow_here": self.slow_here,
             "known": self.known,
+            "not_finite": self.not_finite,
         }
 
 
@@ -185,12 +196,53 @@ def compare(
     kernels, judged = None, graphs[paths[1]].model
     if not options.as_it_stands and has_int8_kernels(judged, provider):
         kernels = session(paths[1], stock=True)
-    shown = map(reported, recording)
-    found = compared(left, right, shown, judged, kernels, sets, alive=options.alive)
+    shown, worst = map(reported, recording), _FirstBad()
+    found = compared(
+        left, right, shown, judged, kernels, sets, worst, alive=options.alive
+    )
+    makers = dict[str, str]()
+    for path, each in zip(paths, (left, right), strict=True):
+        if made := worst.maker(graphs[path].model.clone(), each):
+            makers.setdefault(made, f"{path.name}: {made}")
     known = "; ".join(dict.fromkeys(graphs[path].known for path in paths))
     return CompareResult(
-        *paths, found.fidelity, found.liveness, found.agents, found.runtime, slow, known
+        *(*paths, found.fidelity, found.liveness, found.agents, found.runtime, slow),
+        known=known,
+        not_finite=tuple(makers.values()),
     )
+
+
+class _FirstBad:
+    """Keeps the first frame, or the first of which an output holds NaN or infinity."""
+
+    def __init__(self) -> None:
+        self._frame: Frame | None = None
+        self._is_bad = False
+
+    def add(
+        self, left: Mapping[str, Array], right: Mapping[str, Array], frame: Frame
+    ) -> None:
+        """Look at a frame's outputs of two graphs."""
+        floats = [v for v in (*left.values(), *right.values()) if v.dtype.kind == "f"]
+        if not self._is_bad and not all(np.isfinite(each).all() for each in floats):
+            self._frame, self._is_bad = frame, True
+        self._frame = self._frame or frame
+
+    def maker(self, model: ir.Model, session: Session) -> str:
+        """Name the node that makes the first of it that an output or a place reads.
+
+        State is that of a scene's beginning.
+        """
+        graph.infer_shapes(model)  # untyped values are not looked at
+        places, frame = places_of(model), self._frame
+        if frame is None or not (places or self._is_bad):
+            return ""
+        read, probe = {*places, *session.outputs}, Extremes()
+        try:
+            inputs = {**frame.arrays, **session.first_state(frame.arrays)}
+            return first_maker(model, inputs, read, probe, session.provider)
+        except (GraphError, FramesError):  # it runs optimized alone
+            return ""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -210,6 +262,7 @@ def compared(
     model: ir.Model,
     kernels: Session | None = None,
     sets: SetTally | None = None,
+    watch: _FirstBad | None = None,
     *,
     alive: float = ALIVE,
 ) -> Comparison:
@@ -222,7 +275,7 @@ def compared(
     frames, again = itertools.tee(frames)
     runtime = None if kernels is None else RuntimeTally(kernels, again)
     del again  # what nobody reads must not be kept
-    watching = [each.add for each in (sets, lively, runtime) if each is not None]
+    watching = [each.add for each in (sets, watch, lively, runtime) if each is not None]
     fidelity = measure(reference, candidate, frames, watching)
     return Comparison(
         fidelity,
