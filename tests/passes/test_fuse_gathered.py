@@ -7,7 +7,10 @@ import numpy as np
 import onnx_ir as ir
 import pytest
 
+from me2e_compress.passes.digits import whole
 from me2e_compress.passes.fuse_operators import FuseOperators
+from me2e_compress.passes.fuse_operators.gathered import AT, BEYOND, PAIR, Sampling
+from me2e_compress.passes.fuse_operators.views import View
 from tests.passes.decomposed import FUSED, PLAIN
 from tests.passes.small import apply, ops, read
 from tests.passes.test_fuse_operators import fused
@@ -141,3 +144,23 @@ def test_what_is_no_sampling_of_zeros_stays(opset: int, reason: str) -> None:
     assert result.changes == 0
     (note,) = result.notes
     assert reason in note
+
+
+@pytest.mark.parametrize("shared", [True, False], ids=["one value", "x and y apart"])
+def test_positions_are_drawn_over_each_axis_of_the_map(shared: bool) -> None:
+    """The map has 4 rows and 40 columns: x is the first of a pair."""
+    image = View(ir.Value(name="image"), tuple(map(whole, "bcrw", (1, 2, 4, 40))))
+    pair = (whole(AT, 300), whole(PAIR, 2))
+    at = [View(ir.Value(name="xy"), pair)]
+    if not shared:
+        at = [View(ir.Value(name=each), pair[:1]) for each in "xy"]
+    sampling = Sampling(image, image, (1, 2, 4, 40), tuple(at), (10.0, 1.0), (0.0, 1.5))
+
+    drawn = sampling.draw(np.random.default_rng(0))
+
+    x, y = np.concatenate([drawn[e.value].reshape(300, -1) for e in at], 1).T
+    for places, size, scale, shift in ((x, 40, 10.0, 0.0), (y, 4, 1.0, 1.5)):
+        pixels = places * scale + shift
+        assert pixels.min() < 0 < size - 1 < pixels.max()
+        assert (pixels > -BEYOND - 0.01).all()
+        assert (pixels < size + BEYOND - 0.99).all()
