@@ -28,6 +28,8 @@ LARGEST = 1e15
 """The largest number of an option: beyond, milliseconds are no whole microseconds."""
 MOST_THREADS = 1024
 """Most threads of a session: onnxruntime starts all of them, beyond the cores too."""
+MOST_DRAWN = 1000
+"""Most frames that are made up, all of them in memory."""
 MOST_SAMPLES = 10**9
 """Most inferences that can be asked for: at a millisecond each, a fortnight."""
 _MOST_DIGITS = 18
@@ -203,6 +205,7 @@ class FramesOptions(WriteOptions, GraphOptions):
     """recorded driving, read by another package: LOG:ROOT; else highway drives"""
 
     def __post_init__(self) -> None:
+        check_count("--count", self.count, MOST_SAMPLES)
         check_count("--seed", self.seed)
 
 
@@ -266,7 +269,7 @@ class CompressOptions(WriteOptions, GraphOptions, Int8Options):
 
     def __post_init__(self) -> None:
         check_count("--seed", self.seed)
-        check_count("--verify-frames", self.verify_frames)
+        check_count("--verify-frames", self.verify_frames, MOST_DRAWN)
         check_count("--measure-frames", self.measure_frames)
         check_number("--floor", self.floor, zero=True)
 
@@ -291,6 +294,8 @@ class LintOptions(ProviderOptions):
     def __post_init__(self) -> None:
         if self.target not in (None, "tensorrt") and (option := self.of_tensorrt):
             raise RecipeError(f"--{option} is for tensorrt, not for {self.target}")
+        if self.sm != LintOptions.sm and not self.trt_check:
+            raise RecipeError(f"--sm {self.sm} is for --trt-check, which is not given")
 
     @property
     def of_tensorrt(self) -> str:

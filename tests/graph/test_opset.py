@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+import numpy as np
 import onnx_ir as ir
 import pytest
 
@@ -10,6 +11,8 @@ from me2e_compress.errors import GraphError
 from me2e_compress.graph.opset import read_as
 from me2e_compress.graph.runtime_operators import newest_ir, newest_opset
 from me2e_compress.runtime.session import Session
+from me2e_compress.targets.onnxruntime import OnnxRuntime
+from me2e_compress.targets.tensorrt import TensorRT
 
 
 def written(folder: Path, body: str, *, opset: int = 28, version: int = 15) -> Path:
@@ -120,3 +123,34 @@ def test_operators_that_no_opset_has_together_stay(tmp_path: Path) -> None:
     assert (model.opset_imports[""], read_as(model).count("opset")) == (23, 0)
     with pytest.raises(GraphError, match="no kernel for GlobalLpPool of opset 23"):
         Session(model)
+
+
+def test_lint_judges_the_file_as_it_lies_on_disk(tmp_path: Path) -> None:
+    model = graph.load(written(tmp_path, "y = Relu(x)"))
+
+    for target, severity in ((OnnxRuntime(), "error"), (TensorRT(), "warning")):
+        (found,) = target.lint(model)
+        assert (found.severity, found.rule) == (severity, "opset")
+        assert "opset 28" in found.message
+    # what is written of it is in the older one
+    assert not OnnxRuntime().lint(model.clone())
+    older = graph.load(written(tmp_path, "y = Swish(x)", opset=18, version=10))
+    (found,) = OnnxRuntime().lint(older)
+    assert "onnxruntime has no Swish in opset 18" in found.message
+
+
+def test_an_input_that_holds_a_value_is_a_constant_and_that_is_said(
+    tmp_path: Path,
+) -> None:
+    path = written(tmp_path, "y = Mul(x, a)", opset=17, version=8)
+    model = ir.load(path)
+    held = ir.tensor(np.array(2.0, np.float32), name="a")
+    a = model.graph.inputs[2]
+    a.const_value = held
+    model.graph.register_initializer(a)
+    ir.save(model, path)
+
+    found = graph.load(path)
+
+    assert [each.name for each in found.graph.inputs] == ["x", "x4", "c", "i"]
+    assert read_as(found) == "a held a value: no input any more, but a constant"

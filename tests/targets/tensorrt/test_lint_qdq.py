@@ -277,3 +277,20 @@ def test_an_activation_in_int4_is_refused() -> None:
     body = PAIRED.replace("d =", "y =")
 
     assert "quantized-type" in rules_of(body, s=ONE, z=np.zeros((), ml_dtypes.int4))
+
+
+CLIPPED = """
+m (float[1,8] x) => (float[1,8] y)
+<float s = {0.1}, int8 z = {0}, int8 low = {-127}, int8 high = {127}>
+{ q = QuantizeLinear(x, s, z) c = Clip(q, low, high) d = DequantizeLinear(c, s, z)
+  y = Relu(d) }
+"""
+
+
+def test_a_clip_between_the_nodes_of_a_pair_is_looked_past() -> None:
+    """As brevitas writes it: TensorRT-RTX 1.7 builds int8 kernels of such pairs."""
+    wrong = {"element-type", "unpaired"}
+    read_too = CLIPPED.replace("[1,8] y)", "[1,8] y, int8[1,8] q)")
+
+    assert not wrong & {rule for _, rule, _ in found(CLIPPED)}
+    assert "unpaired" in {rule for _, rule, _ in found(read_too)}
