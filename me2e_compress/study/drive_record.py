@@ -9,7 +9,6 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, Self
 
-import numpy as np
 from pydantic import TypeAdapter
 
 from me2e_compress.errors import StudyError
@@ -52,8 +51,6 @@ class DriveRecord:
         made_by: Its fingerprint without the routes.
         difference: Paired by route with the baseline under the same condition; None for
             the baseline itself.
-        apart_m: By route, how far it was from the baseline at most; without routes that
-            have no frames.
     """
 
     variant: str
@@ -62,7 +59,6 @@ class DriveRecord:
     made_by: Mapping[str, Any] = field(default_factory=dict)
     scores: Scores | None = None
     difference: PairedDifference | None = None
-    apart_m: Mapping[str, float] = field(default_factory=dict)
     reason: str = ""
 
     @classmethod
@@ -118,7 +114,6 @@ class DriveRecord:
                     "infractions": [
                         {"kind": kind, "time_us": us} for kind, us in each.moments
                     ],
-                    "apart_m": self.apart_m.get(each.route),
                 }
                 for each in self.routes
             ],
@@ -150,22 +145,6 @@ class DriveRecord:
             if not isinstance(head.made_by.get("set_size"), int):
                 raise documents.MalformedError("it does not say of how many routes")
             return cls(head.variant, head.condition, routes, head.made_by)
-
-
-def metres_apart(
-    episodes: Sequence[Episode], reference: Sequence[Episode]
-) -> dict[str, float]:
-    """Return how far two drives of the same routes part at most, by route."""
-    by_route = dict[str, float]()
-    for one, other in zip(episodes, reference, strict=True):
-        if one.frames and other.frames:
-            count = min(len(one.frames), len(other.frames))
-            here, there = (
-                np.array([(frame.x, frame.y) for frame in each.frames[:count]])
-                for each in (one, other)
-            )
-            by_route[one.route] = float(np.hypot(*(here - there).T).max())
-    return by_route
 
 
 _CHANGED = {"driving_score": DS, "room_kept": ROOM, "success_rate": SR}

@@ -10,12 +10,11 @@ from me2e_compress.evaluators.contract import Drive, Engine
 from me2e_compress.evaluators.highway.engine import LocalEngine
 from me2e_compress.evaluators.results import MEASURED, ResultsFolder, drive_routes
 from me2e_compress.manager.report import versions
-from me2e_compress.metrics.episode import Episode
 from me2e_compress.metrics.route_summary import difference
 from me2e_compress.metrics.scores import score
 from me2e_compress.study.condition import Condition
 from me2e_compress.study.definition import Study
-from me2e_compress.study.drive_record import DriveRecord, metres_apart
+from me2e_compress.study.drive_record import DriveRecord
 from me2e_compress.study.file import load_study
 from me2e_compress.study.outcome import (
     Clock,
@@ -135,20 +134,17 @@ class StudyCells:
             return ()
         names = [each.variant.name for each in prepared]
         baseline = prepared[names.index(self.study.baseline)]
-        reference, theirs = self._driven(baseline, condition)
+        reference = self._driven(baseline, condition)
         records = list[DriveRecord]()
         for each in prepared:
             if each is baseline:
                 records.append(reference)
                 continue
-            record, episodes = self._driven(each, condition)
-            if episodes and theirs:
+            record = self._driven(each, condition)
+            if record.routes and reference.routes:
                 seed = self.study.seed
-                record = replace(
-                    record,
-                    difference=difference(record.routes, reference.routes, seed),
-                    apart_m=metres_apart(episodes, theirs),
-                )
+                gap = difference(record.routes, reference.routes, seed)
+                record = replace(record, difference=gap)
             records.append(record)
         return tuple(records)
 
@@ -182,17 +178,15 @@ class StudyCells:
             )
         return mean_us
 
-    def _driven(
-        self, prepared: PreparedVariant, condition: Condition
-    ) -> tuple[DriveRecord, tuple[Episode, ...]]:
-        """Drive a cell, or go on; record and score it. No episodes without a drive."""
+    def _driven(self, prepared: PreparedVariant, condition: Condition) -> DriveRecord:
+        """Drive a cell, or go on; record and score it. No routes without a drive."""
         study, names = self.study, (prepared.variant.name, condition.name)
         drive = self.drive(prepared, condition)
         if drive is None:
             why = f"its latency was not measured: {self.clock.reason}"
             if prepared.failure or prepared.model is None:
                 why = prepared.failure or "no model: it has no latency of its own"
-            return DriveRecord(*names, reason=why), ()
+            return DriveRecord(*names, reason=why)
         evaluator, policy = study.driven_by, prepared.driver
         folder = self.workspace.results(prepared.variant, condition)
         stage = ", ".join(names)
@@ -202,4 +196,4 @@ class StudyCells:
         record = DriveRecord.of(*names, made_by, episodes)
         record.save(self.workspace.record(prepared.variant, condition))
         set_size = study.set_size or evaluator.set_size or len(episodes)
-        return replace(record, scores=score(episodes, set_size, study.seed)), episodes
+        return replace(record, scores=score(episodes, set_size, study.seed))
