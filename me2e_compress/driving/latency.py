@@ -284,29 +284,24 @@ class MeasuredLatency(LatencySource):
 def parse_latency(text: str, *, seed: int = 0) -> LatencySource:
     """Build the latency source of a text, e.g. ``fps:10`` or ``trace:FILE``.
 
-    A ``seed`` above 0 overrides the text; in a layered source it applies to the source
-    below.
+    A ``seed`` is that of a text without one; in a layered source it applies to the
+    source below.
 
     Raises:
         EvaluationError: No such source, or an option that it refuses or has not.
     """
-    return with_draws(LATENCY_SOURCES.parse(text), seed=seed)
+    return with_draws(LATENCY_SOURCES.parse(text), seed)
 
 
-def with_draws(
-    source: LatencySource, *, in_order: bool = False, seed: int = 0
-) -> LatencySource:
-    """Say how a source draws from its trace; see `parse_latency`."""
-    # options belong to the innermost source
+def with_draws(source: LatencySource, seed: int) -> LatencySource:
+    """Give the innermost source the seed of its draws, if it draws and names none."""
     below = getattr(source, "source", None)
     if isinstance(below, LatencySource):
-        drawn = with_draws(below, in_order=in_order, seed=seed)
+        drawn = with_draws(below, seed)
         return LATENCY_SOURCES.with_options(source, {"source": drawn})
-    # those at their defaults leave the source as it is; who draws nothing has no seed
-    options: dict[str, object] = {"in_order": True} if in_order else {}
-    if seed and "seed" in type(source).__dataclass_fields__:
-        options["seed"] = seed
-    return LATENCY_SOURCES.with_options(source, options) if options else source
+    if seed and getattr(source, "seed", None) == 0:
+        return LATENCY_SOURCES.with_options(source, {"seed": seed})
+    return source
 
 
 # Sources on top of others: a frame limiter, costs that depend on the work. A latency

@@ -7,11 +7,9 @@ from typing import Any
 
 from pydantic import ConfigDict, with_config
 
-from me2e_compress.display import counted
 from me2e_compress.driving.latency import (
     LATENCY_SOURCES,
     LatencySource,
-    LimitedLatency,
     with_draws,
 )
 from me2e_compress.errors import EvaluationError, StudyError
@@ -41,13 +39,11 @@ class Condition:
     Args:
         name: Follows the rules of a variant's name.
         latency: Latency of decisions, as for ``evaluate``: ``none``, ``fps:F``, or
-            ``trace``, each model's own latencies, also within another source:
-            ``limited{source=trace, fps=10}``.
+            ``trace``, each model's own latencies, also with options
+            (``trace{in_order=true, seed=3}``) and within another source
+            (``limited{source=trace, fps=10}``).
         mean_of: Instead of a latency: every decision takes the mean of this drive,
             ``VARIANT.CONDITION``, whose condition comes earlier.
-        in_order: Replay a trace in its order, which keeps bursts.
-        limit_fps: Frame limiter: a decision takes at least one period.
-        seed: Seed of draws from traces; None takes the study's.
         against: Another condition that differs from this one in one thing: drives are
             compared with those under it, route by route.
         latency_model: As of ``evaluate``, and so ``dt_ms``, ``weather``.
@@ -60,9 +56,6 @@ class Condition:
     name: str
     latency: str = ""
     mean_of: str = ""
-    in_order: bool = False
-    limit_fps: float | None = None
-    seed: int | None = None
     against: str = ""
     latency_model: str = "drop"
     dt_ms: float = 50.0
@@ -72,10 +65,6 @@ class Condition:
         check_name("condition", self.name)
         if bool(self.latency) == bool(self.mean_of):
             raise StudyError(f"condition {self.name}: give a latency or mean_of")
-        if self.mean_of and (self.in_order or self.limit_fps is not None):
-            raise StudyError(
-                f"condition {self.name}: a mean has no order and takes no limit"
-            )
         try:
             source = None if self.mean_of else self.source(0)
             self.drive  # noqa: B018
@@ -92,11 +81,10 @@ class Condition:
     def source(self, seed: int) -> LatencySource:
         """Return the latency source; one that lacks its trace waits for a model's.
 
-        ``seed`` applies if the condition has none of its own. A trace file is an error:
-        it belongs to a variant.
+        ``seed`` applies if the text names none. A trace file is an error: it belongs to
+        a variant.
         """
-        own = seed if self.seed is None else self.seed
-        return with_draws(self._parsed, in_order=self.in_order, seed=own)
+        return with_draws(self._parsed, seed)
 
     @functools.cached_property
     def _parsed(self) -> LatencySource:
@@ -104,10 +92,7 @@ class Condition:
         names_a_file = text.startswith(TRACE) and name_in(text) != TRACE
         if names_a_file or "trace:" in text or "trace=" in text:
             raise StudyError(self._refusal())
-        source = LATENCY_SOURCES.parse(text)
-        if self.limit_fps is None:
-            return source
-        return LimitedLatency(source, self.limit_fps)
+        return LATENCY_SOURCES.parse(text)
 
     @property
     def traced(self) -> bool:
@@ -115,37 +100,23 @@ class Condition:
         return not self.mean_of and self._parsed.lacks_trace
 
     @property
+    def _changed(self) -> dict[str, object]:
+        """The options of its drive that are not the usual ones."""
+        usual = {"latency_model": "drop", "dt_ms": 50.0, "weather": ""}
+        own = {name: getattr(self, name) for name in usual}
+        return {name: each for name, each in own.items() if each != usual[name]}
+
+    @property
     def asks_for(self) -> tuple[str, ...]:
         """What an evaluator must take to drive under it."""
-        asked = {
-            "latency": self.latency != "none",
-            "latency_model": self.latency_model != "drop",
-            "dt_ms": self.dt_ms != 50.0,
-            "weather": bool(self.weather),
-        }
-        return tuple(name for name, is_asked in asked.items() if is_asked)
+        return (*("latency",) * (self.latency != "none"), *self._changed)
 
     def described(self, device: str) -> str:
         """Describe it for the head of a table; ``device`` is that of the traces."""
-        changes = {
-            "in the trace's order": self.in_order,
-            f"limited to {_per_second(self.limit_fps or 0)}": self.limit_fps,
-            "every control late (fifo)": self.latency_model != "drop",
-            f"a step of {self.dt_ms:g} ms": self.dt_ms != 50.0,
-            f"weather {self.weather}": self.weather,
-        }
-        words = [words for words, changed in changes.items() if changed]
-        # what a decision costs
-        cost = f"{self.latency}, {device}" if self.traced else self.latency
-        if self.mean_of:
-            cost = f"every decision costs the mean of {self.mean_of}"
-        elif self.latency == "none":
-            cost = "decisions cost no time"
-        elif self.latency == TRACE:
-            cost = f"each model's own latency, {device}"
-        elif name_in(self.latency) == "fps" and ":" in self.latency:
-            cost = _per_second(float(self.latency.removeprefix("fps:")))
-        return ", ".join([f"{self.name}: {cost}", *words])
+        latency = self.latency or f"the mean of {self.mean_of}"
+        latency += f" of {device}" * self.traced
+        words = [f"{name} {option}" for name, option in self._changed.items()]
+        return ", ".join([f"{self.name}: latency {latency}", *words])
 
     def to_json(self) -> dict[str, Any]:
         """Return every option; ``charged`` is the latency, None for a mean."""
@@ -154,9 +125,6 @@ class Condition:
             "charged": self.latency or None,
             "mean_of": self.mean_of or None,
             "latency_model": self.latency_model,
-            "in_order": self.in_order,
-            "limit_fps": self.limit_fps,
-            "seed": self.seed,
             "dt_ms": self.dt_ms,
             "weather": self.weather,
             "against": self.against or None,
@@ -168,7 +136,3 @@ class Condition:
             f"fps:F and {TRACE}, and what is made of them (a file is a variant's: "
             "trace = FILE)"
         )
-
-
-def _per_second(fps: float) -> str:
-    return f"{counted(fps, 'decision')} a second"

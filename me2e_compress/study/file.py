@@ -3,31 +3,15 @@
 import dataclasses
 import json
 from pathlib import Path
-from typing import get_type_hints
 
 from pydantic import TypeAdapter, ValidationError
-from pydantic.fields import FieldInfo
 
 from me2e_compress.driving.policies import PythonDriver, driver_named
 from me2e_compress.errors import FORMER, StudyError
 from me2e_compress.registry import documents
-from me2e_compress.study.condition import Condition
-from me2e_compress.study.definition import (
-    FramesToRecord,
-    Study,
-    StudyBlock,
-    Timing,
-    Variant,
-)
+from me2e_compress.study.definition import Study
 
 _STUDY = TypeAdapter(Study)
-_TABLES: dict[object, type] = {
-    "variant": Variant,
-    "condition": Condition,
-    "latency": Timing,
-    "block": StudyBlock,
-    "record": FramesToRecord,
-}
 
 
 def load_study(
@@ -106,7 +90,7 @@ def load_study(
 
 
 def _content(path: Path) -> dict[str, object]:
-    """Return the tables of a file, none of which is of an older version."""
+    """Return the tables of a file."""
     try:
         content = documents.from_toml(documents.content(path))
     except FileNotFoundError as error:
@@ -116,13 +100,8 @@ def _content(path: Path) -> dict[str, object]:
         raise StudyError(f"{path}: cannot be read: {error.strerror}") from error
     except documents.MalformedError as error:
         raise StudyError(f"{path}: not TOML: {error}") from error
-    for key, table in content.items():
-        inner = [f"{key}.{each}" for each in table] if isinstance(table, dict) else []
-        for where in (key, *inner):
-            if gone := FORMER.get(f"study {where}"):
-                raise StudyError(f"{path}: {gone}")
     if "set_size" in content:  # Python's own
-        raise StudyError(f"{path}: {_no_key('set_size', Study)}")
+        raise StudyError(f"{path}: no key set_size")
     return content
 
 
@@ -131,19 +110,8 @@ def _complaint(error: ValidationError) -> str:
     errors = error.errors(include_url=False)
     unknown = [each for each in errors if each["type"] == "unexpected_keyword_argument"]
     first = (unknown or errors)[0]
-    where = ".".join(str(part) for part in first["loc"])
+    where = ".".join(map(str, first["loc"]))
     if not unknown:
         return f"{where}: {first['msg']}"
-    table = _TABLES.get(first["loc"][0]) if len(first["loc"]) > 1 else Study
-    return _no_key(where, table)
-
-
-def _no_key(where: str, table: type | None) -> str:
-    if table is None:
-        return f"no key {where}"
-    keys = list[str]()
-    for name, kind in get_type_hints(table, include_extras=True).items():
-        marks = getattr(kind, "__metadata__", ())
-        aliases = [e.alias for e in marks if isinstance(e, FieldInfo) and e.alias]
-        keys += (aliases or [name]) if name != "set_size" else []
-    return f"no key {where}; there are {', '.join(keys)}"
+    names = ".".join(each for each in first["loc"] if isinstance(each, str))
+    return FORMER.get(f"study {names}", f"no key {where}")

@@ -86,7 +86,7 @@ def test_a_study_leaves_a_report_prints_its_tables_and_json_is_the_file(
         ('"exact"\npolicy', '"float"\npolicy', "2 variants are named float"),
         ('recipe = "exact"', 'recipe = "exakt"', "no recipe exakt"),
         ('"frames"', '"nowhere"', "nowhere: no such folder"),
-        ("[[condition]]", "[[conditions]]", "no key conditions; there are title"),
+        ("[[condition]]", "[[conditions]]", "no key conditions"),
     ],
 )
 def test_what_is_wrong_is_one_line(

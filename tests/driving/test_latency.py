@@ -78,12 +78,9 @@ def test_a_trace_is_drawn_by_seed_and_route(trace: Path) -> None:
     assert parse_latency("fps:10", seed=3) == FrameRate(10.0)  # draws nothing
 
 
-@pytest.mark.parametrize("in_order", [False, True])
-def test_a_negative_seed_is_refused_before_anything_drives(
-    trace: Path, in_order: bool
-) -> None:
+def test_a_negative_seed_is_refused_before_anything_drives(trace: Path) -> None:
     with pytest.raises(EvaluationError, match="latency: seed -1: must be 0 or more"):
-        with_draws(TraceLatency(trace), in_order=in_order, seed=-1)
+        with_draws(TraceLatency(trace), -1)
 
 
 def test_a_route_does_not_depend_on_what_drove_before() -> None:
@@ -201,24 +198,20 @@ def test_ours_have_the_form_of_a_latency_source(text: str) -> None:
     check_form(LATENCY_SOURCES.parse(text), LATENCY_SOURCES)
 
 
-def test_options_of_a_trace_reach_it_through_layers() -> None:
+def test_a_seed_reaches_a_trace_without_one_through_layers() -> None:
     text = "limited{source=host-stage{source=trace, per_iteration_us=1}, fps=10}"
-    source = with_draws(parse_latency(text), in_order=True, seed=3)
+    own = text.replace("trace,", "trace{seed=3},")
+    source = with_draws(parse_latency(text), 3)
 
-    assert source == parse_latency(
-        "limited{source=host-stage{source=trace{in_order=true, seed=3},"
-        " per_iteration_us=1}, fps=10}"
-    )
+    assert source == parse_latency(own) == with_draws(parse_latency(own), 5)
     assert source.lacks_trace
     assert not source.with_trace((1, 2), 3.0).lacks_trace
 
 
 def test_what_a_layer_has_of_the_source_below() -> None:
-    """Whether it is measured; neither options that it has not, nor a study's trace."""
+    """Whether it is measured; not a study's trace."""
     assert parse_latency("limited{source=measured, fps=10}").measures
     assert not parse_latency("limited{source=none, fps=10}").measures
-    with pytest.raises(EvaluationError, match="fps has no option 'in_order'"):
-        with_draws(parse_latency("limited{source=fps:10, fps=5}"), in_order=True)
     with pytest.raises(EvaluationError, match=r"names no file \(trace:FILE\)"):
         Drive(parse_latency("limited{source=trace, fps=10}"))
 

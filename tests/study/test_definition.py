@@ -14,6 +14,8 @@ from me2e_compress.study import Condition, Study, Timing, Variant, run_study
 from me2e_compress.study.definition import FramesToRecord, StudyBlock
 from me2e_compress.study.drive_record import DriveRecord
 from me2e_compress.study.workload import held_frames, workload
+from tests.docs.pages import EXAMPLE
+from tests.installed import install
 from tests.study.conftest import BLIND, FASTER, IDEAL, ROUTES, SLOW, Here, Make
 
 
@@ -102,14 +104,14 @@ def test_a_timing_that_measures_nothing(numbers: tuple[int, int, float | None]) 
     [
         ({}, "give a latency or mean_of"),
         ({"latency": "none", "mean_of": "a.b"}, "give a latency or mean_of"),
-        ({"mean_of": "a.b", "limit_fps": 10.0}, "a mean has no order and takes no"),
-        ({"latency": "fps:10", "in_order": True}, "fps has no option 'in_order'"),
-        ({"latency": "fps:10", "limit_fps": 0.0}, "fps 0 is not a positive number"),
         ({"latency": "none", "dt_ms": 30.0}, "a step of 30 ms: it must divide 50 ms"),
         ({"latency": "none", "weather": "hail=1"}, "weather option 'hail'"),
         ({"latency": "none", "latency_model": "lifo"}, "there are drop, fifo"),
-        ({"latency": "trace", "seed": -1}, "seed -1: must be 0 or more"),
-        ({"latency": "limited{source=trace:t.json, fps=1}"}, "is a variant's"),
+        ({"latency": "trace{seed=-1}"}, "seed -1: must be 0 or more"),
+        (
+            {"latency": "host-stage{source=trace:t.json, per_iteration_us=1}"},
+            "is a variant's",
+        ),
         ({"latency": "limited{source=measured, fps=10}"}, "a study knows none"),
         ({"latency": "measured"}, "none, fps:F and trace"),
         ({"latency": "trace:t.json"}, "none, fps:F and trace"),
@@ -145,19 +147,22 @@ def test_a_condition_that_names_one_that_is_not_there(
 
 
 def test_own_latencies_may_be_limited_and_grow_with_the_scene() -> None:
-    text = "host-stage{source=trace, per_iteration_us=3000}"
-    condition = Condition("busy", text, limit_fps=10.0, in_order=True, seed=5)
+    trace = "trace{in_order=true, seed=5}"
+    text = (
+        f"limited{{source=host-stage{{source={trace}, per_iteration_us=3000}}, fps=10}}"
+    )
+    condition = Condition("busy", text)
 
-    found = condition.source(0).with_trace((70_000, 80_000), 2.0)
+    found = condition.source(7).with_trace((70_000, 80_000), 2.0)
 
-    trace = TraceLatency((70_000, 80_000), in_order=True, scale=2.0, seed=5)
+    samples = TraceLatency((70_000, 80_000), in_order=True, scale=2.0, seed=5)
     assert condition.traced
-    assert found == LimitedLatency(HostStageLatency(trace, 3_000), 10.0)
+    assert found == LimitedLatency(HostStageLatency(samples, 3_000), 10.0)
 
 
 def test_every_option_reaches_the_drive(make: Make, tmp_path: Path) -> None:
     condition = Condition(
-        "all", "fps:20", latency_model="fifo", limit_fps=8.0, dt_ms=25.0,
+        "all", "limited{source=fps:20, fps=8}", latency_model="fifo", dt_ms=25.0,
         weather="noise=9",
     )  # fmt: skip
     made = make(
@@ -175,16 +180,6 @@ def test_every_option_reaches_the_drive(make: Make, tmp_path: Path) -> None:
     [table, *_] = found.tables()
     assert table.title.startswith("Scoreboard")
     assert found.to_json()["conditions"] == [condition.to_json()]
-
-
-@pytest.mark.parametrize(
-    ("fps", "words"),
-    [("1", "1 decision a second"), ("1.67", "1.67 decisions a second")],
-)
-def test_one_decision_is_singular(fps: str, words: str) -> None:
-    assert Condition("slow", f"fps:{fps}").described("here") == f"slow: {words}"
-    limited = Condition("slow", "none", limit_fps=float(fps)).described("here")
-    assert limited.endswith(f"limited to {words}")
 
 
 # Some variants under some conditions, and what is left to drive of them.
@@ -235,7 +230,12 @@ def test_what_a_block_or_a_recording_cannot_be() -> None:
         FramesToRecord(0, 4)
 
 
-def test_a_mean_is_that_of_the_drive_that_it_names(tmp_path: Path) -> None:
+def test_a_mean_is_that_of_the_drive_that_it_names(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.syspath_prepend(EXAMPLE)
+    source = {"agents": "me2e_example.agents:AgentsLatency"}
+    install(monkeypatch, tmp_path, "ours", "me2e_compress.latency_sources", source)
     busy = Condition("busy", "agents{source=fps:2, per_agent_us=20000}")
     even = Condition("even", mean_of="faster.busy")
     names = ("busy", "even")

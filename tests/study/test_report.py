@@ -229,7 +229,7 @@ def test_a_scoreboard_has_a_row_a_drive(found: StudyResult) -> None:
     assert all(len(row) == len(board.columns) for row in board.rows)
     assert board.strong == "slow"
     assert board.note.startswith(
-        "ideal: decisions cost no time; slow: 2 decisions a second. 2 of 220 routes."
+        "ideal: latency none; slow: latency fps:2. 2 of 220 routes."
     )
     # its numbers are those of the drives
     scores = found.under(IDEAL)[3].scores
