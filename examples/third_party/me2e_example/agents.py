@@ -1,13 +1,15 @@
 """A latency that grows with the road users in view."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import ClassVar
 
 import numpy as np
 
 from me2e_compress.driving.latency import (
     DecisionFacts,
+    LatencySource,
     LayeredLatency,
+    NoLatency,
     check_positive,
 )
 from me2e_compress.errors import EvaluationError
@@ -32,7 +34,8 @@ class AgentsLatency(LayeredLatency):
     """
 
     name: ClassVar[str] = "agents"
-    per_agent_us: int
+    source: LatencySource = field(default_factory=NoLatency)
+    per_agent_us: int = 3000
     range_m: float = 50.0
     fov_deg: float = 360.0
 

@@ -24,7 +24,7 @@ from me2e_compress.driving.input_sources import (
     Observed,
 )
 from me2e_compress.driving.input_sources.sources import NavigationCommand
-from me2e_compress.errors import EvaluationError
+from me2e_compress.errors import FORMER, EvaluationError
 from me2e_compress.graph.recurrence import RECURRENT, declared_pairs
 from me2e_compress.registry import documents
 from me2e_compress.runtime.frames import Array
@@ -226,6 +226,7 @@ class Adapter(BaseModel):
             first = error.errors(include_url=False)[0]
             where = ".".join(map(str, first["loc"]))
             words = first["msg"].removeprefix("Value error, ")
+            words = FORMER.get(f"adapter key {where}", words)
             raise EvaluationError(f"{origin} {where}: {words}") from error
 
     def metadata(self, own: Mapping[str, str]) -> dict[str, str]:

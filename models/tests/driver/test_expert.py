@@ -34,12 +34,11 @@ from models.driver.expert.futures import (
     sample,
 )
 from models.driver.expert.privileged import Intent
-from models.tests.driver.known_world import KnownWorld, drive
+from models.tests.driver.known_world import KnownWorld, drive, signal_at
 from tests.evaluators.highway.tiny_world import (
     actor,
     circle,
     ego_at,
-    signal_at,
     straight,
 )
 from tests.profiles import scaled

@@ -21,8 +21,6 @@ from me2e_compress.simulator.scene import (
     Ego,
     Scene,
     Signal,
-    SignalKind,
-    SignalState,
 )
 
 DT_US = 50_000
@@ -87,10 +85,6 @@ def actor(
     return Actor(number, kind, x, y, heading, speed, *size, False, 0)
 
 
-def signal_at(x: float, kind: SignalKind, state: SignalState | None = None) -> Signal:
-    return Signal(1, kind, x, -3.0, 0.0, state, ((x, 1.75), (x, -1.75)))
-
-
 @dataclass
 class TinyWorld:
     path: RoutePath
@@ -129,17 +123,3 @@ class TinyWorld:
     @property
     def offset_m(self) -> float:
         return self.path.project(self.ego.x, self.ego.y)[1]
-
-    @property
-    def touches(self) -> bool:
-        """Whether a disc of the ego overlaps an actor's rectangle."""
-        for a in self.actors:
-            for disc in (-2.0, -1.0, 0.0, 1.0, 2.0):
-                x = self.ego.x + disc * math.cos(self.ego.heading) - a.x
-                y = self.ego.y + disc * math.sin(self.ego.heading) - a.y
-                along = abs(math.cos(a.heading) * x + math.sin(a.heading) * y)
-                across = abs(math.cos(a.heading) * y - math.sin(a.heading) * x)
-                end = max(along - a.length / 2, 0.0)
-                if math.hypot(end, max(across - a.width / 2, 0.0)) < 0.9:
-                    return True
-        return False
