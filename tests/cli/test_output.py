@@ -58,9 +58,9 @@ REFUSED = {
     **{f"{line} -o {name}": f"{name} would be a frame of the input"
        for line, name in RECORDED},
     **{f"{line} -o no/o.x": "no/o.x: no such folder no"
-       for line in (*WRITERS, "routes")},
+       for line in WRITERS},
     **{f"{line} -o frames": "frames is a folder"
-       for line in (*WRITERS, "routes", "export highway")},
+       for line in (*WRITERS, "export highway")},
     **{f"{line} -o dense.onnx": "dense.onnx is a file: name a folder"
        for line in (f"frames {M}", f"evaluate {M}", "study study.toml")},
     "study study.toml -o frames": "frames is the input: choose another folder",
