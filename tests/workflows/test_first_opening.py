@@ -18,7 +18,7 @@ from me2e_compress.runtime.children import run_script
 from me2e_compress.runtime.frames import Array, Frame
 from me2e_compress.runtime.session import Session
 from me2e_compress.workflows import checks
-from me2e_compress.workflows.checks import try_first, unseen
+from me2e_compress.workflows.checks import try_first, shortcomings
 from me2e_compress.workflows.compress import compress
 from me2e_compress.workflows.result import SILENT, Listener
 from tests.nets import save_text
@@ -160,8 +160,8 @@ def test_layers_in_functions_are_counted_as_often_as_they_are_called() -> None:
         Two (x, k) => (y) { a = own.One(x, k) y = own.One(a, k) }
         <opset_import: ["" : 18], domain: "own">
         One (x, k) => (y) { a = MatMul(x, k) y = Relu(a) }""")
-    hint = unseen(model)
+    hint = shortcomings(model)
     assert hint.startswith("3 layers in functions of the file (own::Two, own::One), ")
     assert "python -c 'import onnx, onnx.inliner as i; onnx.save(" in hint
     model.functions.clear()
-    assert "layer" not in unseen(model)
+    assert "layer" not in shortcomings(model)
