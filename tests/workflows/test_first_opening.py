@@ -18,7 +18,7 @@ from me2e_compress.runtime.children import run_script
 from me2e_compress.runtime.frames import Array, Frame
 from me2e_compress.runtime.session import Session
 from me2e_compress.workflows import checks
-from me2e_compress.workflows.checks import try_first, shortcomings
+from me2e_compress.workflows.checks import shortcomings, try_first
 from me2e_compress.workflows.compress import compress
 from me2e_compress.workflows.result import SILENT, Listener
 from tests.nets import save_text
