@@ -151,44 +151,10 @@ def comfort(episode: Episode) -> Measure:
     if len(episode.frames) < SEGMENT_FRAMES:
         frames = len(episode.frames)
         return Measure(None, "ratio", f"{frames} frames, {SEGMENT_FRAMES} are needed")
-    return Measure(float(_segments(smooth_frames(episode)).mean()), "ratio")
-
-
-def comfort_in_motion(episode: Episode) -> Measure:
-    """Return the comfort over the segments in which the ego moved.
-
-    A standing ego is comfortable, so a driver that is stuck for most of a route scores
-    well by `comfort`. Here a segment counts only if the ego was faster than 0.1 m/s in
-    at least one of its frames.
-    """
-    if len(episode.frames) < SEGMENT_FRAMES:
-        return comfort(episode)
-    moved = ~_segments(~_moving(episode.frames))
-    if not moved.any():
-        return Measure(None, "ratio", "the ego never moved")
-    return Measure(float(_segments(smooth_frames(episode))[moved].mean()), "ratio")
-
-
-def standing_share(episode: Episode) -> float | None:
-    """Return the share of frames in which the ego stood; None without frames."""
-    if not episode.frames:
-        return None
-    return float(1.0 - _moving(episode.frames).mean())
-
-
-def stood_most(episodes: Iterable[Episode]) -> tuple[str, ...]:
-    """Return the routes on which the ego stood for more than half of the frames."""
-    return tuple(one.route for one in episodes if (standing_share(one) or 0.0) > 0.5)
-
-
-def _segments(smooth: npt.NDArray[np.bool_]) -> npt.NDArray[np.bool_]:
+    smooth = smooth_frames(episode)
     segments = len(smooth) // SEGMENT_FRAMES
     cut = smooth[: segments * SEGMENT_FRAMES].reshape(segments, SEGMENT_FRAMES)
-    return np.asarray(cut.all(axis=1))
-
-
-def _moving(frames: Sequence[EgoFrame]) -> npt.NDArray[np.bool_]:
-    return np.array([frame.speed_mps > BLOCKED_SPEED_MPS for frame in frames])
+    return Measure(float(cut.all(axis=1).mean()), "ratio")
 
 
 def smooth_frames(episode: Episode) -> npt.NDArray[np.bool_]:

@@ -57,7 +57,7 @@ class Scores:
     """Means over the driven routes, each with its interval.
 
     Percentages, except for comfort: it is the share of smooth segments (equation 7, SI
-    units), ``comfort_in_motion`` that of segments in which the ego moved. The fields
+    units). The fields
     ``bench2drive_...`` follow Bench2Drive's own arithmetic; its smoothness is also
     called comfort there. ``failures`` has the reason for each route that the policy or
     the simulator ended by failing. A partial result has fewer routes than ``expected``.
@@ -67,7 +67,6 @@ class Scores:
     success_rate: Estimate
     efficiency: Estimate
     comfort: Estimate
-    comfort_in_motion: Estimate
     abilities: Estimate
     each_ability: dict[str, Estimate]
     bench2drive_efficiency: Estimate
@@ -98,7 +97,6 @@ class Scores:
         plain = ("driving_score", "success_rate", "efficiency", "comfort")
         return {
             **{name: getattr(self, name).to_json() for name in plain},
-            "comfort_in_motion": self.comfort_in_motion.to_json(),
             "abilities": {**self.abilities.to_json(), "each": abilities},
             "bench2drive": {
                 "efficiency": self.bench2drive_efficiency.to_json(),
@@ -119,7 +117,6 @@ def score(
 ) -> Scores:
     """Score a set of routes; their order affects nothing but the bootstrap."""
     # means over routes with their intervals
-    in_motion = route_scores.comfort_in_motion
 
     def driving_score(episode: Episode) -> Measure:
         return Measure(route_scores.route_score(episode).composed, "%")
@@ -132,7 +129,6 @@ def score(
         ),
         efficiency=_over(episodes, route_scores.efficiency, "%", seed),
         comfort=_over(episodes, route_scores.comfort, "ratio", seed, SHARE),
-        comfort_in_motion=_over(episodes, in_motion, "ratio", seed, SHARE),
         abilities=mean_ability,
         each_ability=each_ability,
         bench2drive_efficiency=_over(episodes, bench2drive.efficiency, "%", seed),

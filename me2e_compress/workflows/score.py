@@ -17,7 +17,6 @@ from me2e_compress.metrics import scores as metrics
 from me2e_compress.metrics.deadlines import Deadlines, charged, deadlines_table
 from me2e_compress.metrics.episode import Episode
 from me2e_compress.metrics.measure import Estimate
-from me2e_compress.metrics.route_scores import stood_most
 from me2e_compress.metrics.scores import (
     LeaderboardScores,
     Quotients,
@@ -28,7 +27,6 @@ from me2e_compress.workflows.options import check_budget
 from me2e_compress.workflows.result import SILENT, Listener, Result, Shown
 from me2e_compress.workflows.score_eer import EerScores, estimate_cells, score_eer
 
-STANDING = "the ego stood most of the time, which is comfortable: see comfort in motion"
 _NAMED = 5
 
 
@@ -39,13 +37,11 @@ class RealRun:
     Attributes:
         scores: scores as of any other run, with Bench2Drive's rules of abilities.
         leaderboard: scores as the leaderboard and Bench2Drive's tools compute them.
-        stood: routes on which the ego stood most of its time.
     """
 
     collected: CollectedResults
     scores: Scores
     leaderboard: LeaderboardScores
-    stood: tuple[str, ...]
 
     def tables(self, name: str) -> tuple[Table, ...]:
         """Return the records, and the scores as given and as computed.
@@ -94,7 +90,7 @@ class RealRun:
         found = self.collected
         if found.route_set is None:
             yield f"{name}: its routes are of no set of Bench2Drive that is known"
-        doubtful = {*found.foreign, *found.contradictory, *self.stood, *found.off_rate}
+        doubtful = {*found.foreign, *found.contradictory, *found.off_rate}
         routes = f"of {len(found.episodes)} routes do not count as they should"
         files = "files or records are broken and left out"
         for count, what in ((len(doubtful), routes), (len(found.broken), files)):
@@ -127,8 +123,7 @@ class RealRun:
             *("crashed", "missing", "foreign", "repeated", "rerun"),
             *("contradictory", "unrecorded"),
         )
-        named: dict[str, Sequence[str]] = {n: getattr(self.collected, n) for n in names}
-        return {**named, "stood": self.stood}
+        return {name: getattr(self.collected, name) for name in names}
 
 
 def score_real_run(
@@ -146,7 +141,6 @@ def score_real_run(
         collected,
         metrics.score(episodes, set_size),
         leaderboard_scores(episodes, set_size),
-        stood_most(episodes),
     )
 
 
@@ -276,12 +270,10 @@ def score(
 
 
 def _episodes(folder: ResultsFolder, listener: Listener) -> tuple[Episode, ...]:
-    """Return a folder's episodes; warn of damaged files and of an ego that stood."""
+    """Return a folder's episodes; warn of damaged files."""
     episodes = tuple(folder.episodes().values())
     for file, reason in folder.corrupt.items():
         listener.on_warning(f"{file}: {reason}: left out")
-    if stood := stood_most(episodes):
-        listener.on_warning(f"{folder.path}: {STANDING}: {some_of(stood)}")
     return episodes
 
 
@@ -322,7 +314,6 @@ def _each(scores: Scores) -> Iterator[tuple[str, Estimate]]:
     yield "efficiency", scores.efficiency
     yield "Bench2Drive's efficiency", scores.bench2drive_efficiency
     yield "comfort", scores.comfort
-    yield "comfort in motion", scores.comfort_in_motion
     yield "Bench2Drive's smoothness", scores.bench2drive_smoothness
     yield "abilities, mean", scores.abilities
     yield from ((f"  {name}", rate) for name, rate in scores.each_ability.items())

@@ -8,12 +8,9 @@ from me2e_compress.metrics import bench2drive
 from me2e_compress.metrics.episode import EgoFrame, Ending, Episode
 from me2e_compress.metrics.route_scores import (
     comfort,
-    comfort_in_motion,
     efficiency,
     smooth_frames,
     speed_ratios,
-    standing_share,
-    stood_most,
 )
 from tests.metrics.drives import cruise, drive, frames
 
@@ -131,26 +128,6 @@ def test_standing_blocked_is_not_uncomfortable(intervals: int, value: float) -> 
 
     assert comfort(shaken).value == value
     assert comfort(ended).value == 1.0
-
-
-def test_segments_without_motion_are_left_out_of_comfort_in_motion() -> None:
-    # two seconds in motion, of which one is shaken, then six at rest
-    mostly_still = drive(
-        driven=frames(
-            160,
-            lambda k: {
-                "speed_mps": 5.0 if k < 40 else 0.0,
-                "lateral_acceleration_mps2": 6.0 if k < 14 else 0.0,
-            },
-        )
-    )
-
-    assert comfort(mostly_still).value == 7 / 8
-    assert comfort_in_motion(mostly_still).value == 1 / 2
-    assert standing_share(mostly_still) == 0.75
-    assert stood_most([mostly_still, held(40, speed_mps=1.0)]) == ("r1",)
-    assert comfort_in_motion(held(40)).reason == "the ego never moved"
-    assert standing_share(drive()) is None
 
 
 def original(driven: tuple[EgoFrame, ...]) -> list[bool]:
