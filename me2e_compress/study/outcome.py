@@ -1,8 +1,9 @@
 """What a study knows of a variant without its drives: latency, size, plan.
 
-Latencies are traces: recorded on a device, kept, or measured here in turn.
+Latencies are traces: recorded on a device, or measured here in turn.
 """
 
+import hashlib
 import math
 import os
 import platform
@@ -83,120 +84,65 @@ def time_all(
     workspace: Workspace,
     listener: Listener,
 ) -> Clock:
-    """Load the traces that are given or kept, and measure the others, interleaved.
-
-    Models measured together share their noise. A kept trace must be of the same model,
-    machine, threads and frames, with at least as many samples (studies in one folder
-    share the longest); otherwise it is measured again. Without a kept trace of the
-    baseline, kept traces cannot be compared with new ones, so all are measured again.
+    """Load the traces that are given, and measure the others, interleaved.
 
     Raises:
         EvaluationError: A trace cannot be read or written, or the baseline's median,
             which sets the device scale, is zero.
     """
-    frames = None if study.held_out is None else CalibrationSet(study.held_out)
-    seen = None if frames is None else frames.fingerprint
-    loaded = {
-        each.variant.name: _kept(study, each, seen, workspace, listener)
+    traces = {
+        each.variant.name: LatencyTrace.load(each.variant.trace)
         for each in prepared
+        if each.variant.trace is not None
     }
-    traces = {name: trace for name, trace in loaded.items() if trace is not None}
+    measured = dict[str, LatencyTrace]()
     reason = "no held-out frames were given"
-    if frames is not None:
+    if study.held_out is not None:
         reason = "not a model"
-        baseline = next(each for each in prepared if each.variant == study.reference)
-        kept_baseline = None if baseline.variant.trace else traces.get(study.baseline)
-        # all are missing, if new traces cannot be compared with old
-        ours = [each for each in prepared if each.model and not each.variant.trace]
-        missing = [each for each in ours if each.variant.name not in traces]
-        if kept_baseline is None and missing:
-            for each in (each for each in ours if each not in missing):
-                listener.on_warning(
-                    f"{workspace.trace(each.variant)}: no trace of the baseline is kept"
-                    " beside it: measured again"
-                )
-            missing = ours
-        found = _measured(study, frames, missing, baseline, kept_baseline, listener)
-        # the baseline last: a kill before leaves none that old ones could stand beside
-        for each in sorted(missing, key=lambda one: one is baseline):
-            trace = replace(found[each.variant.name], frames=seen)
-            trace.save(workspace.trace(each.variant))
-            traces[each.variant.name] = trace
+        timed = [each for each in prepared if each.model and not each.variant.trace]
+        frames = CalibrationSet(study.held_out)
+        measured = _measured(study, frames, timed, workspace, listener)
     # the highest load under which a trace was measured here
-    names = [each.variant.name for each in prepared if not each.variant.trace]
-    loads = [traces[name].others for name in names if name in traces]
-    known = [each for each in loads if each is not None]
+    known = [each.others for each in measured.values() if each.others is not None]
     load = max(known, key=lambda load: load.others, default=None)
+    traces |= measured
     return Clock(traces, _scale(study, traces), reason, load)
 
 
 def _measured(
     study: Study,
     frames: CalibrationSet,
-    missing: Sequence[PreparedVariant],
-    baseline: PreparedVariant,
-    kept: LatencyTrace | None,
+    timed: Sequence[PreparedVariant],
+    workspace: Workspace,
     listener: Listener,
 ) -> dict[str, LatencyTrace]:
-    """Measure in turn, always with the baseline.
+    """Measure models in turn, or load what was measured together before.
 
-    If its trace is kept, the others are put on its scale: a machine's speed varies from
-    day to day.
+    Models measured together share their noise, and a machine's speed varies from day to
+    day: traces are kept as a set, of the same models, machine, samples and frames.
     """
-    if not missing:
-        return {}
-    timed = missing if kept is None else (baseline, *missing)
+    timing = study.timing
+    machine = describe_machine(timing.threads, study.provider)
+    parts = machine, str(timing.samples), frames.fingerprint
+    digests = (f"{each.variant.name} {each.sha256}" for each in timed)
+    key = hashlib.sha256("\n".join((*parts, *digests)).encode()).hexdigest()
+    paths = {each.variant.name: workspace.trace(each.variant, key) for each in timed}
+    if all(path.is_file() for path in paths.values()):
+        return {name: LatencyTrace.load(path) for name, path in paths.items()}
     traces = record_traces(
         {each.variant.name: each.model for each in timed if each.model is not None},
         frames,
         said={each.variant.name: each.said for each in timed},
-        samples=study.timing.samples,
-        threads=study.timing.threads,
+        samples=timing.samples,
+        threads=timing.threads,
         provider=study.provider,
         on_sample=partial(listener.on_progress, "latency"),
     )
-    if kept is None:
-        return traces
-    again = traces.pop(baseline.variant.name)
-    pace = kept.percentile_us(50) / max(1, again.percentile_us(50))
-    return {
-        name: replace(
-            each, samples_us=tuple(round(us * pace) for us in each.samples_us)
-        )
-        for name, each in traces.items()
-    }
-
-
-def _kept(
-    study: Study,
-    each: PreparedVariant,
-    frames: str | None,
-    workspace: Workspace,
-    listener: Listener,
-) -> LatencyTrace | None:
-    """Return the trace that is given or kept, unless it is of something else."""
-    if each.variant.trace is not None:
-        return LatencyTrace.load(each.variant.trace)
-    path = workspace.trace(each.variant)
-    if each.model is None or not path.is_file():
-        return None
-    trace, wanted = LatencyTrace.load(path), study.timing.samples
-    machine = describe_machine(study.timing.threads, study.provider)
-    other = ""
-    if trace.model_sha256 != each.sha256:
-        other = "another model"
-    elif len(trace.samples_us) < wanted:
-        other = f"{len(trace.samples_us)} samples, not {wanted}"
-    # as it was written before 1 was singular
-    elif trace.machine.replace("on 1 threads", "on 1 thread") != machine:
-        other = f"another machine ({trace.machine}; this is {machine})"
-    elif None not in (trace.frames, frames) and trace.frames != frames:
-        other = "other frames"
-    if not other:
-        return trace
-    then = "left out" if study.held_out is None else "measured again"
-    listener.on_warning(f"{path}: of {other}: {then}")
-    return None
+    # a kill between leaves no whole set: all are measured again
+    for name, path in paths.items():
+        traces[name] = replace(traces[name], frames=frames.fingerprint)
+        traces[name].save(path)
+    return traces
 
 
 def _scale(study: Study, traces: Mapping[str, LatencyTrace]) -> float:

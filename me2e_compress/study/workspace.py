@@ -34,9 +34,9 @@ class Workspace:
         """Return the path of a compressed model; ``key`` is the hash of its recipe."""
         return self._made("models") / f"{variant.name}.{key[:16]}.onnx"
 
-    def trace(self, variant: Variant) -> Path:
-        """Return the path of the latency trace of a variant's model."""
-        return self._made("traces") / f"{variant.name}.json"
+    def trace(self, variant: Variant, key: str) -> Path:
+        """Return the path of a model's latency trace; ``key`` is that of its set."""
+        return self._made("traces") / f"{variant.name}.{key[:16]}.json"
 
     def _made(self, name: str) -> Path:
         path = self.folder / name

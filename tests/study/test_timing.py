@@ -1,9 +1,8 @@
-import json
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
+import numpy as np
 import pytest
 
 from me2e_compress.calibration.dataset import CalibrationSet
@@ -18,6 +17,7 @@ from me2e_compress.study.outcome import Clock, time_all
 from me2e_compress.study.prepared import prepare_variant
 from me2e_compress.study.workspace import Workspace
 from me2e_compress.workflows.result import SILENT
+from tests.command import write_frames
 from tests.study.conftest import BLIND, IDEAL, Make
 
 DEVICE = Condition("device", "trace")
@@ -80,112 +80,79 @@ def test_one_scale_gives_the_baseline_its_median_and_each_pays_its_own_latency(
     assert clock.source(blind, DEVICE, 7) is None
 
 
-def test_what_was_measured_is_kept_and_so_was_before_frames_were_named(
+def test_what_was_measured_together_is_kept(
     ours: Study, paced: list[list[str]], tmp_path: Path
 ) -> None:
     assert ours.held_out is not None
 
     assert clock_of(ours, tmp_path) == clock_of(ours, tmp_path)
     assert len(paced) == 1
-    kept = LatencyTrace.load(tmp_path / "traces" / "fast.json")
-    assert kept.frames == CalibrationSet(ours.held_out).fingerprint
     for path in (tmp_path / "traces").iterdir():
-        record = json.loads(path.read_bytes())
-        del record["frames"]
-        path.write_text(json.dumps(record))
-    clock_of(ours, tmp_path)
-    assert len(paced) == 1
+        kept = LatencyTrace.load(path)
+        assert kept.frames == CalibrationSet(ours.held_out).fingerprint
 
 
-def test_a_model_that_joins_later_is_put_on_the_scale_of_the_others(
+def test_a_model_that_joins_later_is_measured_with_the_others(
     ours: Study, make: Make, paced: list[list[str]], tmp_path: Path
 ) -> None:
     alone = make(variants=ours.variants[1:2], timing=ours.timing)
 
-    clock_of(alone, tmp_path)
+    before = clock_of(alone, tmp_path)
     clock = clock_of(ours, tmp_path)
 
     assert paced == [["slow"], ["slow", "fast"]]
-    assert clock.traces["fast"].samples_us == SAMPLES
+    assert clock.traces["fast"].samples_us == clock.traces["slow"].samples_us
+    assert clock_of(alone, tmp_path) == before
 
 
-@pytest.mark.parametrize(
-    ("change", "words"),
-    [
-        ({"model_sha256": "0" * 64}, "another model"),
-        ({"samples_us": SAMPLES[:4]}, "4 samples, not 5"),
-        ({"machine": "an Orin"}, f"another machine (an Orin; this is {HERE})"),
-        ({"frames": "0" * 32}, "other frames"),
-    ],
-)
-def test_a_trace_of_something_else_is_measured_again(
+def test_what_was_measured_otherwise_is_measured_again(
     ours: Study,
     paced: list[list[str]],
     tmp_path: Path,
-    change: dict[str, Any],
-    words: str,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    warnings = list[str]()
+    """Other samples, threads, frames or models, or another machine."""
     clock_of(ours, tmp_path)
-    stale = tmp_path / "traces" / "fast.json"
-    replace(LatencyTrace.load(stale), **change).save(stale)
+    write_frames(tmp_path / "others", command=np.array([2]))
+    blind, slow, fast = ours.variants
+    other = replace(fast, policy=slow.policy)
 
-    clock_of(ours, tmp_path, Listener(on_warning=warnings.append))
+    for changed in (
+        replace(ours, timing=replace(ours.timing, samples=3)),
+        replace(ours, timing=replace(ours.timing, threads=2)),
+        replace(ours, held_out=tmp_path / "others"),
+        replace(ours, variants=(blind, slow, other)),
+    ):
+        days = len(paced)
+        clock_of(changed, tmp_path)
+        assert len(paced) == days + 1
+    monkeypatch.setattr(outcome, "describe_machine", lambda *_: "an Orin")
+    clock_of(ours, tmp_path)
+    assert len(paced) == 6
 
-    assert paced[1:] == [["slow", "fast"]]
-    assert warnings == [f"{stale}: of {words}: measured again"]
 
-
-@pytest.mark.parametrize(("change", "days"), [({"samples": 3}, 1), ({"threads": 2}, 2)])
-def test_fewer_samples_take_what_is_kept_and_more_threads_do_not(
+def test_a_kill_while_traces_are_written_leaves_no_set(
     ours: Study,
     paced: list[list[str]],
     tmp_path: Path,
-    change: dict[str, int],
-    days: int,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    kept = clock_of(ours, tmp_path)
-
-    again = clock_of(replace(ours, timing=replace(ours.timing, **change)), tmp_path)
-
-    assert len(paced) == days
-    assert (again == kept) is (days == 1)
-
-
-def test_without_a_trace_of_the_baseline_all_are_measured_again(
-    ours: Study, paced: list[list[str]], tmp_path: Path
-) -> None:
-    warnings = list[str]()
-    clock_of(ours, tmp_path)
-    (tmp_path / "traces" / "slow.json").unlink()
-
-    clock = clock_of(ours, tmp_path, Listener(on_warning=warnings.append))
-
-    assert paced[1:] == [["slow", "fast"]]
-    assert clock.latency("fast", 50).value == pytest.approx(240.0)
-    stale = tmp_path / "traces" / "fast.json"
-    assert warnings == [
-        f"{stale}: no trace of the baseline is kept beside it: measured again"
-    ]
-
-
-@pytest.mark.usefixtures("paced")
-def test_a_kill_while_traces_are_written_leaves_no_baseline(
-    ours: Study, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    save, saved = LatencyTrace.save, list[str]()
+    save, saved = LatencyTrace.save, list[Path]()
 
     def killed(trace: LatencyTrace, path: Path) -> None:
         if saved:
             raise KeyboardInterrupt
-        saved.append(path.stem)
+        saved.append(path)
         save(trace, path)
 
-    monkeypatch.setattr(LatencyTrace, "save", killed)
-    with pytest.raises(KeyboardInterrupt):
-        clock_of(ours, tmp_path)
+    with monkeypatch.context() as patched:
+        patched.setattr(LatencyTrace, "save", killed)
+        with pytest.raises(KeyboardInterrupt):
+            clock_of(ours, tmp_path)
+    clock = clock_of(ours, tmp_path)
 
-    assert saved == ["fast"]
+    assert paced == [["slow", "fast"]] * 2
+    assert clock.traces["slow"].samples_us == clock.traces["fast"].samples_us
 
 
 def test_a_trace_that_is_given_is_taken(
