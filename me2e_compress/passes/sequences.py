@@ -69,9 +69,10 @@ def _lengths(node: ir.Node) -> list[int] | None:
     if lengths is None or array is None or array.ndim:
         return lengths
     # one number is the length of each part but the last
-    if size is None or lengths[0] < 1:
+    (most,) = lengths
+    if size is None or most < 1:
         return None
-    return [min(lengths[0], size - at) for at in range(0, size, lengths[0])]
+    return [min(most, size - at) for at in range(0, size, most)]
 
 
 def _unpacks(reader: ir.Node, size: int) -> bool:

@@ -19,6 +19,7 @@ from benchmarks.bench_int8_shapes import FORMS as INT8_FORMS
 from benchmarks.bench_int8_shapes import Convolution, product, session
 from benchmarks.bench_levers import LEVERS, Feeds, Lever, first_frame, measured, opened
 from benchmarks.bench_runtime import Row, table
+from benchmarks.bench_stacks import print_parted
 from benchmarks.gpu_table import Found
 from benchmarks.gpu_table import table as gpu_table
 from benchmarks.original_patterns import FORMS, restored
@@ -198,6 +199,21 @@ def test_the_table_compares_with_the_first_row() -> None:
 
     assert line.split(" | ")[1:4] == ["1.00", "1.50", "9.00"]
     assert line.endswith("20.0 | 30.0 | 40% |")
+
+
+def test_outputs_that_part_by_6_db_are_listed(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    runs = [
+        {"stack": "a", "target": "onnxruntime", "sqnr_db": {"x": 52.0, "y": 20.0}},
+        {"stack": "a", "target": "tensorrt", "sqnr_db": {"x": 15.5, "y": 26.0}},
+    ]
+    others = [{**runs[0], "seed": 1}, {**runs[1], "seed": 2, "sqnr_db": {}}]
+    print_parted([*({**run, "seed": 0} for run in runs), *others])
+    assert capsys.readouterr().out == (
+        "a, seed 0: placed for onnxruntime, x keeps 52.0 dB; as placed for tensorrt"
+        " 15.5 dB\n"
+    )
 
 
 def test_frames_that_uniad_has_run_are_kept_on_request_and_compared(

@@ -10,10 +10,10 @@ from me2e_compress.runtime.session import run_once
 
 def graph_of(body: str) -> ir.Model:
     return ir.from_onnx_text(
-        f"""<ir_version: 9, opset_import: ["" : 17]>
+        f"""<ir_version: 9, opset_import: ["" : 17, "other" : 1]>
         g (float[2,6] x) => (y) <
             int64 zero = {{0}}, int64 last = {{-1}}, int64 four = {{4}},
-            int64[2] parts = {{2, 4}}
+            int64[2] parts = {{2, 4}}, float[1,6] stored = {{1, 2, 3, 4, 5, 6}}
         > {{ {body} }}"""
     )
 
@@ -23,6 +23,8 @@ def graph_of(body: str) -> ir.Model:
     [
         '["s"] s = SplitToSequence<axis = 1>(x, parts) ["y"] y = SequenceAt(s, last)',
         '["s"] s = SplitToSequence<axis = -1>(x, four) ["y"] y = SequenceAt(s, last)',
+        '["s"] s = SplitToSequence<axis = -1>(x, four) ["y"] y = ConcatFromSequence'
+        "<axis = 1>(s)",
         '["s"] s = SplitToSequence(x) ["y"] y = SequenceAt(s, zero)',
         '["s"] s = SequenceConstruct(x, x) ["y"] y = SequenceLength(s)',
         '["n"] n = Neg(x) ["s"] s = SequenceConstruct(x, n)'
@@ -46,6 +48,15 @@ def test_a_sequence_becomes_its_tensors(body: str) -> None:
         '["s"] s = SplitToSequence<keepdims = 0>(x) ["y"] y = SequenceAt(s, zero)',
         '["s"] s = SequenceConstruct(x) ["t"] t = SequenceInsert(s, x)'
         ' ["y"] y = SequenceAt(t, last)',
+        '["s"] s = SplitToSequence<axis = 1>(stored, parts)'
+        ' ["y"] y = SequenceAt(s, last)',
+        '["s"] s = SplitToSequence(x) ["y"] y = SequenceAt(s, four)',
+        '["y"] y = SequenceConstruct(x, x) ["n"] n = SequenceLength(y)',
+        '["y"] y = Neg(x) ["s"] s = SequenceConstruct(x, y)',
+        '["s"] s = SplitToSequence(x, zero) ["y"] y = SequenceAt(s, zero)',
+        '["s"] s = other.SequenceConstruct(x) ["y"] y = SequenceAt(s, zero)',
+        '["s"] s = SequenceConstruct(x, x) ["n"] n = SequenceLength(s)'
+        ' ["t"] t = SequenceErase(s) ["y"] y = SequenceAt(t, zero)',
     ],
 )
 def test_other_sequences_stay(body: str) -> None:

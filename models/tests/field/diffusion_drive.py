@@ -101,7 +101,8 @@ class DiffusionDrive(nn.Module):
         self.trunk = Trunk()
         self.query = nn.Embedding(1 + AGENTS, WIDTH)
         self.keys, self.status = nn.Conv2d(WIDTHS[-1], WIDTH, 1), nn.Linear(8, WIDTH)
-        self.places = nn.Embedding(16 + 1, WIDTH)
+        cells = math.prod(LIDAR[2:]) // (2 * 2 ** len(WIDTHS)) ** 2
+        self.places = nn.Embedding(cells + 1, WIDTH)
         layer = nn.TransformerDecoderLayer(WIDTH, HEADS, 128, batch_first=True)
         self.decoder = nn.TransformerDecoder(layer, 2)
         self.bev_head, self.boxes = picture_head(WIDTH, 7), mlp(WIDTH, 5)

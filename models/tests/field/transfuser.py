@@ -14,11 +14,11 @@ from torch.nn import functional
 
 from models.resnet import Block
 
-WIDTHS = (16, 32, 64, 128)
-"""Channels of the four stages."""
+WIDTHS = (32, 64)
+"""Channels of the stages, of which the published networks have four."""
 
-IMAGE = (1, 3, 64, 256)
-LIDAR = (1, 2, 128, 128)
+IMAGE = (1, 3, 32, 128)
+LIDAR = (1, 2, 64, 64)
 IMAGE_TOKENS, LIDAR_TOKENS = (2, 8), (4, 4)
 WIDTH, HEADS = 64, 4
 """Of all transformers behind the trunk."""
@@ -67,7 +67,7 @@ class SelfAttention(nn.Module):
 
 
 class FusionBlock(nn.Module):
-    """Attention and two layers, each behind a LayerNormalization and added."""
+    """Attention and two layers, each behind a LayerNorm and added."""
 
     def __init__(self, width: int) -> None:
         super().__init__()
@@ -95,15 +95,15 @@ class Fusion(nn.Module):
         self.lidar_pool = nn.AdaptiveAvgPool2d(LIDAR_TOKENS)
         self.lidar_to_image = nn.Conv2d(width, width, 1)
         self.image_to_lidar = nn.Conv2d(width, width, 1)
-        self.blocks = nn.Sequential(FusionBlock(width), FusionBlock(width))
+        self.block = FusionBlock(width)
         self.ln_f = nn.LayerNorm(width)
 
     def forward(self, image: Tensor, lidar: Tensor) -> tuple[Tensor, Tensor]:
         """Mix two maps [n, c, h, w] of sizes of their own."""
         width = image.shape[1]
         pooled = self.image_pool(image), self.lidar_pool(self.image_to_lidar(lidar))
-        tokens = torch.cat([each.flatten(2).transpose(1, 2) for each in pooled], 1)
-        mixed = self.ln_f(self.blocks(tokens + self.pos_emb))
+        tokens = torch.cat([part.flatten(2).transpose(1, 2) for part in pooled], 1)
+        mixed = self.ln_f(self.block(tokens + self.pos_emb))
         count = math.prod(IMAGE_TOKENS)
         parts = mixed[:, :count], mixed[:, count:]
         maps = [
@@ -116,7 +116,7 @@ class Fusion(nn.Module):
 
 def enlarged(small: Tensor, to: Tensor) -> Tensor:
     """Enlarge a map to the size of another, which a trace takes as fixed."""
-    size = [int(each) for each in to.shape[2:]]
+    size = [int(side) for side in to.shape[2:]]
     return functional.interpolate(small, size, mode="bilinear", align_corners=False)
 
 
@@ -189,14 +189,14 @@ class Centres(nn.Module):
         height, width = heat.shape[2:]
         scores, at = peaks.flatten(1).topk(self.best)
         label, cell = at // (height * width), at % (height * width)
-        said = {}
+        chosen = {}
         for name in ("offset", "size", "yaw_class", "yaw_res"):
             flat = maps[name].flatten(2).transpose(1, 2)
             where = cell[..., None].expand(-1, -1, flat.shape[2])
-            said[name] = flat.gather(1, where)
-        centre = torch.stack((cell % width, cell // width), -1) + said["offset"]
-        turn = said["yaw_class"].argmax(-1, keepdim=True) * (math.pi / 6)
-        parts = (centre, said["size"], turn + said["yaw_res"], scores[..., None])
+            chosen[name] = flat.gather(1, where)
+        centre = torch.stack((cell % width, cell // width), -1) + chosen["offset"]
+        turn = chosen["yaw_class"].argmax(-1, keepdim=True) * (math.pi / 6)
+        parts = (centre, chosen["size"], turn + chosen["yaw_res"], scores[..., None])
         return heat, torch.cat((*parts, label[..., None].float()), -1)
 
 
