@@ -198,7 +198,10 @@ class Registry(Generic[T]):
     def _built(
         self, item: ParsedItem, cls: type[T], more: Mapping[str, object] | None = None
     ) -> T:
-        options, more = item.options, more or {}
+        # a version is written as a number, and is a text
+        texts = [field.name for field in fields_of(cls) if field.type is str]
+        written = {name: text for name, text in item.numbers.items() if name in texts}
+        options, more = {**item.options, **written}, more or {}
         if item.value is not None:
             first = next((each for each in fields_of(cls) if not each.kw_only), None)
             if first is None:

@@ -39,11 +39,15 @@ class TextError(ValueError):
 
 @dataclasses.dataclass(frozen=True)
 class ParsedItem:
-    """A name, the options in braces behind it, and what stands behind a colon."""
+    """A name, the options in braces behind it, and what stands behind a colon.
+
+    ``numbers`` holds numbers as they are written: version 10.10 is not version 10.1.
+    """
 
     name: str
     options: Mapping[str, object] = dataclasses.field(default_factory=dict)
     value: str | None = None
+    numbers: Mapping[str, str] = dataclasses.field(default_factory=dict)
 
 
 def name_in(text: str) -> str:
@@ -137,9 +141,11 @@ class _Reader:
         if self.take(":"):
             value = self.expect(_SHORT, f"a value is expected behind {name}:")
             return ParsedItem(name, value=value)
-        return ParsedItem(name, self.options() if self.take("{") else {})
+        numbers = dict[str, str]()
+        options = self.options(numbers) if self.take("{") else {}
+        return ParsedItem(name, options, numbers=numbers)
 
-    def options(self) -> dict[str, object]:
+    def options(self, numbers: dict[str, str] | None = None) -> dict[str, object]:
         options: dict[str, object] = {}
         while not self.take("}"):
             if options and not self.take(","):
@@ -149,7 +155,10 @@ class _Reader:
                 self.fail(f"option {name} is given twice")
             if not self.take("="):
                 self.fail("option=value is expected")
-            options[name] = self.value()
+            begin = self.at
+            options[name] = value = self.value()
+            if numbers is not None and isinstance(value, int | float):
+                numbers[name] = self.text[begin : self.at].strip()
         return options
 
     def key(self) -> str:

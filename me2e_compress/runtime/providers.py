@@ -20,8 +20,8 @@ Chain: TypeAlias = list[str | tuple[str, dict[str, str]]]
 """Providers in onnxruntime's form; each runs what those before it cannot."""
 
 WRONG_FUSIONS = ("Pad_Fusion",)
-"""Optimizations of onnxruntime (1.31) that change the result: this one folds a Pad of
-zeros into the MaxPool after it, whose own padding is minus infinity."""
+"""Optimizations of onnxruntime up to 1.31 that change the result: this one folds a Pad
+of zeros into the MaxPool after it, whose own padding is minus infinity."""
 SLOW_FUSIONS = ("SkipLayerNormFusion",)
 """Optimizations that slow down the CPU: the fused kernel of Add and LayerNormalization
 takes 4.0 to 6.9 times as long as the two (64 to 768 columns, 100 to 10,000 rows, one

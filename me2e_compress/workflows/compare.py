@@ -12,7 +12,7 @@ from me2e_compress import graph
 from me2e_compress.calibration.calibrator import Extremes
 from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.calibration.statistics import first_maker, places_of
-from me2e_compress.display import Table, counted, number, table
+from me2e_compress.display import counted, number, table
 from me2e_compress.errors import (
     EvaluationError,
     FramesError,
@@ -72,13 +72,18 @@ class CompareResult(Result):
 
     def shown(self) -> Shown:
         """Return how far outputs, agents and the plan moved, and what is dead."""
-        fidelity, liveness = self.fidelity, self.liveness
+        fidelity, liveness, agents = self.fidelity, self.liveness, self.agents
+        matched = {} if agents is None else agents.sqnr_db
         rows = [
-            *((o.name, f"{o.sqnr_db:.1f}", f"{o.error:.1e}") for o in fidelity.outputs),
-            *((name, "removed", "") for name in fidelity.missing),
+            (o.name, f"{matched[o.name]:.1f}", "matched")
+            if o.name in matched
+            else (o.name, f"{o.sqnr_db:.1f}", f"{o.error:.1e}")
+            for o in fidelity.outputs
         ]
+        rows += [(name, "removed", "") for name in fidelity.missing]
         title = f"Fidelity over {counted(fidelity.frames, 'frame')}"
-        outputs = table(title, ("output", "SQNR dB", "max|a-b|/max|a|"), rows)
+        columns, note = ("output", "SQNR dB", "max|a-b|/max|a|"), _agents(agents)
+        outputs = table(title, columns, rows, note)
         faults = () if liveness is None else liveness.faults
         dead = "; ".join(faults)
         return Shown(
@@ -86,7 +91,6 @@ class CompareResult(Result):
             (
                 outputs,
                 *([liveness.table()] if liveness and liveness.outputs else []),
-                *([] if self.agents is None else [_agents(self.agents)]),
             ),
             (
                 *filter(None, [self.known]),
@@ -124,15 +128,15 @@ def _plan_moved(fidelity: Fidelity) -> str:
     return f"{said}; the same candidate on {fidelity.same_choice:.1%} of them"
 
 
-def _agents(found: SetFidelity) -> Table:
-    rows = [(name, f"{decibels:.1f}") for name, decibels in found.sqnr_db.items()]
+def _agents(found: SetFidelity | None) -> str:
+    """Describe how outputs that are sets are compared; empty without any."""
+    if found is None:
+        return ""
     agents = counted(found.agents, "agent")
-    return table(
-        "Agents with a score of 0.5 or more, each against the nearest",
-        ("output", "SQNR dB"),
-        rows,
-        f"The first graph scores {agents} at 0.5 or more. The second has an agent "
-        f"within 2 m of {found.matched} of them.",
+    return (
+        "matched: agents with a score of 0.5 or more, each against the nearest. The"
+        f" first graph has {agents} of such scores, the second one within 2 m of"
+        f" {found.matched} of them."
     )
 
 
@@ -273,15 +277,16 @@ def compared(
     """
     lively = LivenessTally(reference, candidate) if alive else None
     frames, again = itertools.tee(frames)
-    runtime = None if kernels is None else RuntimeTally(kernels, again)
+    runtime = None if kernels is None else RuntimeTally(kernels, again, sets)
     del again  # what nobody reads must not be kept
     watching = [each.add for each in (sets, watch, lively, runtime) if each is not None]
     fidelity = measure(reference, candidate, frames, watching)
+    agents = None if sets is None else sets.result()
     return Comparison(
         fidelity,
         None if lively is None else lively.result(alive),
-        None if runtime is None else runtime.result(model, fidelity),
-        None if sets is None else sets.result(),
+        None if runtime is None else runtime.result(model, fidelity, agents),
+        agents,
     )
 
 

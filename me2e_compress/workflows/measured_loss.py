@@ -137,14 +137,14 @@ class MeasuredLoss:
             for each in found.outputs
             if each.discrete
         }
-        said |= {name: f"agents {db:.1f} dB" for name, db in self._matched.items()}
         said |= dict.fromkeys(below, "below")
+        matched = self._matched
         rows = [
             (
                 each.name,
-                f"{each.sqnr_db:z.1f}",
-                each.by_frame,
-                f"{each.error:.1e}",
+                f"{matched.get(each.name, each.sqnr_db):z.1f}",
+                "matched agents" if each.name in matched else each.by_frame,
+                "" if each.name in matched else f"{each.error:.1e}",
                 said.get(each.name, "above"),
             )
             for each in found.outputs

@@ -8,7 +8,7 @@ import numpy as np
 import onnx_ir as ir
 
 from me2e_compress import graph
-from me2e_compress.fidelity.compare import Fidelity, Tally
+from me2e_compress.fidelity.compare import Fidelity, SetFidelity, SetTally, Tally
 from me2e_compress.runtime.frames import Array, Frame
 from me2e_compress.runtime.providers import CPU, Provider
 from me2e_compress.runtime.session import Session, replay
@@ -67,10 +67,14 @@ class RuntimeTally:
     Args:
         session: the graph, with int8 kernels.
         frames: those that the reference is shown.
+        sets: a tally of the outputs that are sets, which are matched here, too.
     """
 
-    def __init__(self, session: Session, frames: Iterable[Frame]) -> None:
+    def __init__(
+        self, session: Session, frames: Iterable[Frame], sets: SetTally | None = None
+    ) -> None:
         self._answers, self._provider = replay(session, frames), session.provider
+        self._sets = None if sets is None else SetTally(sets.outputs)
         self._tallies: dict[str, Tally] = {}
         self._frame: Frame | None = None
 
@@ -82,11 +86,18 @@ class RuntimeTally:
         for name in (each for each in nodes if each in reference):
             tally = self._tallies.setdefault(name, Tally(name))
             tally.add(reference[name], answers[name], frame.index)
+        if self._sets is not None:
+            self._sets.add(reference, answers, frame)
 
-    def result(self, model: ir.Model, fidelity: Fidelity) -> RuntimeLoss:
+    def result(
+        self, model: ir.Model, fidelity: Fidelity, agents: SetFidelity | None = None
+    ) -> RuntimeLoss:
         """Return what is noisier than by the nodes, and the causes."""
         nodes = {each.name: each.sqnr_db for each in fidelity.outputs}
         runs = {name: tally.sqnr_db for name, tally in self._tallies.items()}
+        if agents is not None and self._sets is not None:
+            nodes.update(agents.sqnr_db)
+            runs.update(self._sets.result().sqnr_db)
         apart = [
             name
             for name, sqnr in runs.items()

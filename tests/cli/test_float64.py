@@ -74,8 +74,9 @@ def test_float64_that_runs_is_proven_against_itself(cli: Cli, tmp_path: Path) ->
 
 
 def test_the_lint_names_it_although_a_pool_is_wrong_too(
-    cli: Cli, tmp_path: Path
+    cli: Cli, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr("onnxruntime.__version__", "1.31.0")
     text = SAMPLED.replace(
         "y = MatMul(o, w)", "p = Pad(o, pads) y = MaxPool<kernel_shape=[3,3]>(p)"
     ).replace("<double h", "<int64[8] pads = {0,0,1,1,0,0,1,1}, double h")

@@ -58,6 +58,22 @@ def test_a_real_run_is_scored(cli: Cli) -> None:
     assert "nowhere: no such folder" in cli.refused("score run --metrics nowhere")
 
 
+@pytest.mark.usefixtures("run")
+def test_a_routes_file_names_a_set_of_ones_own(cli: Cli, tmp_path: Path) -> None:
+    ids = "".join(f'<route town="T" id="{each}"/>' for each in (1711, 2050, 9))
+    (tmp_path / "own.xml").write_text(f"<routes>{ids}</routes>")
+    (tmp_path / "empty.xml").write_text("<routes/>")
+
+    found = scored(cli, "score run own.xml")
+
+    given = found["leaderboard"]["given"]["driving_score"]
+    assert given == {"set": 148 / 3, "driven": 74.0}
+    assert found["records"]["missing"] == ["9"]
+    assert "empty.xml: no <route id=...>" in cli.refused("score run empty.xml")
+    assert "own.xml: one routes file" in cli.refused("score run empty.xml own.xml")
+    assert "own.xml: it names the set" in cli.refused("score own.xml")
+
+
 def test_what_is_wrong_with_a_real_run_is_said(cli: Cli, run: Path) -> None:
     odd = run.parent / "odd"
     write(odd / "m.json", merged(GOOD))

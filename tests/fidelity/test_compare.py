@@ -378,11 +378,14 @@ def test_compare_matches_what_both_graphs_have(
     found = compare_files(one, other, frames, CompareOptions(alive=0.0))
 
     assert found.fidelity.outputs[0].sqnr_db < 6.0
+    (outputs,) = found.shown().tables
     if has_scores:
         assert found.agents is not None
         assert found.agents.sqnr_db["boxes"] == math.inf
+        assert [each.text for each in outputs.rows[0]] == ["boxes", "inf", "matched"]
     else:
         assert found.agents is None
+        assert outputs.rows[0][1].text == f"{found.fidelity.outputs[0].sqnr_db:.1f}"
 
 
 def chooser(bias: float) -> Session:

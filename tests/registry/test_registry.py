@@ -24,6 +24,7 @@ from tests.registry.shapes import GROUP, SHAPES, Circle, Colour, Point, Shape, S
         ("square{picture=a/b.png}", Square(picture=Path("a/b.png"))),
         ("square{label=x{y=[1, 2]}}", Square(label="x{y=[1, 2]}")),
         ('square{label=x{y="}"}}', Square(label='x{y="}"}')),
+        ("square{label=10.10, side=2}", Square(2.0, label="10.10")),
         ("square{label=fps:10,count=1}", Square(label="fps:10", count=1)),
         ('square{colour="blue, or so"}', Square(colour=Colour.BLUE)),
         ("circle:1e-3", Circle(0.001)),

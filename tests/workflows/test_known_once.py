@@ -1,11 +1,12 @@
 """State and plan: known of either file, its sizes of the frames, and from where."""
 
+import json
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from tests.command import Cli
+from tests.command import Cli, write_frames
 from tests.nets import save_text
 
 TEXT = """m (float[batch,4] x, float[batch,4] h) => (float[batch,4] y, float[batch,4] n)
@@ -48,3 +49,23 @@ def test_unknown_keys_of_a_recording_are_refused(files: Cli, tmp_path: Path) -> 
     index(tmp_path, '{"scenes": [0], "sceens": [1]}')
     line = "compare m.onnx small.onnx frames"
     assert "scenes.json: unknown key 'sceens'" in files.refused(line)
+    grey = {"mean": [0] * 3, "std": [1] * 3, "order": "rgb", "rows": 4, "columns": 4}
+    pixels = {"inputs": {"img": grey}}
+    index(tmp_path, json.dumps({"scenes": [0], "pixels": pixels}))
+    assert "pixels: img is not an input of the model" in files.refused(line)
+
+
+ROOTS = """m (float[1,4] x) => (float[1,4] y)
+{ a = Identity(x) [root] r = Sqrt(a) [end] y = Neg(r) }"""
+
+
+def test_compare_names_the_node_that_makes_nan_first(cli: Cli, tmp_path: Path) -> None:
+    save_text(tmp_path / "roots.onnx", ROOTS)
+    x = np.array([[4.0, 1.0, -1.0, 9.0]], np.float32)
+    write_frames(tmp_path / "frames", x=x)
+
+    found = cli.document("compare roots.onnx roots.onnx frames")
+
+    (line,) = found["not_finite"]
+    assert line.startswith("roots.onnx: root (Sqrt) is first to make NaN")
+    assert line in cli.done("compare roots.onnx roots.onnx frames").out

@@ -9,6 +9,7 @@ from collections.abc import Iterator, Mapping
 
 import numpy as np
 import onnx_ir as ir
+import onnxruntime as ort
 
 from me2e_compress.graph import (
     CONVOLUTIONS,
@@ -413,12 +414,20 @@ def unanswered(model: ir.Model) -> Iterator[LintFinding]:
             )
 
 
+def fuses_pads_wrongly() -> bool:
+    """Return whether the installed onnxruntime is one before 1.32."""
+    major, minor = ort.__version__.split(".")[:2]
+    return (int(major), int(minor)) < (1, 32)
+
+
 def padded_pools(model: ir.Model) -> Iterator[LintFinding]:
-    """Find a Pad of zeros before a MaxPool: onnxruntime 1.31 computes it wrongly.
+    """Find a Pad of zeros before a MaxPool: onnxruntime up to 1.31 computes it wrongly.
 
     Its Pad fusion turns the zeros into the pool's own padding, which is minus infinity;
     inputs that are never negative give the same result. Our own sessions disable it.
     """
+    if not fuses_pads_wrongly():
+        return
     for node in nodes_of(model):
         pad = maker(node.inputs[0], "Pad") if node.op_type == "MaxPool" else None
         if (

@@ -101,7 +101,7 @@ def test_a_float_convolution_behind_an_int8_one_needs_no_answer() -> None:
     ],
 )
 def test_pads_that_onnxruntime_folds_into_a_pool(
-    before: str, pad: str, found: list[str]
+    monkeypatch: pytest.MonkeyPatch, before: str, pad: str, found: list[str]
 ) -> None:
     model = parsed(
         "m (float[1,1,2,2] x) => (float[1,1,2,2] y)\n"
@@ -109,11 +109,27 @@ def test_pads_that_onnxruntime_folds_into_a_pool(
         f"{{ a = {before}(x) [edge] b = Pad(a, p{pad})"
         " [pool] y = MaxPool<kernel_shape=[3,3]>(b) }"
     )
+    assert OnnxRuntime().lint(model) == ()  # mended since
+    monkeypatch.setattr("onnxruntime.__version__", "1.31.2")
     lint = OnnxRuntime().lint(model)
 
     assert [each.rule for each in lint] == found
     assert all("Pad 'edge'" in each.message for each in lint)
     assert {each.severity for each in lint} <= {"wrong"}  # it runs
+
+
+def test_a_scale_that_is_neither_a_number_nor_a_row_is_an_error() -> None:
+    text = """<ir_version: 10, opset_import: ["" : 21]>
+    m (float[1,2,4,4] x) => (float[1,2,4,4] y)
+    <int8[2,2,1,1] w = {1,2,3,4}, float[%s] s = {0.1,0.2}>
+    { [pair] d = DequantizeLinear<axis=%s>(w, s) y = Conv(x, d) }"""
+    wrong, row = text % ("2,1", "0"), text % ("2", "0")
+    blocks = text % ("2,1,1,1", "1, block_size=2")
+
+    (found,) = OnnxRuntime().lint(parsed(wrong))
+    assert (found.severity, found.rule, found.node) == ("error", "scale-shape", "pair")
+    assert "[2, 1]" in found.message
+    assert OnnxRuntime().lint(parsed(row)) == OnnxRuntime().lint(parsed(blocks)) == ()
 
 
 SAMPLED = "(float[1,1,2,2] x, double[1,1,1,2] g) => (float[1,1,1,1] y)"
