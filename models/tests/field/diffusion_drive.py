@@ -145,13 +145,12 @@ class DiffusionDrive(nn.Module):
         """Take both steps from anchors with noise; courses are within 32 m."""
         kept, anchors = self.get_buffer("kept"), self.get_buffer("anchors")
         noisy = kept[8].sqrt() * anchors / 32 + (1 - kept[8]).sqrt() * noise
+        courses, scores = noisy, noisy
         for step, after in zip(STEPS, (*STEPS[1:], None), strict=True):
             points = noisy.clamp(-1, 1) * 32
             query = self.encode(sines(points, 16).flatten(2))
             now = torch.full((len(noise),), step, dtype=torch.int64)
             time = self.time(sines(now.float(), WIDTH))
-            scores = query[..., 0]
-            courses = torch.zeros(0)
             for layer in self.layers:
                 query, courses, scores = layer(query, points, bev, agents, ego, time)
                 points = courses[..., :2]
