@@ -122,19 +122,12 @@ def test_fused_attention_runs_as_its_nodes_do(layout: str) -> None:
     apply(FuseKernels(), model)
 
     assert np.allclose(Session(model, threads=1).run(feeds)["y"], wanted, atol=1e-6)
+    if layout == "heads in the batch":
+        assert "Transpose" not in ops(model)
     if layout.startswith("side by side"):  # the transposes go
         assert ops(model) == [*["Reshape"] * 3, "MultiHeadAttention", "Reshape"]
         (fused,) = filter(find, model.graph)
         assert fused.attributes.get_int("heads") == H
-
-
-def test_a_scale_that_is_not_the_usual_stays_on_the_query() -> None:
-    model = written("heads in the batch", scale=0.5)
-
-    apply(FuseKernels(), model)
-
-    assert "Mul" in ops(model)
-    assert "Transpose" not in ops(model)
 
 
 @pytest.mark.parametrize(
@@ -142,6 +135,7 @@ def test_a_scale_that_is_not_the_usual_stays_on_the_query() -> None:
     [
         ("w = Softmax<axis=-1>(b)", "w = Softmax<axis=2>(b)", "over the last axis"),
         ("(b) z", "(b) others = Abs(w) z", "others read its scores or weights"),
+        ("w = Soft", "others = Soft", "others read its scores or weights"),
         ("b = Div(a, t)", "b = Div(a, t) others = Abs(a)", "others read its scores"),
         ("b = Div(a, t)", "b = Div(a, t) others = Abs(b)", "others read its scores"),
         ("w = Softmax<axis=-1>(b)", "c = Add(b, t) w = Softmax<axis=-1>(c)", "a mask"),
@@ -166,6 +160,8 @@ def test_near_misses_stay_and_say_why(old: str, new: str, why: str) -> None:
         text = text.replace("y)", f"y, float[1,{H},{Q},{K}] others)", 1)
     if "DequantizeLinear" in new:
         text = text.replace(f"float[1,{H},{K},{C}] v", f"int8[1,{H},{K},{C}] i")
+    if "others = Soft" in new:
+        text = text.replace("MatMul(w,", "MatMul(others,")
     assert old in text
     model = read(text.replace(old, new))
 
@@ -185,11 +181,3 @@ def test_a_query_that_is_a_vector_stays() -> None:
     (note,) = apply(FuseKernels(), model).notes
 
     assert note.endswith("one of its operands is a vector")
-
-
-def test_attention_maps_that_are_outputs_stay() -> None:
-    model = written("heads in the batch")
-    (softmax,) = (node for node in model.graph if node.op_type == "Softmax")
-    model.graph.outputs.append(softmax.outputs[0])
-
-    assert not apply(FuseKernels(), model).changes
