@@ -32,6 +32,7 @@ def test_a_number_that_is_none(cli: Cli, dense: Path, line: str, value: str) -> 
     [
         f"calibrate {F} -o out --threads -1",
         "compress dense.onnx -r exact -o out --verify-frames -1",
+        "compress dense.onnx -r exact -o out --verify-frames 1001",
         f"sensitivity {F} -o out --node-trials -1",
         "profile dense.onnx frames -o out --threads -1",
         "frames highway -n 1 -o out --seed -1",

@@ -110,7 +110,6 @@ OTHERS = {
     "lint dense.onnx --target onnxruntime --trt-check": "--trt-check is for tensorrt",
     "lint dense.onnx --target-version ten": "target-version: 'ten' is no version of",
     "lint dense.onnx --sm 75": "--sm 75 is for --trt-check, which is not given",
-    "compress dense.onnx -o o.onnx --verify-frames 1001": "must be 1,000 at most",
     "lint dense.onnx --target-version 10": "'10' is no version of TensorRT, such as",
     "lint dense.onnx --target onnxruntime --target-version 10.13": (
         "--target-version is for tensorrt, not for onnxruntime"
@@ -135,7 +134,6 @@ SCORE = {
     "score nodir": "nodir: no such folder$",
     "score frames": "not a results folder",
     "score results --metrics frames": "no results of a real run, which --metr",
-    "routes -o out.json --scenarios Flying": "no scenario 'Flying'; there are",
 }
 LINES = {
     **{f"compress {words}": said for words, said in COMPRESS.items()},
