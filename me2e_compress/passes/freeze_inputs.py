@@ -110,7 +110,7 @@ def deciding_inputs(model: ir.Model) -> tuple[str, ...]:
         elif node.op_type == "MatMul":
             near = (_roots(model, value) for value in node.inputs)
             every = (root for some in near for root in some)
-            roots = {e for e in every if (static_shape(e) or ())[-2:] in MATRICES}
+            roots = [e for e in every if (static_shape(e) or ())[-2:] in MATRICES]
             least = 16 * MOST_MATRICES
         else:
             continue
@@ -120,17 +120,15 @@ def deciding_inputs(model: ir.Model) -> tuple[str, ...]:
     return tuple(name for name in names if name not in states)
 
 
-def _roots(model: ir.Model, value: ir.Value | None) -> set[ir.Value]:
+def _roots(model: ir.Model, value: ir.Value | None) -> list[ir.Value]:
     """Return the inputs that a value is computed of, but those of known size alone."""
-    roots, seen, pending = set[ir.Value](), set[ir.Value](), [value]
+    seen, pending = set[ir.Value](), [value]
     while pending:
         value = pending.pop()
         if value is None or value in seen:
             continue
         seen.add(value)
         made = producer_of(value)
-        if made is None:
-            roots.update({value} & set(model.graph.inputs))
-        elif made.op_type not in ("Shape", "Size"):
+        if made is not None and made.op_type not in ("Shape", "Size"):
             pending += made.inputs
-    return roots
+    return [each for each in model.graph.inputs if each in seen]

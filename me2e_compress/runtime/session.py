@@ -352,11 +352,9 @@ class Session:
         """
         sizes = {
             dim: size
-            for name in self.inputs
+            for name, port in self.inputs.items()
             if name in held
-            for dim, size in zip(
-                self.inputs[name].shape, held[name].shape, strict=False
-            )
+            for dim, size in zip(port.shape, held[name].shape, strict=False)
             if dim_name(dim)
         }
         return {

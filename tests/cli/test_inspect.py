@@ -6,6 +6,7 @@ import onnx_ir as ir
 import pytest
 
 from me2e_compress import graph
+from me2e_compress.graph.runtime_operators import newest_opset
 from tests.command import Cli
 from tests.graph.test_opset import written
 from tests.nets import conv_attention, save_text
@@ -102,10 +103,10 @@ def test_a_model_newer_than_onnxruntime_says_what_was_changed(
     model = ir.load(path)
     del model.graph.inputs[1:]
     path.write_bytes(ir.to_proto(model).SerializeToString())
-    changed = "IR version 14 became 13, opset 28 became 26"
+    changed = f"opset 28 became {newest_opset()}: onnxruntime has no QuantizeLinear"
 
-    assert f"opset 26 and trt ({changed}: " in cli.done("inspect", path).words
+    assert f"opset {newest_opset()} and trt (" in cli.done("inspect", path).words
+    assert changed in cli.done("inspect", path).words
     done = cli.done("compress -r exact -o small.onnx", path)
-    assert f"{changed}: onnxruntime reads no" in " ".join(done.err.split())
-    report = (tmp_path / "small.report.json").read_text()
-    assert "opset 28 became 26" in report
+    assert changed in " ".join(done.err.split())
+    assert changed in (tmp_path / "small.report.json").read_text()
