@@ -104,7 +104,7 @@ class DiffusionDrive(nn.Module):
         cells = math.prod(LIDAR[2:]) // (2 * 2 ** len(WIDTHS)) ** 2
         self.places = nn.Embedding(cells + 1, WIDTH)
         layer = nn.TransformerDecoderLayer(WIDTH, HEADS, 128, batch_first=True)
-        self.decoder = nn.TransformerDecoder(layer, 2)
+        self.decoder = nn.TransformerDecoder(layer, 1)
         self.bev_head, self.boxes = picture_head(WIDTH, 7), mlp(WIDTH, 5)
         self.labels = nn.Linear(WIDTH, 1)
         ways = torch.linspace(0.1, 1, POSES)[None, :, None] * 30
@@ -118,7 +118,7 @@ class DiffusionDrive(nn.Module):
         self.time = nn.Sequential(
             nn.Linear(WIDTH, 4 * WIDTH), nn.Mish(), nn.Linear(4 * WIDTH, WIDTH)
         )
-        self.layers = nn.ModuleList(DecoderLayer() for _ in range(2))
+        self.layers = nn.ModuleList(DecoderLayer() for _ in range(1))
         kept = (1 - torch.linspace(1e-4**0.5, 0.02**0.5, 1000) ** 2).cumprod(0)
         self.register_buffer("kept", kept)
 

@@ -260,7 +260,7 @@ class Planner(nn.Module):
         self.normalise = nn.BatchNorm1d(1, affine=False)
         self.speed_encoder, self.goal_encoder = nn.Linear(1, WIDTH), nn.Linear(2, WIDTH)
         self.radar_encoder = nn.Linear(WIDTH, WIDTH)
-        self.decoder = decoder(layers=2)
+        self.decoder = decoder(layers=1)
         self.route, self.course = nn.Linear(WIDTH, 2), nn.GRU(WIDTH, 32, 1, True, True)
         self.step, self.speed = nn.Linear(32, 2), mlp(WIDTH, 8)
         self.register_buffer("classes", torch.arange(8) * 4.0)
