@@ -131,9 +131,9 @@ def test_the_same_is_made_once_and_an_altered_model_again(
     assert again == first
     assert graph.sha256_of(first.model) == first.sha256
     assert json.loads(report.read_text())["output"]["sha256"] == first.sha256
-    again = [each for each in warnings if "made again" in each]
+    repeated = [each for each in warnings if "made again" in each]
     told = [f"{first.model}: not what its report is of: made again"]
-    assert again == ([] if damage in ("", "no report") else told)
+    assert repeated == ([] if damage in ("", "no report") else told)
 
 
 def with_overrides(study: Study, file: Path) -> Study:
