@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 OUT := out
 NEWEST ?= python3.13
-WORKS := demo,frames,compress,compare,plan,lint,calibrate,ranges,profile,evaluate,score,study
+WORKS := demo,frames,compress,compare,plan,lint,calibrate,profile,evaluate,score,study
 JOBS ?= $(shell n=$$(nproc); echo $$((n < 4 ? n : 4)))
 # tests run side by side: threads of one would spin while the other's work
 PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q -n $(JOBS) --dist loadgroup
