@@ -36,9 +36,6 @@ def unpack_sequences(model: ir.Model, by: str) -> int:
             size = _length(node) if is_standard(node) else None
             if size is None or not readers or node.outputs[0].is_graph_output():
                 continue
-            # what is taken of a stored weight is folded, tensor by tensor
-            if array_of(node.inputs[0]) is not None:
-                continue
             if not all(_unpacks(reader, size) for reader in readers):
                 continue
             tensors = _tensors(node, size, names, by)
@@ -59,6 +56,8 @@ def _length(node: ir.Node) -> int | None:
 
 def _lengths(node: ir.Node) -> list[int] | None:
     """Return the lengths of the parts of a SplitToSequence along its axis."""
+    if array_of(node.inputs[0]) is not None:  # a stored weight's are left to folding
+        return None
     split = input_at(node, 1)
     shape, axis = static_shape(node.inputs[0]), node.attributes.get_int("axis", 0)
     size = None if shape is None else shape[axis]

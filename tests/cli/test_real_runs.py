@@ -62,7 +62,8 @@ def test_a_real_run_is_scored(cli: Cli) -> None:
 def test_a_routes_file_names_a_set_of_ones_own(cli: Cli, tmp_path: Path) -> None:
     ids = "".join(f'<route town="T" id="{each}"/>' for each in (1711, 2050, 9))
     (tmp_path / "own.xml").write_text(f"<routes>{ids}</routes>")
-    (tmp_path / "empty.xml").write_text("<routes/>")
+    (tmp_path / "empty.xml").write_text("<!-- <route id='1'/> --><routes/>")
+    (tmp_path / "cut.xml").write_text("<routes><route id='1'")
 
     found = scored(cli, "score run own.xml")
 
@@ -70,6 +71,7 @@ def test_a_routes_file_names_a_set_of_ones_own(cli: Cli, tmp_path: Path) -> None
     assert given == {"set": 148 / 3, "driven": 74.0}
     assert found["records"]["missing"] == ["9"]
     assert "empty.xml: no <route id=...>" in cli.refused("score run empty.xml")
+    assert "cut.xml: not a routes file: unclosed" in cli.refused("score run cut.xml")
     assert "own.xml: one routes file" in cli.refused("score run empty.xml own.xml")
     assert "own.xml: it names the set" in cli.refused("score own.xml")
 

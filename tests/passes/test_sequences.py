@@ -26,7 +26,7 @@ def graph_of(body: str) -> ir.Model:
         '["s"] s = SplitToSequence<axis = -1>(x, four) ["y"] y = ConcatFromSequence'
         "<axis = 1>(s)",
         '["s"] s = SplitToSequence(x) ["y"] y = SequenceAt(s, zero)',
-        '["s"] s = SequenceConstruct(x, x) ["y"] y = SequenceLength(s)',
+        '["s"] s = SequenceConstruct(stored, x) ["y"] y = SequenceLength(s)',
         '["n"] n = Neg(x) ["s"] s = SequenceConstruct(x, n)'
         ' ["y"] y = ConcatFromSequence<axis = 1>(s)',
         '["n"] n = Neg(x) ["s"] s = SequenceConstruct(x, n)'

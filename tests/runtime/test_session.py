@@ -87,8 +87,7 @@ def test_metadata_that_pairs_nothing_is_refused(
 
 
 def test_state_of_open_shape_needs_a_first_value() -> None:
-    open_state = COUNTER.replace("float[1,2] memory,", "float[n,2] memory,")
-    model = parsed(open_state.replace("float[1,2] memory)", "float[n,2] memory)"))
+    model = parsed(COUNTER.replace("float[1,2] memory", "float[n,2] memory"))
 
     with pytest.raises(GraphError, match=r"memory .*nothing gives n a size: .*n=1"):
         list(replay(Session(model), [ones(0, True)]))

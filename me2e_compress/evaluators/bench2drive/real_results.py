@@ -1,12 +1,12 @@
 """Evaluator that turns results of real CARLA runs into episodes."""
 
 import json
-import re
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import ClassVar, Self
+from xml.etree import ElementTree
 
 from me2e_compress.driving.policies import Driver
 from me2e_compress.errors import EvaluationError
@@ -36,16 +36,17 @@ leaderboard/data/bench2drive220.xml and of bench2drive_0.0.4_val.xml, which shar
 The ten routes of "dev10" belong to the first."""
 
 
-_ROUTE = re.compile(r"<route\b[^>]*?\bid\s*=\s*[\"']([^\"']+)[\"']")
-
-
 def _ids(routes: Path) -> frozenset[str]:
     """Read the ids of a leaderboard's routes file."""
-    with documents.reading(routes, EvaluationError, "a routes file"):
-        ids = _ROUTE.findall(documents.content(routes).decode())
+    with documents.reading(routes, EvaluationError, "not a routes file"):
+        try:
+            root = ElementTree.fromstring(documents.content(routes))
+        except ElementTree.ParseError as error:
+            raise documents.MalformedError(str(error)) from error
+    ids = frozenset(each.attrib.get("id", "") for each in root.iter("route")) - {""}
     if not ids:
         raise EvaluationError(f"{routes}: no <route id=...> stands in it")
-    return frozenset(ids)
+    return ids
 
 
 @dataclass

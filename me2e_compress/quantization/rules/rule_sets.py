@@ -163,13 +163,13 @@ class MatrixVector(Rule):
         return f"{size.rows} rows by {size.columns} columns: a matrix-vector product"
 
     def _pays(self, node: ir.Node, facts: RuleFacts) -> bool:
-        shape = static_shape(node.inputs[1])
-        costs = None if facts.costs is None else facts.costs(facts.model, ())
+        weight, costs = node.inputs[1], facts.costs
+        shape = static_shape(weight)
         if self.share is None or shape is None or costs is None:
             return False
-        elements = math.prod(shape)
-        large = elements >= max(LEAST_READ, self.share * facts.weight_elements)
-        return large and node.inputs[1] in facts.constants
+        large = max(LEAST_READ, self.share * facts.weight_elements)
+        holds = weight in facts.constants and math.prod(shape) >= large
+        return holds and costs(facts.model, ()) is not None
 
 
 @dataclasses.dataclass(frozen=True)

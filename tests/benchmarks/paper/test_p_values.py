@@ -10,7 +10,6 @@ from hypothesis import strategies as st
 
 from benchmarks.paper.evidence import drawn_anew, p_value
 from me2e_compress.metrics import measure
-from me2e_compress.metrics.measure import mean_estimate
 
 UNEVEN = {"a": [1.0, 5.0], "b": [-3.0], "c": [2.0, 2.0, 9.0], "d": [0.5]}
 
@@ -37,7 +36,7 @@ def test_types_drawn_anew_are_as_all_draws_by_brute_force(
 
     draws, exact = anew_of(values, types), np.array(every_draw())
 
-    found = mean_estimate(values, types, "%")
+    found = measure.mean_estimate(values, types, "%")
     for end, percent in ((found.anew_low, 2.5), (found.anew_high, 97.5)):
         assert end == pytest.approx(float(np.percentile(exact, percent)), abs=0.35)
     for edge in (-1.5, 0.2, 2.0, 4.1):

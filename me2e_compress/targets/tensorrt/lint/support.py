@@ -146,21 +146,21 @@ class Parser:
 
     def opset(self, model: ir.Model) -> Iterator[LintFinding]:
         """Check the graph's opset against those that parsers read."""
-        (_, found), last = on_disk(model), max(NEWEST_OPSETS.values())
-        if not OLDEST_OPSET <= found <= last:
-            said = f"opset {found}: parsers read {OLDEST_OPSET} to {last}"
-            if found < OLDEST_OPSET:
+        (_, opset), last = on_disk(model), max(NEWEST_OPSETS.values())
+        if not OLDEST_OPSET <= opset <= last:
+            said = f"opset {opset}: parsers read {OLDEST_OPSET} to {last}"
+            if opset < OLDEST_OPSET:
                 yield error("opset", None, said)
             else:
                 more = "; TensorRT-RTX 1.7 parses newer (measured)"
                 yield warning("opset", None, f"{said}, by their pages{more}")
             return
         # never an error: it was read from some version in between on
-        since = next(each for each, newest in NEWEST_OPSETS.items() if found <= newest)
+        since = next(each for each, newest in NEWEST_OPSETS.items() if opset <= newest)
         oldest, given = next(iter(NEWEST_OPSETS)), self.version
         if since != oldest and (given is None or given < version_of(since)):
             said = f"TensorRT {since} reads it, {oldest} reads {NEWEST_OPSETS[oldest]}"
-            yield warning("opset", None, f"opset {found}: {said}")
+            yield warning("opset", None, f"opset {opset}: {said}")
 
     def operators(self, model: ir.Model) -> Iterator[LintFinding]:
         """Find operators that the parser refuses, or that are unknown."""
