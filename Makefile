@@ -9,7 +9,7 @@ JOBS ?= $(shell n=$$(nproc); echo $$((n < 4 ? n : 4)))
 # tests run side by side: threads of one would spin while the other's work
 PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q -n $(JOBS) --dist loadgroup
 
-.PHONY: coverage demo docs newest nightly test test-slow check check-mypy check-rest fix clean
+.PHONY: coverage demo docs newest nightly replay test test-slow check check-mypy check-rest fix clean
 
 demo: $(VENV)/.demo  ## compress the driver that ships, drive before and after
 	$(BIN)/me2e-compress demo -o $(OUT)
@@ -25,6 +25,9 @@ nightly: $(VENV)/.test  ## hours: all that make test leaves out; FIRST=seed GRAP
 	$(PYTEST) -m "slow or not slow" --hypothesis-profile=night --cov --cov-report=term:skip-covered
 	$(MAKE) --no-print-directory docs
 	$(MAKE) --no-print-directory newest
+
+replay: $(VENV)/.test  ## do the last tag (or BASE=commit) and this checkout write the same files?
+	OMP_NUM_THREADS=1 $(BIN)/python -m benchmarks.tools.replay $(if $(BASE),--base $(BASE))
 
 newest:  ## every command, with the newest Python that is tested
 	rm -rf $(OUT)/newest && $(NEWEST) -m venv $(OUT)/newest && git clone -q . $(OUT)/newest/source

@@ -1,3 +1,3 @@
-"""What is measured, one script each: ``python -m benchmarks.NAME``."""
+"""What is measured, one script each: ``python -m benchmarks.FOLDER.NAME``."""
 
 import me2e_compress  # noqa: F401  before onnxruntime, whose telemetry that switches off

@@ -69,7 +69,7 @@ FORMER = {
     "--smaller": f"--smaller {_NOW} a recipe's fold-constants{{bytes_per_node=0}}",
     "--allow-empty": f"--allow-empty {_NOW} -r exact, which writes no int8",
     "compress --alive": "--alive is of compare alone since 0.3.0",
-    "command routes": f"routes {_NOW} python -m benchmarks.admit_routes",
+    "command routes": f"routes {_NOW} python -m benchmarks.tools.admit_routes",
     "--tactic-source": "--tactic-source is gone since 0.3.0: TensorRT chooses",
     "--seed": "--seed is of compress, evaluate and frames since 0.3.0",
     "--tensorrt-cache": f"--tensorrt-cache {_NOW} compress: int8 pairs have the scales",

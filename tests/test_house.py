@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.files_entered import CALLS
-from benchmarks.house import (
+from benchmarks.tools.files_entered import CALLS
+from benchmarks.tools.house import (
     Budget,
     House,
     budget,

@@ -18,7 +18,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from benchmarks.bench_study import told
+from benchmarks.measure.study import told
 from benchmarks.paper.drives import FILE
 from benchmarks.paper.questions import SHIPPED
 from benchmarks.paper.records import RECORDS, add_facts, files, read_paper

@@ -15,7 +15,7 @@ so that most elements round to zero."""
 FEW_SCENES = 8
 """Fewest scenes of a recording that nothing is said of. At the tag ``road-1``,
 4 of 16 scenes miss more than a fifth of the range of 9 % of the driver's tensors, 8 of
-3 %, one of 35 % (benchmarks/bench_observers.py)."""
+3 %, one of 35 % (benchmarks/measure/observers.py)."""
 
 NOT_FINITE = "Runtimes answer it each in their own way: guard what makes it"
 

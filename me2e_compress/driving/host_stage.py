@@ -114,7 +114,7 @@ class CollisionOptimizer(HostStage):
         weight: Weight of a cell of 0.5 m, as UniAD's is; other cells weigh by their
             area.
         solver: SciPy's method; ``SLSQP`` is faster, mostly by a little, sometimes by
-            far: ``benchmarks/bench_host_stage.py``.
+            far: ``benchmarks/measure/host_stage.py``.
     """
 
     name: ClassVar[str] = "collision-optimizer"

@@ -1,7 +1,7 @@
 """A value with its unit, or the reason why it has none; and its 95 % intervals.
 
-Routes of one scenario type are alike (``benchmarks.bench_intervals`` says how much), so
-there are two questions and two intervals of a mean over routes:
+Routes of one scenario type are alike (``benchmarks.measure.intervals`` says how much),
+so there are two questions and two intervals of a mean over routes:
 
 * over *these types*: other routes of the same types might have been drawn. Routes are
   resampled within each type;

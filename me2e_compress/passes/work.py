@@ -19,14 +19,14 @@ MOVED_BYTES_PER_NODE = 40_000
 Both at 2 us a node, which is what a GPU takes to launch a kernel and onnxruntime to
 start an operator that allocates; at 100 GMAC/s of float32 products and 20 GB/s through
 element-wise operators on two cores of an AMD Zen 5 (``python -m
-benchmarks.bench_folding --price`` measures a machine).
+benchmarks.measure.folding --price`` measures a machine).
 """
 
 SMALL_PRODUCTS_PER_NODE = 25
 """Products of a batch of matrices that take as long to start as a node does.
 
 At 85 ns each: a matrix [4, 4] times each of 240,000 vectors takes onnxruntime's CPU
-20.4 ms (``python -m benchmarks.bench_hoisting``).
+20.4 ms (``python -m benchmarks.measure.hoisting``).
 """
 
 

@@ -9,7 +9,7 @@ Let int8 products that are read in float run by onnxruntime's faster kernel.
 onnxruntime makes a QGemm of a quantized Gemm. It writes the bias to every row of the
 answer first, and adds the products to it; MatMulIntegerToFloat does both while a tile
 lies in the cache, and takes 0.6 to 1.0 of the time
-(``benchmarks/bench_int8_shapes.py``). onnxruntime 1.31 makes one with a bias of no
+(``benchmarks/measure/int8_shapes.py``). onnxruntime 1.31 makes one with a bias of no
 pattern of constant scales, so it is written as a graph is opened.
 """
 

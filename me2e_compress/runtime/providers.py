@@ -26,7 +26,7 @@ SLOW_FUSIONS = ("SkipLayerNormFusion",)
 """Optimizations that slow down the CPU: the fused kernel of Add and LayerNormalization
 takes 4.0 to 6.9 times as long as the two (64 to 768 columns, 100 to 10,000 rows, one
 thread and two), 2.7 times on 20 rows, and as long on one
-(``benchmarks/bench_levers.py``)."""
+(``benchmarks/measure/levers.py``)."""
 
 _CPU = "CPUExecutionProvider"
 _CUDA = "CUDAExecutionProvider"

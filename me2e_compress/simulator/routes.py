@@ -161,7 +161,7 @@ def load_routes(path: Path = SHIPPED) -> tuple[Route, ...]:
     if routes and records[0].get(DIGEST) != digest_of(routes):
         raise EvaluationError(
             f"{path}: was changed after its routes were admitted (its {DIGEST} does not"
-            " fit them); make a set with: python -m benchmarks.admit_routes"
+            " fit them); make a set with: python -m benchmarks.tools.admit_routes"
         )
     # ids are unique
     seen: dict[str, int] = {}

@@ -74,7 +74,7 @@ def weights_of(
         # are never negative. Over tokens of both signs, behind a LayerNormalization,
         # balance only adds to the errors: on the driver such products lose up to 1.7
         # dB, while products behind a ReLU and convolutions gain 0.2 to 8.6, but for
-        # one that loses 0.2 (``python -m benchmarks.bench_weights``).
+        # one that loses 0.2 (``python -m benchmarks.measure.weights``).
         made = producer_of(node.inputs[0])
         behind_relu = made is not None and made.op_type == "Relu"
         if node.op_type not in CONVOLUTIONS and not behind_relu:

@@ -10,14 +10,14 @@ from statistics import mean
 
 import pytest
 
-from benchmarks.bench_intervals import (
+from benchmarks.measure.intervals import (
     KeptDrive,
     coverage,
     intra_type_correlation,
     kept_drives,
     told,
 )
-from benchmarks.bench_road import drives_of, means_of
+from benchmarks.measure.road import drives_of, means_of
 from benchmarks.paper.drives import KeptFacts
 from benchmarks.paper.evidence import NOISE
 from me2e_compress.metrics.measure import Estimate

@@ -12,19 +12,27 @@ import onnxruntime as ort
 import pytest
 import torch
 
-from benchmarks import bench_gpu, bench_uniad, run_on_provider
-from benchmarks.bench_energy import COUNTER, FRAMES_MS, conditions, held
-from benchmarks.bench_gpu import ROWS, Bench, provider_or_reason
-from benchmarks.bench_int8_shapes import FORMS as INT8_FORMS
-from benchmarks.bench_int8_shapes import Convolution, product, session
-from benchmarks.bench_levers import LEVERS, Feeds, Lever, first_frame, measured, opened
-from benchmarks.bench_runtime import Row, table
-from benchmarks.bench_stacks import print_parted
-from benchmarks.gpu_table import Found
-from benchmarks.gpu_table import table as gpu_table
-from benchmarks.original_patterns import FORMS, restored
-from benchmarks.runtime_files import REFERENCE
-from benchmarks.subject import Subject
+from benchmarks.measure import gpu, uniad
+from benchmarks.measure.energy import COUNTER, FRAMES_MS, conditions, held
+from benchmarks.measure.gpu import ROWS, Bench, provider_or_reason
+from benchmarks.measure.int8_shapes import FORMS as INT8_FORMS
+from benchmarks.measure.int8_shapes import Convolution, product, session
+from benchmarks.measure.levers import (
+    LEVERS,
+    Feeds,
+    Lever,
+    first_frame,
+    measured,
+    opened,
+)
+from benchmarks.measure.runtime import Row, table
+from benchmarks.measure.stacks import print_parted
+from benchmarks.subjects.original_patterns import FORMS, restored
+from benchmarks.subjects.runtime_files import REFERENCE
+from benchmarks.subjects.subject import Subject
+from benchmarks.tools import run_on_provider
+from benchmarks.tools.gpu_table import Found
+from benchmarks.tools.gpu_table import table as gpu_table
 from me2e_compress.runtime.energy.energy_counter import EnergySchedule
 from me2e_compress.runtime.energy.energy_result import Absent
 from me2e_compress.runtime.providers import CPU, CpuProvider, Provider, TensorRtProvider
@@ -98,7 +106,7 @@ def test_a_file_that_cannot_be_made_is_a_row(
     name: str,
     reason: str,
 ) -> None:
-    monkeypatch.setattr(bench_gpu, "made", lambda *words: "a pass refused it")
+    monkeypatch.setattr(gpu, "made", lambda *words: "a pass refused it")
 
     found = Bench(subject, 1, given).found(provider, name, ROWS[name])
 
@@ -128,7 +136,7 @@ def test_energy_is_that_of_the_device_which_runs(
 @pytest.mark.slow
 def test_the_driver_on_the_cpu(tmp_path: Path) -> None:
     words = "--providers cpu --subjects highway --frames 2 --runs 5 --warm-up 1"
-    command = [sys.executable, "-m", "benchmarks.bench_gpu", str(tmp_path)]
+    command = [sys.executable, "-m", "benchmarks.measure.gpu", str(tmp_path)]
 
     subprocess.run(
         [*command, "--no-energy", *words.split()], check=True, capture_output=True
@@ -219,9 +227,9 @@ def test_outputs_that_part_by_6_db_are_listed(
 def test_frames_that_uniad_has_run_are_kept_on_request_and_compared(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    ran = list[bench_uniad.Outputs]()
+    ran = list[uniad.Outputs]()
 
-    def runtime(feeds: bench_uniad.Outputs) -> bench_uniad.Outputs:
+    def runtime(feeds: uniad.Outputs) -> uniad.Outputs:
         ran.append(feeds)
         seen = np.float32(feeds["timestamp"].item())
         return dict.fromkeys(UNIAD_TINY.outputs, np.array([seen]))
@@ -230,17 +238,17 @@ def test_frames_that_uniad_has_run_are_kept_on_request_and_compared(
         words = {"out": tmp_path, "frames": frames, "resume": resume}
         given = argparse.Namespace(stack=UNIAD_TINY.name, **words)
         before = len(ran)
-        bench_uniad.drive(given, name, runtime)
+        uniad.drive(given, name, runtime)
         return len(ran) - before
 
-    def frames(_: object, count: int) -> list[bench_uniad.Outputs]:
+    def frames(_: object, count: int) -> list[uniad.Outputs]:
         return [{"timestamp": np.array([each + 1.0])} for each in range(count)]
 
-    monkeypatch.setattr(bench_uniad, "_frames", frames)
+    monkeypatch.setattr(uniad, "_frames", frames)
 
     assert drive(2, "torch", resume=True) == 2
     drive(3, "onnxruntime", resume=True)
-    said = bench_uniad.errors_of(tmp_path, UNIAD_TINY, 3)  # as far as both have run
+    said = uniad.errors_of(tmp_path, UNIAD_TINY, 3)  # as far as both have run
     assert [(each["frame"], each["error"]) for each in said] == [(0, 0.0), (1, 0.0)]
     assert drive(5, "torch", resume=True) == 3
     assert drive(5, "torch", resume=False) == 5

@@ -9,12 +9,13 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks import seven_nodes, written_files
-from benchmarks.files_entered import Entered
-from benchmarks.masks import MASKS, Mask, masked, masked_name
-from benchmarks.mutate import Fate, main, run, table
-from benchmarks.mutations import mutations
-from benchmarks.written_files import differences, manifest
+from benchmarks.subjects import seven_nodes
+from benchmarks.tools import written_files
+from benchmarks.tools.files_entered import Entered
+from benchmarks.tools.masks import MASKS, Mask, masked, masked_name
+from benchmarks.tools.mutate import Fate, main, run, table
+from benchmarks.tools.mutations import mutations
+from benchmarks.tools.written_files import differences, manifest
 from tests.command import Cli, cli, command
 
 __all__ = ["cli", "command"]
@@ -160,7 +161,7 @@ def compressed(cli: Cli, name: str, frames: int) -> dict[str, str]:
         patch.chdir(folder)
         options = "-r full --target tensorrt --frames frames -o o.onnx"
         cli.done(f"compress m.onnx {options}")
-    return manifest(folder, Path(written_files.__file__).parents[1] / "me2e_compress")
+    return manifest(folder, Path(written_files.__file__).parents[2] / "me2e_compress")
 
 
 def test_the_same_run_writes_the_same_files_and_one_more_frame_shows(cli: Cli) -> None:

@@ -5,7 +5,7 @@ The documents themselves are held against the page where the commands are tested
 
 import pytest
 
-from benchmarks.json_page import page
+from benchmarks.tools.json_page import page
 from me2e_compress.cli.app import COMMANDS
 from tests.docs.documents import EVERY, PAGE, faults, sections
 

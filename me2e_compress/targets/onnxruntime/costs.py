@@ -84,8 +84,8 @@ ZEN5 = CpuSeconds(
     dequantize=0.17,
 )
 """Fitted to single layers and chains on an AMD EPYC (Zen 5), onnxruntime 1.31, by
-``python -m benchmarks.fit_cpu_costs``; sampling by hand, to the results of
-``python -m benchmarks.bench_int8_sampling``. Ratios carry over to other
+``python -m benchmarks.tools.fit_cpu_costs``; sampling by hand, to the results of
+``python -m benchmarks.measure.int8_sampling``. Ratios carry over to other
 processors with VNNI better than the seconds do."""
 
 

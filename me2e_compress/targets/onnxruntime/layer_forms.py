@@ -2,7 +2,7 @@
 
 A product between uint8 tensors becomes a convolution: on one core with VNNI,
 onnxruntime 1.31 computes [10000, 256] x [256, 512] at 200 GMAC/s as a QGemm, and at 440
-to 470 as a QLinearConv over pixels (``benchmarks/bench_int8_shapes.py``).
+to 470 as a QLinearConv over pixels (``benchmarks/measure/int8_shapes.py``).
 """
 
 import dataclasses

@@ -9,7 +9,7 @@ Both add up the same products; w' has zeros where a block reaches beyond w. onnx
 reads the pixels of a QLinearConv in place only if four channels or a multiple of them
 lie side by side. With three it copies every window first, and a ResNet's first layer
 runs at a quarter of the processor's int8 rate; so at two thirds
-(``benchmarks/bench_int8_shapes.py``). ONNX defines the order of the channels under
+(``benchmarks/measure/int8_shapes.py``). ONNX defines the order of the channels under
 `SpaceToDepth <https://onnx.ai/onnx/operators/onnx__SpaceToDepth.html>`_.
 """
 

@@ -16,7 +16,7 @@ FRAMES = 10
 @pytest.mark.slow
 @pytest.mark.parametrize("stack", CONFIGS)
 def test_onnxruntime_agrees_with_torch(stack: str, tmp_path: Path) -> None:
-    command = [sys.executable, "-m", "benchmarks.bench_uniad", str(tmp_path)]
+    command = [sys.executable, "-m", "benchmarks.measure.uniad", str(tmp_path)]
     options = ["--stack", stack, "--frames", str(FRAMES)]
     done = subprocess.run(
         [*command, *options], check=True, text=True, stdout=subprocess.PIPE

@@ -1,0 +1,406 @@
+"""Trained networks of public packages, compressed by this toolkit and by others.
+
+    python -m benchmarks.measure.real_files OUT [--only PART] [--tools ours,...]
+        [--rounds 3]
+
+Five pinned packages are installed into OUT/packages, onnxsim and onnxslim into
+OUT/peers; nothing of them is kept anywhere else. Of files that are one network with
+other weights the first is taken, of trees none: they have no layer. Each network is
+compressed with 16 frames drawn by one seed and judged on 16 of another, against its
+source run without any optimization. A line of JSON for a network and a tool is added to
+OUT/records.jsonl; what stands there is not measured again, so a run that ended goes on.
+
+Columns: nodes; MB; dB of the worst output on fresh frames; what the report of
+`compress` says of that output, and by how much it says too much of any; CPU time as a
+share of the source's, both in onnxruntime on one thread, a process each, in turn.
+"""
+
+import argparse
+import hashlib
+import json
+import subprocess
+import sys
+import time
+from collections.abc import Iterable, Iterator
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import onnx
+import onnxruntime
+
+from benchmarks.subjects.real_frames import MAKERS, Frame, opened
+from benchmarks.tools.processes import answer, last_line
+from me2e_compress import graph
+from me2e_compress.passes.freeze_inputs import deciding_inputs
+
+PACKAGES = (
+    "rapidocr-onnxruntime==1.4.4",
+    "silero-vad==6.2.3",
+    "magika==1.0.3",
+    "atspm-detector==1.1.0",
+    "speechmos==0.0.1.1",
+)
+PEERS = ("onnxsim==0.8.1", "onnxslim==0.1.98")
+OURS = {
+    "exact": ("-r", "exact"),
+    "ours": ("-r", "full", "--target", "onnxruntime"),
+    "ours for TensorRT": ("-r", "full", "--target", "tensorrt"),
+}
+TOOLS = (*OURS, "onnxsim", "onnxslim", "quantize_static")
+FRAMES = 16
+"""Frames that are compressed with, and so many others that are judged on."""
+
+COMMAND = "import sys; from me2e_compress.cli import main; sys.exit(main())"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("out", type=Path)
+    parser.add_argument("--only", default="", help="part of the file's path")
+    parser.add_argument("--tools", default=",".join(TOOLS))
+    parser.add_argument("--rounds", type=int, default=3)
+    parser.add_argument("--records", default="records.jsonl", help="file in OUT")
+    parser.add_argument(
+        "--child", choices=("quantize_static", "onnxsim", "onnxslim", "time")
+    )
+    parser.add_argument("--file", type=Path)
+    options = parser.parse_args()
+    if options.child == "time":
+        print(json.dumps(cpu_seconds(options.file, options.out)))
+        return
+    if options.child:
+        PEER_WORK[options.child](options.file, options.out)
+        return
+    install(options.out / "packages", PACKAGES)
+    install(options.out / "peers", PEERS)
+    records = options.out / options.records
+    for model in networks(options.out / "packages"):
+        if options.only in str(model):
+            measure(
+                model, options.tools.split(","), options.out, records, options.rounds
+            )
+    for line in table(read(records)):
+        print(line)
+
+
+def install(folder: Path, packages: Iterable[str]) -> None:
+    """Install packages alone, without what they need, into a folder."""
+    if not folder.is_dir():
+        command = [
+            sys.executable,
+            "-m",
+            "pip",
+            "install",
+            "-q",
+            "--no-deps",
+            "-t",
+            folder,
+        ]
+        subprocess.run([*map(str, command), *packages], check=True)
+
+
+def networks(folder: Path) -> Iterator[Path]:
+    """Yield one file of each network for which frames can be made."""
+    forms = set[str]()
+    for path in sorted(folder.rglob("*.onnx")):
+        if not any(part in str(path) for part in MAKERS):
+            continue
+        model = onnx.load(path)
+        nodes = [(node.op_type, node.name, *node.input) for node in model.graph.node]
+        weights = [(each.name, *each.dims) for each in model.graph.initializer]
+        form = hashlib.sha256(repr((nodes, weights)).encode()).hexdigest()
+        if form not in forms:
+            forms.add(form)
+            yield path
+
+
+def frames_of(model: Path, seed: int) -> list[Frame]:
+    """Draw a network's frames."""
+    maker = next(make for part, make in MAKERS.items() if part in str(model))
+    return list(islice(maker(model, np.random.default_rng(seed)), FRAMES))
+
+
+def save(frames: Iterable[Frame], folder: Path) -> None:
+    """Write a recording with four frames a scene."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for place, frame in enumerate(frames):
+        np.savez(folder / f"{place:06d}.npz", **frame)  # type: ignore[arg-type]
+    scenes = {"scenes": list(range(0, FRAMES, 4))}
+    (folder / "scenes.json").write_text(json.dumps(scenes))
+
+
+def measure(
+    model: Path, tools: list[str], out: Path, records: Path, rounds: int
+) -> None:
+    """Make what the records lack of a network, and judge it."""
+    name = str(model.relative_to(out / "packages"))
+    known = {row["tool"] for row in read(records) if row["file"] == name}
+    missing = [tool for tool in tools if tool not in known]
+    if not missing:
+        return
+    work = out / "work" / name.replace("/", "+")
+    recording, fresh = frames_of(model, 0), frames_of(model, 1)
+    save(recording, work / "frames")
+    truth = answers(opened(model), fresh)
+    rows = list[dict[str, Any]]()
+    for tool in missing:
+        row: dict[str, Any] = {"file": name, "tool": tool, "error": ""}
+        made = work / f"{tool.replace(' ', '-')}.onnx"
+        started = time.monotonic()
+        row["error"] = run_tool(tool, model, recording[0], made)
+        row["seconds"] = time.monotonic() - started
+        if not row["error"]:
+            row |= judged(model, made, fresh, truth)
+        rows.append(row)
+    # the time of all beside the source's
+    files = {
+        row["tool"]: work / f"{row['tool'].replace(' ', '-')}.onnx" for row in rows
+    }
+    files = {tool: path for tool, path in files.items() if path.is_file()}
+    taken = timed({"source": model, **files}, work / "frames", rounds)
+    with records.open("a") as file:
+        for row in rows:
+            if not row["error"] and row["tool"] in taken:
+                row["ratio"] = taken[row["tool"]] / taken["source"]
+            file.write(json.dumps(row) + "\n")
+            print(shown(row), flush=True)
+
+
+def run_tool(tool: str, model: Path, frame: Frame, made: Path) -> str:
+    """Let a tool write its file; return why it did not, or nothing."""
+    made.unlink(missing_ok=True)
+    if tool in OURS:
+        if names := deciding_inputs(graph.load(model)):
+            model = frozen(model, names, made)
+        command = [sys.executable, "-c", COMMAND, "compress", model, *OURS[tool]]
+        command += ["--frames", made.parent / "frames", "-o", made, "--force"]
+        command += [
+            word for size in open_sizes(model, frame) for word in ("--set-dim", size)
+        ]
+    else:
+        command = [sys.executable, "-m", "benchmarks.measure.real_files", made]
+        command += ["--child", tool, "--file", model]
+    done = subprocess.run(
+        list(map(str, command)), capture_output=True, text=True, check=False
+    )
+    made.with_suffix(".log").write_text(done.stdout + done.stderr)
+    return "" if done.returncode == 0 else last_line(done) or f"exit {done.returncode}"
+
+
+def frozen(model: Path, names: tuple[str, ...], made: Path) -> Path:
+    """Make flags constants, as inspect advises; return the file."""
+    passes = f"import-normalize,freeze-inputs{{inputs=[{','.join(names)}]}}"
+    output = made.with_name("frozen.onnx")
+    command = [sys.executable, "-c", COMMAND, "compress", str(model), "--force"]
+    command += ["--passes", f"{passes},fold-constants", "-o", str(output)]
+    command += ["--frames", str(made.parent / "frames")]
+    done = subprocess.run(command, capture_output=True, check=False)
+    return output if done.returncode == 0 else model
+
+
+def open_sizes(model: Path, frame: Frame) -> list[str]:
+    """Return what fixes the sizes that a network leaves open, as INPUT:AXIS=SIZE."""
+    sizes = list[str]()
+    for port in opened(model).get_inputs():
+        for axis, size in enumerate(port.shape):
+            if not isinstance(size, int) or size < 1:
+                sizes.append(f"{port.name}:{axis}={frame[port.name].shape[axis]}")
+    return sizes
+
+
+def answers(
+    session: onnxruntime.InferenceSession, frames: list[Frame]
+) -> dict[str, list[Any]]:
+    """Run frames; return the outputs by name, a list over frames."""
+    names = [port.name for port in session.get_outputs()]
+    taken = [port.name for port in session.get_inputs()]
+    rows = [
+        session.run(None, {name: frame[name] for name in taken}) for frame in frames
+    ]
+    return {name: [row[place] for row in rows] for place, name in enumerate(names)}
+
+
+def judged(
+    model: Path, made: Path, fresh: list[Frame], truth: dict[str, list[Any]]
+) -> dict[str, Any]:
+    """Return size, nodes and decibels of a file that a tool wrote."""
+    try:
+        answered = answers(opened(made), fresh)
+    except Exception as error:  # whatever onnxruntime says of a peer's file
+        return {"error": f"does not run: {str(error).splitlines()[0][:120]}"}
+    true = {name: decibels(truth[name], answered[name]) for name in truth}
+    worst = min(true, key=lambda name: true[name])
+    row: dict[str, Any] = {
+        "nodes": [count_nodes(model), count_nodes(made)],
+        "mb": [model.stat().st_size / 1e6, made.stat().st_size / 1e6],
+        "db": true,
+        "worst": worst,
+    }
+    report = made.with_suffix(".report.json")
+    if report.is_file() and (loss := json.loads(report.read_text())["fidelity"]):
+        outputs = (loss["fidelity"] or {"outputs": ()})["outputs"]
+        row["reported"] = {each["name"]: each["sqnr_db"] for each in outputs}
+    return row
+
+
+def count_nodes(model: Path) -> int:
+    """Count the nodes of a file, those of branches too, without constants."""
+
+    def walk(body: onnx.GraphProto) -> int:
+        inner = [
+            each.g
+            for node in body.node
+            for each in node.attribute
+            if each.HasField("g")
+        ]
+        own = sum(node.op_type != "Constant" for node in body.node)
+        return own + sum(map(walk, inner))
+
+    return walk(onnx.load(model).graph)
+
+
+def decibels(truth: list[Any], answered: list[Any]) -> float:
+    """Return the signal to noise ratio over all frames, 200 dB at most."""
+    signal = noise = 0.0
+    for a, b in zip(truth, answered, strict=True):
+        exact, other = (
+            np.asarray(a, np.float64).ravel(),
+            np.asarray(b, np.float64).ravel(),
+        )
+        signal += float(exact @ exact)
+        noise += float((exact - other) @ (exact - other))
+    return float(min(200.0, 10 * np.log10(max(signal, 1e-300) / max(noise, 1e-300))))
+
+
+def timed(files: dict[str, Path], frames: Path, rounds: int) -> dict[str, float]:
+    """Return the least CPU seconds a frame of each file, a process each, in turn."""
+    taken = dict[str, float]()
+    for _ in range(rounds):
+        for name, path in files.items():
+            command: list[str | Path]
+            command = [sys.executable, "-m", "benchmarks.measure.real_files", frames]
+            seconds = answer([*command, "--child", "time", "--file", path])
+            if isinstance(seconds, dict):
+                taken[name] = min(taken.get(name, np.inf), seconds["cpu_s"])
+    return taken
+
+
+def cpu_seconds(model: Path, frames: Path) -> dict[str, float]:
+    """Time a file on its first frame, as anybody opens it: the least of ten or more."""
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads, options.log_severity_level = 1, 4
+    session = onnxruntime.InferenceSession(
+        model, options, providers=["CPUExecutionProvider"]
+    )
+    with np.load(frames / "000000.npz") as arrays:
+        frame = {port.name: arrays[port.name] for port in session.get_inputs()}
+    session.run(None, frame)
+    spent, begun = list[float](), time.perf_counter()
+    while len(spent) < 10 or time.perf_counter() - begun < 0.5:
+        start = time.process_time()
+        session.run(None, frame)
+        spent.append(time.process_time() - start)
+    return {"cpu_s": min(spent)}
+
+
+def quantize_static(model: Path, made: Path) -> None:
+    """Quantize as onnxruntime does by default: QDQ, of the same frames."""
+    from onnxruntime.quantization import CalibrationDataReader, QuantFormat
+    from onnxruntime.quantization import quantize_static as quantize
+
+    class Reader(CalibrationDataReader):  # type: ignore[misc]
+        def __init__(self) -> None:
+            taken = [port.name for port in opened(model).get_inputs()]
+            files = sorted((made.parent / "frames").glob("*.npz"))
+            frames = [dict(np.load(file)) for file in files]
+            self.left = iter(
+                [{name: frame[name] for name in taken} for frame in frames]
+            )
+
+        def get_next(self) -> Any:
+            return next(self.left, None)
+
+    quantize(str(model), str(made), Reader(), quant_format=QuantFormat.QDQ)
+
+
+def simplify(model: Path, made: Path) -> None:
+    sys.path.insert(0, str(made.parents[2] / "peers"))
+    import onnxsim
+
+    simplified, _ = onnxsim.simplify(onnx.load(model))
+    onnx.save(simplified, made)
+
+
+def slim(model: Path, made: Path) -> None:
+    sys.path.insert(0, str(made.parents[2] / "peers"))
+    import onnxslim
+
+    slimmed: Any = onnxslim.slim(onnx.load(model))
+    onnx.save(slimmed, made)
+
+
+PEER_WORK = {"quantize_static": quantize_static, "onnxsim": simplify, "onnxslim": slim}
+
+
+def read(records: Path) -> list[dict[str, Any]]:
+    """Return the rows that were measured."""
+    if not records.is_file():
+        return []
+    return [json.loads(line) for line in records.read_text().splitlines()]
+
+
+def shown(row: dict[str, Any]) -> str:
+    """Return a row of the table."""
+    short = row["file"].rsplit("/", 1)[-1].removesuffix(".onnx")
+    if row["error"]:
+        return f"{short} | {row['tool']} | {row['error']}"
+    nodes, mb = row["nodes"], row["mb"]
+    reported, true = row.get("reported", {}), row["db"]
+    limited = {name: 200.0 if db is None else db for name, db in reported.items()}
+    beside = above = ""
+    if limited:
+        beside = f"{limited[row['worst']]:.1f}"
+        above = f"{max(limited[name] - true[name] for name in limited):+.1f}"
+    ratio = f"{row['ratio']:.2f}" if "ratio" in row else ""
+    sizes = f"{nodes[0]} {nodes[1]} | {mb[0]:.2f} {mb[1]:.2f}"
+    loss = f"{true[row['worst']]:.1f} | {beside} | {above}"
+    return f"{short} | {row['tool']} | {sizes} | {loss} | {ratio}"
+
+
+def table(rows: list[dict[str, Any]]) -> Iterator[str]:
+    """Yield all rows, and how many meet what is asked of them."""
+    yield "file | tool | nodes | MB | dB | reported | too much | time"
+    yield "---|---|---|---|---|---|---|---"
+    yield from map(shown, rows)
+    ours = [row for row in rows if row["tool"] in OURS and not row["error"]]
+    refused = [row for row in rows if row["tool"] in OURS and row["error"]]
+    peer = {row["file"]: row for row in rows if row["tool"] == "quantize_static"}
+    int8 = [row for row in ours if row["tool"] == "ours"]
+    gaps = [
+        max(
+            (200.0 if db is None else db) - row["db"][name]
+            for name, db in row["reported"].items()
+        )
+        for row in ours
+        if row.get("reported")
+    ]
+    behind = [
+        row["file"]
+        for row in int8
+        if (other := peer.get(row["file"]))
+        and not other["error"]
+        and row["db"][row["worst"]] < other["db"][other["worst"]]
+    ]
+    yield f"refused: {len(refused)}"
+    yield f"reported within 3 dB above: {sum(gap <= 3 for gap in gaps)} of {len(gaps)}"
+    yield f"reported more than 6 dB above: {sum(gap > 6 for gap in gaps)}"
+    slower = sum(row.get("ratio", 1) > 1.05 for row in int8)
+    larger = sum(row["mb"][1] > row["mb"][0] for row in ours)
+    yield f"slower than their source: {slower}; larger: {larger}"
+    yield f"worst output behind quantize_static's: {', '.join(behind) or 'none'}"
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,1 @@
+"""What is measured: models, their frames, and what makes them."""

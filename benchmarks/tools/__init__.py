@@ -1,0 +1,2 @@
+"""Scripts that measurements and the project need: ``python -m
+benchmarks.tools.NAME``."""
