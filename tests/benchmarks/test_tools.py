@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from benchmarks.subjects import seven_nodes
-from benchmarks.tools import written_files
+from benchmarks.tools import replay, written_files
 from benchmarks.tools.files_entered import Entered
 from benchmarks.tools.masks import MASKS, Mask, masked, masked_name
 from benchmarks.tools.mutate import Fate, main, run, table
@@ -274,3 +274,31 @@ def test_the_key_of_a_studys_model_is_hidden_in_its_name_alone() -> None:
     assert masked_name(KEPT_MODEL) == "out/models/full.<key>.report.json"
     other = "out/results/full.0123456789abcdef.json"
     assert masked_name(other) == other
+
+
+class Played(replay.Tree):
+    """A checkout whose passes are numbers: from ``fault`` on they do otherwise."""
+
+    def __init__(self, fault: int) -> None:
+        self.fault, self.texts = fault, {}
+
+    def steps(self, job: replay.Job) -> list[str]:
+        return [f"pass-{number}" for number in range(7)]
+
+    def start(self, jobs: object) -> None:  # type: ignore[override]
+        """Start nothing."""
+
+    def finish(self, child: object, jobs: object) -> None:
+        """Wait for nothing."""
+
+    def digest(self, job: replay.Job) -> str:
+        ran = job.passes[1].count("pass") if job.passes[0] == "--passes" else 7
+        return f"{self.fault < ran}"
+
+
+@pytest.mark.parametrize("fault", range(7))
+def test_a_replay_names_the_pass_behind_which_two_graphs_differ(fault: int) -> None:
+    subject = replay.Subject("net", Path("net.onnx"), Path("net"), ("full",))
+    job = replay.Job(subject, ("-r", "full"), "tensorrt")
+    lines = replay.differences(job, Played(7), Played(fault))
+    assert list(lines) == [f"net.full.tensorrt.onnx: pass-{fault}"]
