@@ -20,7 +20,7 @@ and halves of characters: they steer a terminal, or no file can hold them."""
 def printable(text: str) -> str:
     """Write what cannot be seen in a text, but ends of lines, as escapes."""
     return _UNSEEN.sub(
-        lambda found: found.group().encode("unicode_escape").decode(), text
+        lambda match: match.group().encode("unicode_escape").decode(), text
     )
 
 
@@ -147,8 +147,8 @@ def not_measured(reasons: Mapping[str, str]) -> str:
     rows = {why: list[str]() for why in reasons.values()}
     for name, why in reasons.items():
         rows[why].append(name.strip())
-    said = (f"{', '.join(names)} ({why})" for why, names in rows.items())
-    return f"Not measured: {'; '.join(said)}." if reasons else ""
+    reasons_of = (f"{', '.join(names)} ({why})" for why, names in rows.items())
+    return f"Not measured: {'; '.join(reasons_of)}." if reasons else ""
 
 
 def megabytes(count: float) -> str:

@@ -159,9 +159,9 @@ class CalibrationCheckpoint:
         if self.path is None or not self.path.is_file():
             return CalibrationState()
         try:
-            found = load_arrays(self.path, "a checkpoint")
-            key = documents.from_json(str(found.pop("key")))
-            done = int(str(found.pop("done")))
+            arrays = load_arrays(self.path, "a checkpoint")
+            key = documents.from_json(str(arrays.pop("key")))
+            done = int(str(arrays.pop("done")))
         except (ValueError, KeyError) as error:
             raise FramesError(f"{self.path}: not a checkpoint ({error})") from error
         # A checkpoint of another calibration is refused.
@@ -177,10 +177,10 @@ class CalibrationCheckpoint:
             )
         return CalibrationState(
             done,
-            {name: a for name, a in found.items() if not name.startswith(_STATE)},
+            {name: a for name, a in arrays.items() if not name.startswith(_STATE)},
             {
                 name.removeprefix(_STATE): array
-                for name, array in found.items()
+                for name, array in arrays.items()
                 if name.startswith(_STATE)
             },
         )
@@ -379,9 +379,9 @@ class _Job:
             provider=self.settings.provider,
         )
         state = self.begun.state if begin else None
-        told = [name for name, port in session.outputs.items() if port.type in DTYPES]
+        floats = [name for name, port in session.outputs.items() if port.type in DTYPES]
         rest = (self.frames[index] for index in range(begin, len(self.frames)))
-        runs = feed_forward(session, rest, told, state)
+        runs = feed_forward(session, rest, floats, state)
         # Store the progress from time to time.
         for at, (inputs, values, after) in enumerate(runs, begin):
             readings = values[READINGS].astype(np.float32).reshape(-1, probe.width)

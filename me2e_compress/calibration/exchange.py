@@ -82,17 +82,17 @@ def taken_from(
 def _parse(
     path: Path, lines: list[str], first: int, mark: str, read: Callable[[str], float]
 ) -> dict[str, float]:
-    found = {}
+    values = {}
     for number, line in enumerate(lines[first:], first + 1):
         name, parted, text = line.rpartition(mark)
-        if name in found:
+        if name in values:
             raise FramesError(f"{path}: line {number} names {name} again")
         try:
-            found[name] = read(text)
+            values[name] = read(text)
         except (ValueError, struct.error) as error:
             raise FramesError(
                 f"{path}: line {number} is not a name and a number: {line[:60]!r}"
             ) from error
-        if not parted or not 0 <= found[name] <= LARGEST:
+        if not parted or not 0 <= values[name] <= LARGEST:
             raise FramesError(f"{path}: line {number} is not a range: {line[:60]!r}")
-    return found
+    return values

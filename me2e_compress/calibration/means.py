@@ -47,9 +47,9 @@ def token_means(
     session = Session(copy, threads=threads, provider=provider)
     # One pass: the averages are updated frame by frame.
     averages = {name: _Average(name) for name in values}
-    for index, found in enumerate(replay(session, frames, list(values))):
+    for index, answers in enumerate(replay(session, frames, list(values))):
         for name, average in averages.items():
-            average.take(index, found[name])
+            average.take(index, answers[name])
     return {name: average.result() for name, average in averages.items()}
 
 

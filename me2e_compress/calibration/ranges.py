@@ -100,11 +100,11 @@ class Ranges:
     @property
     def crests(self) -> dict[str, float]:
         """The largest magnitude of each range over its root mean square, if known."""
-        found = {}
+        ratios = {}
         for name, root in self.rms.items():
             low, high = self.tensors[name]
-            found[name] = max(-low, high) / root if root else 0.0
-        return found
+            ratios[name] = max(-low, high) / root if root else 0.0
+        return ratios
 
     @property
     def outliers(self) -> dict[str, float]:
@@ -117,10 +117,10 @@ class Ranges:
 
     def save(self, path: Path) -> None:
         """Write JSON atomically."""
-        told = dataclasses.asdict(self)
+        document = dataclasses.asdict(self)
         if not self.not_finite:
-            del told["not_finite"]
-        write_document(path, told, indent=1)
+            del document["not_finite"]
+        write_document(path, document, indent=1)
 
     @classmethod
     def load(cls, path: Path) -> Self:
@@ -129,17 +129,17 @@ class Ranges:
             raise FramesError(f"{path}: no such ranges file")
         with documents.reading(path, FramesError, "not ranges"):
             content = documents.content(path)
-            found = pydantic.TypeAdapter(cls).validate_json(content)
+            ranges = pydantic.TypeAdapter(cls).validate_json(content)
         # Bounds must be finite and in order.
-        for name, (low, high) in found.tensors.items():
+        for name, (low, high) in ranges.tensors.items():
             if not -LARGEST <= low <= high <= LARGEST:  # NaN too
                 raise FramesError(
                     f"{path}: not ranges: {name} has {low:g} to {high:g}; a range is"
                     " two float32 bounds, the lower one first"
                 )
-        if lie := found._contradiction():
+        if lie := ranges._contradiction():
             raise FramesError(f"{path}: not ranges: {lie}")
-        return found
+        return ranges
 
     def _contradiction(self) -> str:
         """Say what of a file cannot be true; empty if nothing is."""

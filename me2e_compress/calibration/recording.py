@@ -105,11 +105,11 @@ class _Draft:
     def resume(self) -> Begin:
         """Keep the complete scenes of an earlier run of the same frames, if any."""
         try:
-            found = documents.from_json((self.folder / PROGRESS).read_bytes())
+            progress = documents.from_json((self.folder / PROGRESS).read_bytes())
         except (OSError, documents.MalformedError):
-            found = None
-        if isinstance(found, dict) and found.get("key") == self.key:
-            scenes, places = list(found["scenes"]), list(found["places"])
+            progress = None
+        if isinstance(progress, dict) and progress.get("key") == self.key:
+            scenes, places = list(progress["scenes"]), list(progress["places"])
             if all(self._frame(index).is_file() for index in range(scenes[-1])):
                 self.scenes, self.places = scenes[:-1], places[:-1]
                 self.count = scenes[-1]

@@ -63,17 +63,17 @@ class RangeFinding:
 
 def review(ranges: Ranges) -> tuple[RangeFinding, ...]:
     """Judge ranges by what they say themselves; warnings first."""
-    found = [*_scales(ranges), *_ports(ranges)]
+    findings = [*_scales(ranges), *_ports(ranges)]
     if said := ranges.not_finite:
-        found.append(RangeFinding("not finite", "warning", said, advice=NOT_FINITE))
+        findings.append(RangeFinding("not finite", "warning", said, advice=NOT_FINITE))
     if ranges.scenes is not None and ranges.scenes < FEW_SCENES:
         said = f"{counted(ranges.frames, 'frame')} in {counted(ranges.scenes, 'scene')}"
         advice = (
             f"Frames of one scene look alike: record {FEW_SCENES} scenes or more, on"
             " other routes, in other traffic and light"
         )
-        found.append(RangeFinding("few scenes", "note", said, advice=advice))
-    return tuple(sorted(found, key=lambda each: each.severity, reverse=True))
+        findings.append(RangeFinding("few scenes", "note", said, advice=advice))
+    return tuple(sorted(findings, key=lambda each: each.severity, reverse=True))
 
 
 def not_in(cache: Path, missing: Sequence[str]) -> tuple[RangeFinding, ...]:
@@ -175,12 +175,12 @@ def _named(
     kind: Kind,
     severity: Literal["warning", "note"],
     said: str,
-    found: Mapping[str, float | None],
+    ratio_of: Mapping[str, float | None],
     advice: str = "",
 ) -> Iterable[RangeFinding]:
     """Yield one finding about several names, or none; ``said`` begins with a noun."""
-    if found:
+    if ratio_of:
         noun, rest = said.split(" ", 1)
-        ratios = tuple(each for each in found.values() if each is not None)
-        line = f"{counted(len(found), noun)} {rest}"
-        yield RangeFinding(kind, severity, line, tuple(found), ratios, advice)
+        ratios = tuple(each for each in ratio_of.values() if each is not None)
+        line = f"{counted(len(ratio_of), noun)} {rest}"
+        yield RangeFinding(kind, severity, line, tuple(ratio_of), ratios, advice)

@@ -141,14 +141,14 @@ def no_element(measured: Floats) -> npt.NDArray[np.bool_]:
 
 def places_of(model: ir.Model) -> list[str]:
     """Name the computed floats that say where to read: what is read shows no NaN."""
-    found = dict[str, None]()
+    places = dict[str, None]()
     for node in model.graph:
         value = grid_of(node)
         if node.op_type == "Cast" and node.outputs[0].dtype in _INDICES:
             value = node.inputs[0]
         if value is not None and value.producer() and value.dtype in FLOATS:
-            found[str(value.name)] = None
-    return list(found)
+            places[str(value.name)] = None
+    return list(places)
 
 
 _INDICES = (ir.DataType.INT32, ir.DataType.INT64)

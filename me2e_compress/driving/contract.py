@@ -65,11 +65,11 @@ def fed(array: Array, port: SessionPort) -> Array:
     return array.reshape(sides).astype(DTYPES[port.type], copy=False)
 
 
-def fits(found: Shape, wanted: Shape) -> bool:
+def fits(shape: Shape, wanted: Shape) -> bool:
     """Return whether two shapes agree where both are known."""
-    return len(found) == len(wanted) and all(
+    return len(shape) == len(wanted) and all(
         not isinstance(side, int) or not isinstance(other, int) or side == other
-        for side, other in zip(found, wanted, strict=True)
+        for side, other in zip(shape, wanted, strict=True)
     )
 
 
@@ -270,12 +270,12 @@ def timed(plan: Plan | Trajectory) -> Trajectory:
 
 def six_waypoints(answer: object) -> npt.NDArray[np.float64]:
     """Return a plan as six waypoints every 0.5 s, interpolated if need be."""
-    found = checked(answer)
-    if isinstance(found, PedalsAndWheel):
+    control = checked(answer)
+    if isinstance(control, PedalsAndWheel):
         raise EvaluationError("the policy answers controls: there is no plan")
-    if np.array_equal(found.times_s, PLAN_TIMES_S):
-        return np.asarray(found.points, np.float64)
-    return found.at(PLAN_TIMES_S)
+    if np.array_equal(control.times_s, PLAN_TIMES_S):
+        return np.asarray(control.points, np.float64)
+    return control.at(PLAN_TIMES_S)
 
 
 def _finite(points: Plan) -> Plan:

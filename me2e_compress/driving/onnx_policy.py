@@ -35,7 +35,7 @@ def answers_by_input(
     inputs in ``fed_otherwise``, which the adapter feeds.
     """
     own = {k: v for k, v in session.recurrent.items() if k not in fed_otherwise}
-    found: dict[str, str] = {}
+    answers: dict[str, str] = {}
     for name, entry in (entries or {}).items():
         answer = entry.answer or own.get(name)
         if answer is None:
@@ -43,8 +43,8 @@ def answers_by_input(
                 f"recurrent input {name}: no output answers it by its name; say from ="
                 f" one of {', '.join(session.outputs)}"
             )
-        found[name] = answer
-    return {**own, **found}
+        answers[name] = answer
+    return {**own, **answers}
 
 
 @dataclass(frozen=True)

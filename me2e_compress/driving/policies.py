@@ -138,11 +138,11 @@ class PythonDriver(Driver):
     def fingerprint(self) -> str:
         """Return its text and a digest of the module's file."""
         _look_here()
-        found = importlib.util.find_spec(self.factory.split(":")[0])
+        spec = importlib.util.find_spec(self.factory.split(":")[0])
         text = POLICIES.text(self)
-        if found is None or found.origin is None or not Path(found.origin).is_file():
+        if spec is None or spec.origin is None or not Path(spec.origin).is_file():
             return text
-        return f"{text}+{_sha256(Path(found.origin))}"
+        return f"{text}+{_sha256(Path(spec.origin))}"
 
 
 def driver_named(

@@ -56,8 +56,8 @@ def _has_operator(op_type: str) -> bool:
 
 def opset_of(imports: ir.Model | ir.Function) -> int:
     """Return the opset of ONNX's own operators that is imported; 0 if none is."""
-    found = imports.opset_imports
-    return next((found[domain] for domain in STANDARD if domain in found), 0)
+    versions = imports.opset_imports
+    return next((versions[domain] for domain in STANDARD if domain in versions), 0)
 
 
 def nodes_of(model: ir.Model) -> Iterator[ir.Node]:
@@ -96,13 +96,13 @@ def bodies_of(node: ir.Node) -> Sequence[ir.Graph]:
     """List the graphs that a node carries, not those inside them."""
     if node.op_type not in _WITH_BODIES and is_standard(node):
         return ()
-    found: list[ir.Graph] = []
+    bodies: list[ir.Graph] = []
     for attribute in node.attributes.values():
         if attribute.type == ir.AttributeType.GRAPH:
-            found.append(attribute.as_graph())
+            bodies.append(attribute.as_graph())
         elif attribute.type == ir.AttributeType.GRAPHS:
-            found.extend(attribute.as_graphs())
-    return found
+            bodies.extend(attribute.as_graphs())
+    return bodies
 
 
 def attribute_values(node: ir.Node) -> tuple[bytes, ...]:
@@ -117,14 +117,14 @@ def attribute_values(node: ir.Node) -> tuple[bytes, ...]:
 
 def makers_of(values: Iterable[ir.Value | None]) -> dict[ir.Node, None]:
     """Find the nodes that compute some values, by what their bodies read too."""
-    found: dict[ir.Node, None] = {}
+    makers: dict[ir.Node, None] = {}
     waiting = list(values)
     while waiting:
         node = producer_of(waiting.pop())
-        if node is not None and node not in found:
-            found[node] = None
+        if node is not None and node not in makers:
+            makers[node] = None
             waiting.extend(reads_of(node))
-    return found
+    return makers
 
 
 def input_at(node: ir.Node, index: int) -> ir.Value | None:
@@ -284,13 +284,13 @@ def constant_values(model: ir.Model) -> frozenset[ir.Value]:
     computed. One look at each node: the graph must be in topological order.
     """
     weights = model.graph.initializers.values()
-    found = {value for value in weights if not value.is_graph_input()}
+    constants = {value for value in weights if not value.is_graph_input()}
     for node in model.graph:
         if (
             is_standard(node)
             and node.op_type not in DRAWS
             and not has_subgraph(node)
-            and all(each is None or each in found for each in node.inputs)
+            and all(each is None or each in constants for each in node.inputs)
         ):
-            found.update(node.outputs)
-    return frozenset(found)
+            constants.update(node.outputs)
+    return frozenset(constants)

@@ -60,11 +60,11 @@ def recurrence(
             raise GraphError(f"metadata {RECURRENT}: {why}")
     # An output feeds one input only.
     for source in inputs:
-        found = _answer(source, outputs)
-        if found is None or source in (named or {}) or found in pairs.values():
+        output = _answer(source, outputs)
+        if output is None or source in (named or {}) or output in pairs.values():
             continue
-        if _fits(inputs[source], outputs[found]):
-            pairs[source] = found
+        if _fits(inputs[source], outputs[output]):
+            pairs[source] = output
     return {source: pairs[source] for source in inputs if source in pairs}
 
 

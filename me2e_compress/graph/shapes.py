@@ -212,16 +212,16 @@ def unshaped_plugins(model: ir.Model) -> list[ir.Node]:
     ]
 
 
-def refined(declared: ir.Shape | None, found: ir.Shape | None) -> ir.Shape | None:
-    """Return a declared shape, its open dimensions numbers where those are found.
+def refined(declared: ir.Shape | None, inferred: ir.Shape | None) -> ir.Shape | None:
+    """Return a declared shape, its open dimensions numbers where those are inferred.
 
-    Nothing declared leaves what is found.
+    Nothing declared leaves what is inferred.
     """
     if declared is None:
-        return found
-    if found is None or len(declared) != len(found):
+        return inferred
+    if inferred is None or len(declared) != len(inferred):
         return declared
-    pairs = list(zip(declared, found, strict=True))
+    pairs = list(zip(declared, inferred, strict=True))
     if not any(isinstance(new, int) and not isinstance(old, int) for old, new in pairs):
         return declared
     return ir.Shape([new if isinstance(new, int) else old for old, new in pairs])

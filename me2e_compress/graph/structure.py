@@ -259,9 +259,9 @@ def _check_calls(
     if calls:
         first = min(calls)[1]
         raise GraphError(f"function {first} calls itself, at once or over others")
-    if (found := size(graph.node)) > MOST_CALLED_NODES:
+    if (nodes := size(graph.node)) > MOST_CALLED_NODES:
         raise GraphError(
-            f"its functions make {found:,} nodes of it, {MOST_CALLED_NODES:,} at most"
+            f"its functions make {nodes:,} nodes of it, {MOST_CALLED_NODES:,} at most"
             " are read"
         )
 

@@ -62,8 +62,8 @@ def macs_counter(model: ir.Model) -> Counter:
         if function is None:
             return macs(node)
         if key not in bodies:
-            found, unknown = total_macs(count(inner) for inner in function.all_nodes())
-            bodies[key] = found if not unknown else None
+            total, unknown = total_macs(count(inner) for inner in function.all_nodes())
+            bodies[key] = total if not unknown else None
         return bodies[key]
 
     return count
@@ -219,12 +219,12 @@ class Size:
 
 def size(model: ir.Model) -> Size:
     """Measure a graph."""
-    found, unknown = total_macs(map(macs_counter(model), nodes_in(model.graph)))
+    macs, unknown = total_macs(map(macs_counter(model), nodes_in(model.graph)))
     return Size(
         nodes=node_count(model),
         graph_nodes=sum(1 for _ in nodes_in(model.graph)),
         weight_bytes=weight_bytes(model),
-        macs=found,
+        macs=macs,
         unknown_macs_nodes=unknown,
     )
 

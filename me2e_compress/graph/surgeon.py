@@ -72,17 +72,17 @@ def _values(model: ir.Model) -> Iterable[ir.Value]:
 def _match(nodes: Sequence[ir.Node], past: Sequence[ir.Node]) -> dict[ir.Node, ir.Node]:
     by_output = {node.outputs[0].name: node for node in past if node.outputs}
     by_name = {node.name: node for node in past if node.name}
-    found: dict[ir.Node, ir.Node] = {}
+    matches: dict[ir.Node, ir.Node] = {}
     for node in nodes:
         known = by_output.get(node.outputs[0].name) if node.outputs else None
         if known is None and node.name:
             named = by_name.get(node.name)
             known = named if named is not None and _alike(named, node) else None
         if known is not None:
-            found[node] = known
+            matches[node] = known
             if _alike(node, known):
                 _merge(node.metadata_props, known.metadata_props)
-    return found
+    return matches
 
 
 def _alike(one: ir.Node, other: ir.Node) -> bool:
@@ -90,12 +90,12 @@ def _alike(one: ir.Node, other: ir.Node) -> bool:
 
 
 def _inherit_from_neighbours(
-    nodes: Sequence[ir.Node], found: dict[ir.Node, ir.Node], by: str
+    nodes: Sequence[ir.Node], matches: dict[ir.Node, ir.Node], by: str
 ) -> None:
     alive = {value.name for node in nodes for value in node.outputs}
     claimed: set[ir.Node] = set()
     for node in nodes:
-        if provenance.read(node) is None and (known := found.get(node)) is not None:
+        if provenance.read(node) is None and (known := matches.get(node)) is not None:
             vanished = _vanished_above(known, alive, claimed)
             provenance.inherit(node, (known, *vanished), by=by)
     place = {node: index for index, node in enumerate(nodes)}
@@ -114,7 +114,7 @@ def _inherit_from_neighbours(
 def _vanished_above(
     node: ir.Node, alive: set[str | None], claimed: set[ir.Node]
 ) -> list[ir.Node]:
-    found: list[ir.Node] = []
+    vanished: list[ir.Node] = []
     stack = [node]
     while stack:
         for value in stack.pop().inputs:
@@ -123,9 +123,9 @@ def _vanished_above(
                 continue
             if not any(output.name in alive for output in maker.outputs):
                 claimed.add(maker)
-                found.append(maker)
+                vanished.append(maker)
                 stack.append(maker)
-    return found
+    return vanished
 
 
 def to_graphsurgeon(model: ir.Model) -> gs.Graph:

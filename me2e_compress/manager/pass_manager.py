@@ -190,18 +190,18 @@ class _Run:
             what = f"the graph after {stretch[-1][0].name}"
             seeded = first_seeded(model, self.context.seed)
             self.manager.try_first(model, what, self._frames() or seeded)
-        found, runnable, inputs = self._compare(stretch, model)
-        self.verifications.append(found)
-        if found.passed or inputs is None:
+        check, runnable, inputs = self._compare(stretch, model)
+        self.verifications.append(check)
+        if check.passed or inputs is None:
             return
         suspects, guilty, changed = _bisect(runnable, model, inputs, self.progress)
         current, who = suspects[-1], " or ".join(each.name for each in suspects)
-        worst = max(found.judged, key=lambda name: found.errors[name])
+        worst = max(check.judged, key=lambda name: check.errors[name])
         drawn = inputs.kind == "synthetic"
         error = VerificationError(
             f"{who} promises the same outputs and changed {worst} by"
-            f" {found.errors[worst]:.3g} of its range"
-            f" (allowed {found.tolerances[worst]:.0e}, {found.inputs} inputs)"
+            f" {check.errors[worst]:.3g} of its range"
+            f" (allowed {check.tolerances[worst]:.0e}, {check.inputs} inputs)"
             f"{equivalence.where(guilty, changed, inputs)}"
             + (f"; inputs were drawn (seed {self.context.seed}):{_RECORD}" * drawn)
         )
@@ -219,12 +219,12 @@ class _Run:
                 inputs = VerificationInputs.of(
                     before, frames, context.seed, count, context.provider
                 )
-                found = equivalence.verify(names, before, model, inputs)
+                check = equivalence.verify(names, before, model, inputs)
             except (GraphError, PreconditionError) as error:
                 reason = reason or str(error)
                 continue
-            said = (*found.remarks, *self._leave_out(stretch[:first], reason))
-            return dataclasses.replace(found, remarks=said), stretch[first:], inputs
+            remarks = (*check.remarks, *self._leave_out(stretch[:first], reason))
+            return dataclasses.replace(check, remarks=remarks), stretch[first:], inputs
         names = tuple(current.name for current, _ in stretch)
         return equivalence.skipped(names, reason), stretch, None
 

@@ -184,18 +184,18 @@ class Report:
 
 def versions() -> dict[str, str]:
     """Name the versions that decide the result."""
-    found = {"python": platform.python_version()}
+    versions = {"python": platform.python_version()}
     for package in _PACKAGES:
         try:
-            found[package] = importlib.metadata.version(package)
+            versions[package] = importlib.metadata.version(package)
         except importlib.metadata.PackageNotFoundError:
-            found[package] = "not installed as a package"
-    return found
+            versions[package] = "not installed as a package"
+    return versions
 
 
 def _steps_table(steps: Sequence[Step]) -> Table:
     """Show pass by pass what changed and what it cost, and what the passes say."""
-    said = [f"{step.name}: {note}" for step in steps for note in step.notes]
+    notes = [f"{step.name}: {note}" for step in steps for note in step.notes]
     partly = any(step.after.unknown_macs_nodes for step in steps)
     return table(
         "Pass by pass",
@@ -213,7 +213,7 @@ def _steps_table(steps: Sequence[Step]) -> Table:
             for step in steps
         ],
         AT_LEAST if partly else "",
-        details="\n".join(said),
+        details="\n".join(notes),
     )
 
 

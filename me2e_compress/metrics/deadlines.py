@@ -120,23 +120,23 @@ def _mean(latencies_us: Sequence[int], why: str) -> Measure:
     return Measure(fmean(latencies_us) / 1e3, "ms")
 
 
-def deadlines_table(title: str, found: Deadlines) -> Table:
+def deadlines_table(title: str, deadlines: Deadlines) -> Table:
     """Return percentiles, and how many decisions took longer than the budget."""
-    rows = [(n, number(each.value, ".2f"), each.unit) for n, each in _each(found)]
-    why = {name: each.reason for name, each in _each(found) if each.value is None}
+    rows = [(n, number(each.value, ".2f"), each.unit) for n, each in _each(deadlines)]
+    why = {name: each.reason for name, each in _each(deadlines) if each.value is None}
     return table(
-        f"{title}: {counted(found.count, 'decision')}",
+        f"{title}: {counted(deadlines.count, 'decision')}",
         ("latency", "", "unit"),
         rows,
         not_measured(why),
     )
 
 
-def _each(found: Deadlines) -> Iterator[tuple[str, Measure]]:
-    yield from ((f"p{p:g}", each) for p, each in found.percentiles_ms.items())
-    yield "max", found.worst_ms
-    yield "mean", found.mean_ms
-    yield f"over {found.budget_ms:g} ms", found.over_percent
-    if found.critical_ms.value is not None:
-        yield "mean, TTC below 1.5 s", found.critical_ms
-        yield "mean, other frames", found.other_ms
+def _each(deadlines: Deadlines) -> Iterator[tuple[str, Measure]]:
+    yield from ((f"p{p:g}", each) for p, each in deadlines.percentiles_ms.items())
+    yield "max", deadlines.worst_ms
+    yield "mean", deadlines.mean_ms
+    yield f"over {deadlines.budget_ms:g} ms", deadlines.over_percent
+    if deadlines.critical_ms.value is not None:
+        yield "mean, TTC below 1.5 s", deadlines.critical_ms
+        yield "mean, other frames", deadlines.other_ms

@@ -167,7 +167,7 @@ def _neighbours(
     low = call.add("Floor", [pixel])
     part = call.add("Sub", [pixel, low])
     one = call.numbers(1.0, pixel)
-    found = []
+    neighbours = []
     for edge, share in (
         (low, call.add("Sub", [one, part])),
         (call.add("Add", [low, one]), part),
@@ -175,8 +175,8 @@ def _neighbours(
         # A neighbour outside of the map counts as zero
         above = call.add("GreaterOrEqual", [edge, call.numbers(0.0, pixel)])
         inside = call.add("And", [above, call.add("Less", [edge, size])])
-        found.append((call.cast(edge, ir.DataType.INT64), inside, share))
-    return found
+        neighbours.append((call.cast(edge, ir.DataType.INT64), inside, share))
+    return neighbours
 
 
 def _first_rows(call: FusedCall, padded: ir.Value, starts: ir.Value) -> ir.Value:

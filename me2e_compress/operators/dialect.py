@@ -186,7 +186,7 @@ class Dialect:
     def attributes_of(self, node: ir.Node) -> dict[str, AttributeValue]:
         """Return a node's attributes with defaults; unknown ones are refused."""
         known = {each.name: each for each in self.attributes}
-        found: dict[str, AttributeValue] = {n: e.default for n, e in known.items()}
+        attributes: dict[str, AttributeValue] = {n: e.default for n, e in known.items()}
         # Names and values must be known
         for name, written in node.attributes.items():
             if name in PLUGIN_ATTRIBUTES:
@@ -199,12 +199,12 @@ class Dialect:
             value = _value_of(written)
             kind, choices = type(known[name].default), known[name].choices
             if not isinstance(value, kind) or (choices and value not in choices):
-                said = " or ".join(map(str, choices)) or kind.__name__
+                among = " or ".join(map(str, choices)) or kind.__name__
                 raise PreconditionError(
-                    f"{self.call_of(node)}: attribute {name} is {value!r}, not {said}"
+                    f"{self.call_of(node)}: attribute {name} is {value!r}, not {among}"
                 )
-            found[name] = value
-        return found
+            attributes[name] = value
+        return attributes
 
     def check(self, node: ir.Node) -> None:
         """Refuse a node whose number, types or shapes of inputs do not fit."""

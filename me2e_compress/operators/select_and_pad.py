@@ -81,9 +81,9 @@ class SelectAndPad(Operator):
         index = best.producer().outputs[1]  # type: ignore[union-attr]
         index = call.unsqueeze(index, (2,))
         # Replace unflagged rows by the padding
-        found = call.add("GatherND", [feature, index], {"batch_dims": 1})
+        gathered = call.add("GatherND", [feature, index], {"batch_dims": 1})
         none = call.add("Equal", [best, last])
-        return call.add("Where", [call.unsqueeze(none, (2,)), invalid, found])
+        return call.add("Where", [call.unsqueeze(none, (2,)), invalid, gathered])
 
     def reference(self, inputs: Arrays, attributes: Attributes) -> NdArray:
         """Compute it in numpy, [B, P, C] float64."""

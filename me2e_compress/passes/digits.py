@@ -57,7 +57,7 @@ def regrouped(layout: Layout, shape: Sequence[int]) -> Layout | None:
     ``[16] -> [2, 8]`` splits a digit in two; ``[4, 3] -> [6, 2]`` has no digits.
     """
     rest = list(reversed(flat(layout)))
-    found: list[Digits] = []
+    groups: list[Digits] = []
     for size in shape:
         taken: list[Digit] = []
         # Take digits from the front, and split the last if it divides
@@ -75,8 +75,8 @@ def regrouped(layout: Layout, shape: Sequence[int]) -> Layout | None:
                 return None
             taken.append(digit)
             size //= digit.size
-        found.append(tuple(taken))
-    return None if rest else tuple(found)
+        groups.append(tuple(taken))
+    return None if rest else tuple(groups)
 
 
 def before(node: ir.Node, layout: Layout) -> Layout | None:
@@ -94,14 +94,14 @@ def before(node: ir.Node, layout: Layout) -> Layout | None:
 
 def merged(digits: Iterable[Digit]) -> Digits:
     """Return digits with consecutive digits of the same index merged."""
-    found: list[Digit] = []
+    result: list[Digit] = []
     for digit in digits:
-        last = found[-1] if found else None
+        last = result[-1] if result else None
         if last is not None and last.axis == digit.axis and last.stride == digit.end:
-            found[-1] = Digit(digit.axis, digit.stride, last.size * digit.size)
+            result[-1] = Digit(digit.axis, digit.stride, last.size * digit.size)
         else:
-            found.append(digit)
-    return tuple(found)
+            result.append(digit)
+    return tuple(result)
 
 
 def split_like(digits: Digits, others: Iterable[Digit]) -> Digits:
@@ -109,7 +109,7 @@ def split_like(digits: Digits, others: Iterable[Digit]) -> Digits:
     edges: dict[str, set[int]] = {}
     for other in others:
         edges.setdefault(other.axis, set()).update((other.stride, other.end))
-    found: list[Digit] = []
+    pieces_of: list[Digit] = []
     for digit in digits:
         inner = {
             edge
@@ -121,8 +121,8 @@ def split_like(digits: Digits, others: Iterable[Digit]) -> Digits:
             Digit(digit.axis, low, high // low)
             for low, high in itertools.pairwise(bounds)
         ]
-        found.extend(reversed(pieces))
-    return tuple(found)
+        pieces_of.extend(reversed(pieces))
+    return tuple(pieces_of)
 
 
 def runs(source: Digits, wanted: Digits) -> tuple[list[Digits], list[int]]:

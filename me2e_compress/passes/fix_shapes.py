@@ -125,15 +125,15 @@ def _by_symbol(model: ir.Model, sizes: Mapping[str, int]) -> dict[str, int]:
         for axis, dim in enumerate(value.shape or ())
         if isinstance(dim, ir.SymbolicDim) and _symbols(dim) == (dim.value,)
     }
-    found = dict[str, int]()
+    by_symbol = dict[str, int]()
     for place, size in sizes.items():
         name = symbols.get(place, place)
-        if found.setdefault(name, size) != size:
+        if by_symbol.setdefault(name, size) != size:
             raise PreconditionError(
                 f"fix-shapes: {place}={size}: it is dimension {name!r}, which is"
-                f" {found[name]} already"
+                f" {by_symbol[name]} already"
             )
-    return found
+    return by_symbol
 
 
 def sized_inputs(model: ir.Model, sizes: Mapping[str, int]) -> ir.Model:

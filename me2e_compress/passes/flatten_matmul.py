@@ -71,8 +71,8 @@ class FlattenMatmul(Pass):
             (repeats, f"{counted(repeats, 'repeated operand')} read unrepeated"),
             (open_shapes, f"left {counted(open_shapes, 'product')} of unknown shape"),
         )
-        said = tuple(note for count, note in notes if count)
-        return PassResult(model, repeats + flattened, said)
+        remarks = tuple(note for count, note in notes if count)
+        return PassResult(model, repeats + flattened, remarks)
 
 
 @dataclasses.dataclass(frozen=True)

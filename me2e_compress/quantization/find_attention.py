@@ -33,34 +33,34 @@ def behind(graph: ir.Graph, through: Collection[str], is_product: Test) -> Neare
 
     The graph is in topological order.
     """
-    found: dict[ir.Value, Hits] = {}
+    hits_of: dict[ir.Value, Hits] = {}
     for node in graph:
         if is_product(node):
             hits: Hits = ((0, node),)
         elif node.op_type in through:
-            hits = _merged(found.get(v, ()) for v in node.inputs if v is not None)
+            hits = _merged(hits_of.get(v, ()) for v in node.inputs if v is not None)
         else:
             continue
         if hits:
-            found.update(dict.fromkeys(node.outputs, hits))
-    return found
+            hits_of.update(dict.fromkeys(node.outputs, hits))
+    return hits_of
 
 
 def ahead(graph: ir.Graph, through: Collection[str], is_product: Test) -> Nearest:
     """List, for every value, the products that read it through some operators only."""
-    found: dict[ir.Value, Hits] = {}
+    hits_of: dict[ir.Value, Hits] = {}
     beyond: dict[ir.Node, Hits] = {}
     for node in reversed(graph):
         for value in node.outputs:
-            found[value] = _merged(
+            hits_of[value] = _merged(
                 beyond.get(reader, ()) for reader in value.consumers()
             )
         # what reads a node's inputs: the product itself, or what lies ahead of it
         if is_product(node):
             beyond[node] = ((0, node),)
         elif node.op_type in through:
-            beyond[node] = _merged(found[value] for value in node.outputs)
-    return found
+            beyond[node] = _merged(hits_of[value] for value in node.outputs)
+    return hits_of
 
 
 def _merged(sources: Iterable[Hits]) -> Hits:
@@ -140,12 +140,12 @@ def find_attention(
     # products behind the scores, and ahead of the weights, of every softmax
     scored = behind(model.graph, _SCORES, is_product)
     weighed = ahead(model.graph, _WEIGHTS, is_product)
-    found: dict[ir.Node, Attention] = {}
+    attentions: dict[ir.Node, Attention] = {}
     for node in model.graph:
         if is_fused(node):  # tokens of [batch, (heads,) tokens, width]
             shapes = [open_shape(value) or () for value in node.inputs[:2]]
             tokens = [each[-2] if len(each) > 1 else None for each in shapes]
-            found[node] = Attention(tokens[0], tokens[-1])
+            attentions[node] = Attention(tokens[0], tokens[-1])
     for weights, scores in _softmaxes(model.graph):
         # a mask may have products of its own, of another size
         queries_by_keys = [
@@ -157,8 +157,8 @@ def find_attention(
         attention = Attention(*(shape[-2:] if len(shape) > 1 else (None, None)))
         by_values = [node for _, node in weighed.get(weights, ())]
         for product in (*queries_by_keys, *by_values):
-            found.setdefault(product, attention)
-    return found
+            attentions.setdefault(product, attention)
+    return attentions
 
 
 def find_attention_weights(
@@ -169,13 +169,13 @@ def find_attention_weights(
     Besides both products of an attention these are layers that read a softmax, as a
     mean position over bins does.
     """
-    found = dict.fromkeys(attention, "gives or reads attention weights")
+    reasons = dict.fromkeys(attention, "gives or reads attention weights")
     softmaxes = behind(model.graph, _WEIGHTS, lambda node: node.op_type == "Softmax")
     for node in model.graph:
         reads = node.inputs[:2] if node.op_type in WEIGHTED else ()
         if any(each in softmaxes for each in reads if each is not None):
-            found.setdefault(node, "reads the weights that a softmax gives")
-    return found
+            reasons.setdefault(node, "reads the weights that a softmax gives")
+    return reasons
 
 
 def _fits(product: ir.Value, scores: ir.Value) -> bool:

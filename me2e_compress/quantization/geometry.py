@@ -269,14 +269,14 @@ def find_coordinates(
     is linear in the graph. Sampling weights whose layer reads the same tensor as such a
     layer are mapped too. ``constants`` are values that no input changes.
     """
-    found = {
+    products = {
         node: f"positions that {reader} reads come from it"
         for node, reader in _behind_positions(
             model.graph, lambda layer: is_few(depth(layer)), constants
         )
         if node.op_type in _PRODUCTS
     }
-    return {**found, **_companions(model, found, constants)}
+    return {**products, **_companions(model, products, constants)}
 
 
 def position_arithmetic(
@@ -339,15 +339,15 @@ def _behind_positions(
 
 
 def _companions(
-    model: ir.Model, found: dict[ir.Node, str], constants: Collection[ir.Value]
+    model: ir.Model, products: dict[ir.Node, str], constants: Collection[ir.Value]
 ) -> dict[ir.Node, str]:
     """Find layers of sampling weights beside layers of offsets."""
-    shared = {node.inputs[0] for node in found}
+    shared = {node.inputs[0] for node in products}
 
     def is_beside(node: ir.Node) -> bool:
         return (
             node.op_type in _PRODUCTS
-            and node not in found
+            and node not in products
             and node.inputs[0] in shared
             and node.inputs[1] in constants
         )

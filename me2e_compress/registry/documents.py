@@ -111,13 +111,13 @@ def from_json(text: bytes | str, *, finite: bool = True) -> Any:
     False; the caller must then look at the numbers.
     """
     try:
-        found = (_DECODER if finite else _ANY_NUMBER).decode(_decoded(text))
+        document = (_DECODER if finite else _ANY_NUMBER).decode(_decoded(text))
     except RecursionError as error:
         raise MalformedError("nested too deeply") from error
     except ValueError as error:
         raise MalformedError(_line(error)) from error
-    _check_strings(found)
-    return found
+    _check_strings(document)
+    return document
 
 
 def from_toml(text: bytes | str) -> dict[str, Any]:

@@ -55,8 +55,8 @@ def name_in(text: str) -> str:
 
     A colon, a brace or the end of the text must follow it.
     """
-    found = _BEGINNING.match(text.strip())
-    return "" if found is None else found.group()
+    name = _BEGINNING.match(text.strip())
+    return "" if name is None else name.group()
 
 
 def read_one(text: str) -> ParsedItem:

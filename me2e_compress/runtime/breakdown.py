@@ -84,11 +84,11 @@ def break_down(
         str(copy.name): module_of(node)
         for node, copy in zip(model.graph, source.graph, strict=True)
     }
-    found = optimized(source, provider)
-    made_of = origins(source, found)
+    compiled = optimized(source, provider)
+    made_of = origins(source, compiled)
     places = {name: modules[str(node.name)] for name, node in made_of.items()}
     # Record no more events than the profiler can hold.
-    wanted = max(1, min(runs, MOST_EVENTS // max(1, len(found.graph))))
+    wanted = max(1, min(runs, MOST_EVENTS // max(1, len(compiled.graph))))
     # Profile the source graph: the session optimizes it again.
     with tempfile.TemporaryDirectory(prefix="me2e-profile-") as folder:
         session = Session(

@@ -42,19 +42,19 @@ def read_import(path: Path) -> Imported:
         EvaluationError: it is missing, or of no such form.
     """
     with documents.reading(path, EvaluationError, FORMATS):
-        found = documents.from_json(documents.content(path))
-        if isinstance(found, dict):
+        document = documents.from_json(documents.content(path))
+        if isinstance(document, dict):
             trace = LatencyTrace.load(path)
             return Imported(trace.samples_us, trace.machine or "a trace")
         # A list is trtexec's; a profile begins with a count.
-        first = next((each for each in found if isinstance(each, dict)), {})
+        first = next((each for each in document if isinstance(each, dict)), {})
         if "count" not in first:
-            times = TypeAdapter(_Some[_Time]).validate_python(found)
+            times = TypeAdapter(_Some[_Time]).validate_python(document)
             samples = tuple(round(1e3 * each.latencyMs) for each in times)
             return Imported(samples, "times of trtexec")
         # Sum layers of the same name: trtexec repeats the names in loops.
         layers = dict[str, int]()
-        for each in TypeAdapter(_Some[_Layer]).validate_python(found[1:]):
+        for each in TypeAdapter(_Some[_Layer]).validate_python(document[1:]):
             taken = layers.get(each.name, 0) + round(1e3 * each.averageMs)
             layers[each.name] = taken
         by_cost = sorted(layers.items(), key=lambda item: -item[1])

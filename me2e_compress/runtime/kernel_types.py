@@ -58,7 +58,7 @@ def _given(
 
     None where a type is not known, or is one that onnxruntime casts by itself.
     """
-    found = dict[tuple[str, str], str]()
+    plain_types = dict[tuple[str, str], str]()
     sides = ((node.inputs, schema.inputs), (node.outputs, schema.outputs))
     for values, formals in sides:
         for index, value in enumerate(values):
@@ -73,19 +73,19 @@ def _given(
             word = kind.name.lower()
             for name in (formal.type_str, formal.name):
                 plain = "float64" if kind == ir.DataType.DOUBLE else word
-                found[name, f"tensor({word})"] = plain
-    return [(name, word, plain) for (name, word), plain in found.items()]
+                plain_types[name, f"tensor({word})"] = plain
+    return [(name, word, plain) for (name, word), plain in plain_types.items()]
 
 
 @functools.cache
 def _schema(op_type: str, opset: int) -> onnx.defs.OpSchema | None:
     """Return an operator's definition; None of what is made of other operators."""
     try:
-        found: Any = onnx.defs.get_schema(op_type, opset, "")  # stubs lack functions
+        schema: Any = onnx.defs.get_schema(op_type, opset, "")  # stubs lack functions
     except onnx.defs.SchemaError:
         return None
-    is_made = found.has_function or found.has_context_dependent_function
-    return None if is_made else found
+    is_made = schema.has_function or schema.has_context_dependent_function
+    return None if is_made else schema
 
 
 def remedy(model: ir.Model, missing: str) -> str:

@@ -42,11 +42,11 @@ class Load:
         return {"others_cores": self.others, "cores": self.cores}
 
     def __str__(self) -> str:
-        said = f"other processes took {self.others:.1f} of {self.cores} cores"
+        load = f"other processes took {self.others:.1f} of {self.cores} cores"
         if not self.busy:
-            return said
+            return load
         return (
-            f"the machine was busy: {said}, and more than {BUSY:.0%} moves latencies;"
+            f"the machine was busy: {load}, and more than {BUSY:.0%} moves latencies;"
             " measure again when it is idle"
         )
 

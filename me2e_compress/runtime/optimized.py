@@ -25,9 +25,9 @@ def optimized(model: ir.Model, provider: Provider = CPU) -> ir.Model:
     with tempfile.TemporaryDirectory(prefix="me2e-optimized-") as folder:
         path = Path(folder) / "model.onnx"
         Session(model, threads=1, int8_kernels=True, rewritten=path, provider=provider)
-        found = ir.load(path)
-        ir.external_data.load_to_model(found)
-    return found
+        compiled = ir.load(path)
+        ir.external_data.load_to_model(compiled)
+    return compiled
 
 
 def with_unique_names(model: ir.Model) -> ir.Model:
@@ -45,18 +45,18 @@ def with_unique_names(model: ir.Model) -> ir.Model:
     return copy
 
 
-def origins(source: ir.Model, found: ir.Model) -> dict[str, ir.Node]:
+def origins(source: ir.Model, compiled: ir.Model) -> dict[str, ir.Node]:
     """Return the source node for each node that runs, by the running node's name.
 
     A fused node maps to the node whose name it keeps, or else to the last one that it
     absorbed. A node that only changes a layout maps to its reader's node, else to its
-    input's. Nodes without a known origin are missing. ``found`` is what
+    input's. Nodes without a known origin are missing. ``compiled`` is what
     :func:`optimized` made of ``source``, whose nodes have unique names.
     """
     names = {str(node.name): node for node in source.graph}
     makers = {str(value.name): node for node in source.graph for value in node.outputs}
     known: dict[ir.Node, ir.Node | None] = {}
-    for node in found.graph:
+    for node in compiled.graph:
         # Match by the name and its prefixes at separators, the longest first; or by an
         # output.
         name = str(node.name)
@@ -66,12 +66,12 @@ def origins(source: ir.Model, found: ir.Model) -> dict[str, ir.Node]:
         made = (makers.get(str(value.name)) for value in node.outputs)
         known[node] = _first(chain(named, made))
     # Take the origin of readers, then of inputs, for the rest.
-    for node in reversed(found.graph):
+    for node in reversed(compiled.graph):
         known[node] = known[node] or _first(
             known.get(reader) for value in node.outputs for reader in value.consumers()
         )
     # Readers may be unknown too: fall back to the inputs.
-    for node in found.graph:
+    for node in compiled.graph:
         known[node] = known[node] or _first(
             known.get(maker)
             for value in node.inputs
@@ -80,5 +80,5 @@ def origins(source: ir.Model, found: ir.Model) -> dict[str, ir.Node]:
     return {str(node.name): each for node, each in known.items() if each is not None}
 
 
-def _first(found: Iterable[ir.Node | None]) -> ir.Node | None:
-    return next((each for each in found if each is not None), None)
+def _first(nodes: Iterable[ir.Node | None]) -> ir.Node | None:
+    return next((each for each in nodes if each is not None), None)

@@ -137,20 +137,20 @@ class PlanAdapter(pydantic.BaseModel):
         if text is None:
             return cls(output=DEFAULT_OUTPUT) if DEFAULT_OUTPUT in outputs else None
         try:
-            found = cls.model_validate(documents.from_json(text))
+            adapter = cls.model_validate(documents.from_json(text))
         except (documents.MalformedError, pydantic.ValidationError) as error:
             first = str(error).splitlines()[0]
             raise GraphError(
                 f"metadata {PLAN} is not a plan adapter: {first}"
             ) from error
         # A name that is not an output is an error here.
-        for named in (found.output, found.scores):
+        for named in (adapter.output, adapter.scores):
             if named is not None and named not in outputs:
                 raise GraphError(
                     f"metadata {PLAN} names output {named}; there is"
                     f" {', '.join(outputs)}"
                 )
-        return found
+        return adapter
 
     def plan(self, outputs: Arrays, inputs: Arrays) -> npt.NDArray[np.float64]:
         """Return the waypoints, metres in the model's frame, float64 [waypoints, 2].

@@ -136,14 +136,14 @@ def _copied(model: Path) -> str | None:
 @functools.cache
 def _checked(path: Path, expected: str) -> Path:
     try:
-        found = hashlib.sha256(path.read_bytes()).hexdigest()
+        digest = hashlib.sha256(path.read_bytes()).hexdigest()
     except OSError as error:
         raise GraphError(
             f"{path}: cannot be read: {error.strerror}; expected sha256 {expected}"
         ) from error
-    if found != expected:
+    if digest != expected:
         raise GraphError(
-            f"{path}: altered or incomplete: sha256 {found}, expected {expected}"
+            f"{path}: altered or incomplete: sha256 {digest}, expected {expected}"
         )
     return path
 

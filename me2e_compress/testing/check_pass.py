@@ -81,6 +81,6 @@ def _check_exact(
     require(not second.changes, f"{current.name} is not idempotent: {again}")
     # the outputs are the same
     inputs = VerificationInputs.of(before, context.frames, context.seed, 2)
-    found = equivalence.verify((current.name,), before, after, inputs)
-    if not found.passed:
-        raise VerificationError(f"{current.name} moved the outputs: {found.errors}")
+    check = equivalence.verify((current.name,), before, after, inputs)
+    if not check.passed:
+        raise VerificationError(f"{current.name} moved the outputs: {check.errors}")

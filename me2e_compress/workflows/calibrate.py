@@ -81,9 +81,9 @@ class CalibrateResult(Result):
 
     def to_json(self) -> object:
         """Return the ranges and the tensors that are always zero."""
-        found = self.ranges
-        own = {**dataclasses.asdict(found), "dead": found.dead}
-        own |= {"outliers": found.outliers, "findings": self.findings}
+        ranges = self.ranges
+        own = {**dataclasses.asdict(ranges), "dead": ranges.dead}
+        own |= {"outliers": ranges.outliers, "findings": self.findings}
         return {**own, "overrides": self.overrides}
 
 

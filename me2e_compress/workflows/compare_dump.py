@@ -54,11 +54,11 @@ class DumpResult(Result):
     def shown(self) -> Shown:
         """Return what every output lost to what, and where the inside differs."""
         worst = min(self.outputs, key=lambda each: each.compilation_db)
-        said = "the engine answers as its graph does"
+        verdict = "the engine answers as its graph does"
         if worst.compilation_db < SAME_DB:
-            said = "compilation: the engine, or its host, does not answer as its graph"
-            said += " does"
-        headline = f"{said} (least: {worst.name}, {worst.compilation_db:.1f} dB)"
+            verdict = "compilation: the engine, or its host, does not answer as its"
+            verdict += " graph does"
+        headline = f"{verdict} (least: {worst.name}, {worst.compilation_db:.1f} dB)"
         rows = [
             (
                 each.name,

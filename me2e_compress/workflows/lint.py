@@ -62,8 +62,8 @@ class LintResult(Result):
     @property
     def refusal(self) -> str | None:
         """Why the target would refuse the graph, in one line; None if it would not."""
-        if said := self._first("error", f"{self.options.target} refuses it"):
-            return said
+        if reason := self._first("error", f"{self.options.target} refuses it"):
+            return reason
         if self.build is not None and not self.build.passed:
             return f"{self.model}: {self.build.refusal}"
         return None
@@ -75,12 +75,12 @@ class LintResult(Result):
 
     def _first(self, severity: Severity, what: str) -> str | None:
         """Count the findings of a severity, and tell the first."""
-        found = [each for each in self.findings if each.severity == severity]
-        if not found:
+        matches = [each for each in self.findings if each.severity == severity]
+        if not matches:
             return None
-        first, noun = found[0], "error" if severity == "error" else "finding"
+        first, noun = matches[0], "error" if severity == "error" else "finding"
         return (
-            f"{self.model}: {what}, {counted(len(found), noun)};"
+            f"{self.model}: {what}, {counted(len(matches), noun)};"
             f" {first.rule} {first.node!r}: {first.message}"
         )
 
@@ -126,7 +126,7 @@ class LintResult(Result):
         """The number of findings of each severity, by our own rules and tables."""
         counts = Counter(each.severity for each in self.findings)
         always = ("error", "warning")
-        said = [
+        parts = [
             counted(counts[each], each) if each in always else f"{counts[each]} {each}"
             for each in SEVERITIES
             if counts[each] or each in always
@@ -134,7 +134,7 @@ class LintResult(Result):
         asked = self.options.target, self.options.target_version
         runtime = " ".join(filter(None, asked))
         return (
-            f"{self.model.name} for {runtime}: {', '.join(said)}"
+            f"{self.model.name} for {runtime}: {', '.join(parts)}"
             " (our own rules and operator tables)"
         )
 
@@ -144,8 +144,8 @@ class LintResult(Result):
         for each in self.findings:
             rows.setdefault((each.severity, each.rule), []).append(each)
         return tuple(
-            RuleSummary(*key, len(found), found[0].node, found[0].message)
-            for key, found in rows.items()
+            RuleSummary(*key, len(of_rule), of_rule[0].node, of_rule[0].message)
+            for key, of_rule in rows.items()
         )
 
     def to_json(self) -> object:
@@ -172,20 +172,20 @@ def lint(
     loaded = graph.load(path)
     options = asked_of(loaded, options or LintOptions())
     judge, provider = _judge(options), options.runs_on
-    found = judge.lint(loaded)
+    findings = judge.lint(loaded)
     if provider.native != CPU.native:  # the list of kernels is the CPU's
-        found = tuple(each for each in found if each.rule != "kernel")
+        findings = tuple(each for each in findings if each.rule != "kernel")
     # a graph that the rules refuse is not opened
-    if not any(each.severity == "error" for each in found):
+    if not any(each.severity == "error" for each in findings):
         if judge.opens:
             try_first(loaded, path.name, listener=listener, provider=provider)
         # a node that a rule has named already is not named again
-        known = {each.node for each in found if each.rule == "float-answer"}
+        known = {each.node for each in findings if each.rule == "float-answer"}
         opened = judge.read_back(loaded, provider)
         new = [each for each in opened if each.node not in known]
-        found = worst_first((*found, *new))
+        findings = worst_first((*findings, *new))
     build = check(loaded, options.sm) if options.trt_check else None
-    return LintResult(path, options, found, build)
+    return LintResult(path, options, findings, build)
 
 
 def asked_of(model: ir.Model, options: LintOptions) -> LintOptions:
@@ -222,5 +222,5 @@ def lint_written(
     if not targets:
         return None
     options = LintOptions(target=targets[-1])
-    found = _judge(options).lint(with_own_domains(model))
-    return LintResult(Path(output.name), options, found, asked=asked is not None)
+    findings = _judge(options).lint(with_own_domains(model))
+    return LintResult(Path(output.name), options, findings, asked=asked is not None)

@@ -156,8 +156,8 @@ class Feed(BaseModel):
 
     def sizes(self, seen: Observed) -> str:
         """Name the sources with their element counts, for messages."""
-        found = ((p.source.name, p.source.value(seen).size) for p in self.parts)
-        return ", ".join(f"{name} {size}" for name, size in found)
+        parts = ((p.source.name, p.source.value(seen).size) for p in self.parts)
+        return ", ".join(f"{name} {size}" for name, size in parts)
 
     @property
     def command(self) -> NavigationCommand | None:
@@ -242,13 +242,13 @@ class Adapter(BaseModel):
             **{name: each.answer for name, each in named if each.answer is not None},
         }
         # the plan's mode may be picked by an input of another name
-        said = {RECURRENT: json.dumps(pairs)} if pairs else {}
+        metadata = {RECURRENT: json.dumps(pairs)} if pairs else {}
         if self.plan is not None:
             picks = self.plan.command_input
             renamed = self.inputs.get("command") if picks == "command" else None
             plan = self.plan.model_copy(update={"command_input": renamed or picks})
-            said[PLAN] = plan.model_dump_json(exclude_none=True)
-        return said
+            metadata[PLAN] = plan.model_dump_json(exclude_none=True)
+        return metadata
 
     def to_ego(self, waypoints: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
         """Turn [n, 2] waypoints of the model's frame into the ego frame."""

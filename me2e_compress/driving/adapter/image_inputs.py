@@ -212,13 +212,13 @@ class ImagePort:
             )
             or ("n" not in layout and pictures > 1)
         ):
-            said = f"input {name} has shape {list(shape)}, it must be "
+            problem = f"input {name} has shape {list(shape)}, it must be "
             if table == ImageInput():
                 raise EvaluationError(
-                    f"{said}[1, 6, 3, 'any', 'any'], or [images.{name}] say which"
+                    f"{problem}[1, 6, 3, 'any', 'any'], or [images.{name}] say which"
                     " cameras it shows"
                 )
-            raise EvaluationError(f"{said}{wanted}")
+            raise EvaluationError(f"{problem}{wanted}")
         # open sides take the table's size, or the default
         rows, columns = (shape[layout.index(letter)] for letter in "hw")
         usual_rows, usual_columns = table.size or DEFAULT_IMAGE_SIZE
@@ -298,13 +298,13 @@ class InputImages:
     def check(self, name: str) -> None:
         """Check that no crop is empty, and that crops to stitch have one height."""
         rows, columns = self.rendered
-        said = f"input {name}: of cameras rendered in {rows} x {columns}"
+        problem = f"input {name}: of cameras rendered in {rows} x {columns}"
         if not all(a < c and b < d for a, b, c, d in self.windows):
-            raise EvaluationError(f"{said}, a crop has no pixel")
+            raise EvaluationError(f"{problem}, a crop has no pixel")
         heights = sorted({bottom - top for _, top, _, bottom in self.windows})
         if self.table.stitch and len(heights) > 1:
             raise EvaluationError(
-                f"{said}, the crops that are stitched have {heights[0]} and"
+                f"{problem}, the crops that are stitched have {heights[0]} and"
                 f" {heights[-1]} rows: choose crops or a rendered size that divide"
             )
 

@@ -102,8 +102,8 @@ class ModelInputs:
     @property
     def normalization(self) -> ImageNormalization | None:
         """How the first image input is normalised; None if it is not."""
-        found = (each.normalization for each in self.images.values())
-        return next(found, None)
+        normalizations = (each.normalization for each in self.images.values())
+        return next(normalizations, None)
 
     @property
     def cameras(self) -> tuple[int, ...]:
@@ -158,18 +158,18 @@ class ModelInputs:
         nothing = self.nothing(0)
         self._track.note(0, nothing.motion)
         # what feeds an input must be there, and fit
-        seen, found = self._seen(nothing), dict[str, str]()
+        seen, faults = self._seen(nothing), dict[str, str]()
         for name, feed in self.given.items():
             try:
                 array, sizes = feed.value(seen), feed.sizes(seen)
             except EvaluationError as error:
-                found[name] = f"input {name}: {error}"
+                faults[name] = f"input {name}: {error}"
                 continue
             sizes = sizes if feed.joined else ""
             if fault := _fault(name, self.ports[name], array, sizes):
-                found[name] = fault
+                faults[name] = fault
         self._track.clear()
-        return found
+        return faults
 
 
 def contract_names(adapter: Adapter) -> dict[str, str]:
@@ -183,7 +183,7 @@ def _images(
     """Return the image inputs, the size of the cameras, and what does not fit."""
     ports: dict[str, ImagePort] = {}
     sizes: list[tuple[int, int]] = []
-    found: dict[str, InputImages] = {}
+    images: dict[str, InputImages] = {}
     faults: dict[str, str] = {}
     # one rendered size serves all inputs: the largest that any of them asks for
     for name, table in tables.items():
@@ -205,10 +205,10 @@ def _images(
                 norm = tables[name].normalization(name, usual)
             made = InputImages(tables[name], port, rendered, norm)
             made.check(name)
-            found[name] = made
+            images[name] = made
         except EvaluationError as error:
             faults[name] = str(error)
-    return found, rendered, faults
+    return images, rendered, faults
 
 
 def _check_names(
@@ -239,13 +239,13 @@ def _exists(name: str, ports: Mapping[str, SessionPort], kind: str) -> None:
 
 def _fault(name: str, port: SessionPort, array: Array, sizes: str) -> str:
     """Say how an array does not fit a port, which may have a batch of one before it."""
-    found: Shape = port.shape
-    batch = found[: max(0, len(found) - array.ndim)]
+    shape: Shape = port.shape
+    batch = shape[: max(0, len(shape) - array.ndim)]
     if any(isinstance(side, int) and side != 1 for side in batch) or not fits(
-        found[len(batch) :], array.shape
+        shape[len(batch) :], array.shape
     ):
-        said = f"input {name} has shape {list(found)}, it must be {[1, *array.shape]}"
-        return f"{said}: it is {sizes}" if sizes else said
+        fault = f"input {name} has shape {list(shape)}, it must be {[1, *array.shape]}"
+        return f"{fault}: it is {sizes}" if sizes else fault
     # the types must agree
     if not np.can_cast(array.dtype, DTYPES[port.type], "same_kind"):
         return f"input {name} is {port.type}, and what feeds it {array.dtype}"

@@ -230,26 +230,26 @@ class Bench2DriveResults(Evaluator):
         yield from self.collect().episodes
 
     def collect(self) -> CollectedResults:
-        """Read everything, and report what was found besides the episodes."""
-        found = find_files(self.folder)
+        """Read everything, and report what was files besides the episodes."""
+        files = find_files(self.folder)
         if self.metrics is not None:
             apart = find_files(self.metrics)
-            found.recordings += apart.recordings
-            found.decisions += apart.decisions
+            files.recordings += apart.recordings
+            files.decisions += apart.decisions
         # links may lead to the same file twice
-        for paths in (found.recordings, found.decisions):
+        for paths in (files.recordings, files.decisions):
             paths[:] = {path.resolve(): path for path in paths}.values()
-        if not any(file.records for file in found.results):
+        if not any(file.records for file in files.results):
             # the first of what could be the cause
             none = "no results of a leaderboard"
-            whys = [f"{none}: {path.name}: {why}" for path, why in found.broken.items()]
-            for file in found.results:
+            whys = [f"{none}: {path.name}: {why}" for path, why in files.broken.items()]
+            for file in files.results:
                 for place, why in file.broken.items():
                     record = f"{file.path.name}: record {place}"
                     whys.append(f"no whole record: {record}: {why}")
-            whys += (f"no record: {e.path.name} holds none" for e in found.results)
+            whys += (f"no record: {e.path.name} holds none" for e in files.results)
             raise EvaluationError(f"{self.folder}: {[*whys, f'{none} below it'][0]}")
-        return CollectedResults.of(found, self.route_file)
+        return CollectedResults.of(files, self.route_file)
 
 
 def _by_number(number: str) -> tuple[int, str]:

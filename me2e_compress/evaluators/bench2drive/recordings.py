@@ -159,7 +159,7 @@ class _Line(BaseModel):
 
 def read_decisions(path: Path) -> tuple[InferenceRecord, ...]:
     """Read a ``decisions.jsonl``."""
-    found = list[InferenceRecord]()
+    decisions = list[InferenceRecord]()
     lines = documents.content(path, documents.LARGEST_LOG_BYTES).splitlines()
     for number, line in enumerate(lines, 1):
         try:
@@ -167,5 +167,5 @@ def read_decisions(path: Path) -> tuple[InferenceRecord, ...]:
         except (documents.MalformedError, ValidationError) as error:
             raise BrokenRecordingError(f"line {number} is no decision") from error
         time_us = round(1e6 * TICK_S * noted.frame)
-        found.append(InferenceRecord(time_us, noted.latency_us))
-    return tuple(found)
+        decisions.append(InferenceRecord(time_us, noted.latency_us))
+    return tuple(decisions)

@@ -49,8 +49,8 @@ class RouteNodes:
         """Return [2, 2] the next two nodes from an arc length, in the ego frame."""
         last = len(self.points) - 1
         index = int(np.searchsorted(self.stations_m, station_m + REACHED_M, "right"))
-        found = self.points[[min(index, last), min(index + 1, last)]]
-        return ego.seen(*found.T).astype(np.float32)
+        ends = self.points[[min(index, last), min(index + 1, last)]]
+        return ego.seen(*ends.T).astype(np.float32)
 
 
 @dataclass
@@ -103,8 +103,8 @@ ROAD_USERS = (
 
 def road_users(scene: Scene) -> npt.NDArray[np.float64]:
     """Return [N, 2] positions of road users, metres in the ego frame."""
-    found = [(each.x, each.y) for each in scene.actors if each.kind in ROAD_USERS]
-    return scene.ego.seen(*np.array(found, np.float64).reshape(-1, 2).T)
+    places = [(each.x, each.y) for each in scene.actors if each.kind in ROAD_USERS]
+    return scene.ego.seen(*np.array(places, np.float64).reshape(-1, 2).T)
 
 
 def can_bus_of(ego: Ego, last: Ego | None) -> npt.NDArray[np.float32]:

@@ -113,17 +113,17 @@ def behind_a_prefix(modules: ModuleMap, paths: Iterable[str]) -> str:
     The prefix behind which most of its patterns match a path is named, with the first
     of them.
     """
-    found: dict[str, dict[tuple[str, str], None]] = {}
+    matches: dict[str, dict[tuple[str, str], None]] = {}
     for path in paths:
         parts = [part for part in path.split(".") if part]
         for depth in range(1, min(_DEEPEST, len(parts) - 1) + 1):
             if claims := modules.claims(".".join(parts[depth:])):
                 prefix = ".".join(parts[:depth])
-                found.setdefault(prefix, {}).update(dict.fromkeys(claims))
+                matches.setdefault(prefix, {}).update(dict.fromkeys(claims))
     # a pattern that matches anywhere matches without a prefix, too
     named = {
         prefix: [text for _, text in claims if not PathGlob(text).anywhere]
-        for prefix, claims in found.items()
+        for prefix, claims in matches.items()
     }
     best = max(named, key=lambda prefix: (len(named[prefix]), -len(prefix)), default="")
     if not best or not named[best]:
@@ -240,24 +240,24 @@ def _spread(
     """
     # sweep 1, then 2: from producers to consumers
     place = {node: index for index, node in enumerate(nodes)}
-    found = dict(known) | _single_destinations(nodes, known)
+    modules = dict(known) | _single_destinations(nodes, known)
     for node in nodes:
-        if node in found or node in constant:
+        if node in modules or node in constant:
             continue
         makers = [value.producer() for value in node.inputs if value is not None]
-        heard = [m for m in makers if m in found and m not in constant]
+        heard = [m for m in makers if m in modules and m not in constant]
         if heard:
-            found[node] = found[max(heard, key=place.__getitem__)]
+            modules[node] = modules[max(heard, key=place.__getitem__)]
     # sweep 3: from consumers to producers
     for node in reversed(nodes):
-        heard = [reader for reader in _readers(node) if reader in found]
-        if node not in found and heard:
-            found[node] = found[min(heard, key=place.__getitem__)]
+        heard = [reader for reader in _readers(node) if reader in modules]
+        if node not in modules and heard:
+            modules[node] = modules[min(heard, key=place.__getitem__)]
     # sweep 4: along the graph's order
-    last = next(found[node] for node in nodes if node in found)
+    last = next(modules[node] for node in nodes if node in modules)
     for node in nodes:
-        last = found.setdefault(node, last)
-    return found
+        last = modules.setdefault(node, last)
+    return modules
 
 
 def _single_destinations(
@@ -280,18 +280,18 @@ def _readers(node: ir.Node) -> list[ir.Node]:
 
 def is_constant(nodes: Sequence[ir.Node]) -> frozenset[ir.Node]:
     """Return the nodes that compute from constants alone; nodes come in graph order."""
-    found: set[ir.Node] = set()
+    constant: set[ir.Node] = set()
     for node in nodes:
         if has_subgraph(node):
             continue
         if all(
-            value.producer() in found
+            value.producer() in constant
             or (value.is_initializer() and not value.is_graph_input())
             for value in node.inputs
             if value is not None
         ):
-            found.add(node)
-    return frozenset(found)
+            constant.add(node)
+    return frozenset(constant)
 
 
 def by_parameter(

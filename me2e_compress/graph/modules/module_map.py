@@ -335,12 +335,12 @@ class ModuleMap:
     def claims(self, path: str) -> list[tuple[str, str]]:
         """List every (module, pattern) that matches a path, the winner first."""
         parts = self._parts(path)
-        found = [
+        matches = [
             (-reach, -len(glob.components), order, module, glob.text)
             for order, (module, glob) in enumerate(self._globs)
             if (reach := glob.reach(parts)) is not None
         ]
-        return [(module, text) for _, _, _, module, text in sorted(found)]
+        return [(module, text) for _, _, _, module, text in sorted(matches)]
 
     def required(self) -> list[tuple[str, str]]:
         """List every (module, pattern) that must match something."""

@@ -145,7 +145,7 @@ class Fusion:
 def needs_opset(what: str, version: int) -> Callable[[Match, Facts], str | None]:
     """Build the check that an operator is there in the model's opset."""
 
-    def check(found: Match, facts: Facts) -> str | None:
+    def check(match: Match, facts: Facts) -> str | None:
         return None if facts.opset >= version else f"{what} needs opset {version}"
 
     return check
@@ -229,19 +229,19 @@ class _Run:
     def _attempt(
         self, fusion: Fusion, node: ir.Node, body: ir.Graph, refused: Counter[str]
     ) -> bool:
-        found = match(fusion.pattern, node)
-        if found is None or (fusion.where and not fusion.where(found, self.facts)):
+        matched = match(fusion.pattern, node)
+        if matched is None or (fusion.where and not fusion.where(matched, self.facts)):
             return False
-        reason = fusion.check(found, self.facts) if fusion.check else None
+        reason = fusion.check(matched, self.facts) if fusion.check else None
         if reason is None:
-            reason = fusion.rewrite(found, Kit(body, found, self.by, self.names))
+            reason = fusion.rewrite(matched, Kit(body, matched, self.by, self.names))
         if reason is not None:
             refused[reason] += 1
             return False
         # The nodes of the match that nothing reads any more go, readers first
         while dead := [
             each
-            for each in found.nodes
+            for each in matched.nodes
             if each.graph is body and not any(map(is_read, each.outputs))
         ]:
             for each in dead:

@@ -239,14 +239,14 @@ class Product(Pattern):
 
     def ways(self, value: ir.Value) -> Iterator[Way]:
         """Take the value apart; try the factors in each order."""
-        found = factors_of(value)
-        if found is None or len(found.factors) != len(self.factors):
+        product = factors_of(value)
+        if product is None or len(product.factors) != len(self.factors):
             return
-        if not is_close(found.scale, self.scale):
+        if not is_close(product.scale, self.scale):
             return
-        nodes = tuple(found.nodes)
+        nodes = tuple(product.nodes)
         inner = tuple(node.outputs[0] for node in nodes)
-        for factors in itertools.permutations(found.factors):
+        for factors in itertools.permutations(product.factors):
             yield Way(tuple(zip(self.factors, factors, strict=True)), nodes, inner)
 
 
@@ -329,10 +329,10 @@ class Match:
         Raises:
             GraphError: nothing makes it, it is an input or a weight.
         """
-        found = self.values[part].producer()
-        if found is None:
+        producer = self.values[part].producer()
+        if producer is None:
             raise GraphError(f"no node makes {self.values[part].name}")
-        return found
+        return producer
 
     def array(self, part: Pattern) -> Array:
         """Return the array of a constant part, as it is stored.
@@ -340,10 +340,10 @@ class Match:
         Raises:
             GraphError: it is not a constant.
         """
-        found = array_of(self.values[part])
-        if found is None:
+        constant = array_of(self.values[part])
+        if constant is None:
             raise GraphError(f"{self.values[part].name} is not a constant")
-        return found
+        return constant
 
     def numbers(self, part: Pattern) -> Numbers:
         """Return the array of a constant part, widened to float64."""
@@ -358,36 +358,36 @@ def match(pattern: Pattern, node: ir.Node) -> Match | None:
 
 
 def _solve(
-    goals: tuple[Goal, ...], found: Match, inner: tuple[ir.Value, ...]
+    goals: tuple[Goal, ...], match: Match, inner: tuple[ir.Value, ...]
 ) -> Match | None:
     """Match the first goal in each of its ways until the rest matches too."""
     if not goals:
         # Nothing else may read what the inner nodes make
-        last = found.root.outputs[0]
-        closed = all(value is last or _is_inside(value, found) for value in inner)
-        return found if closed else None
+        last = match.root.outputs[0]
+        closed = all(value is last or _is_inside(value, match) for value in inner)
+        return match if closed else None
     (pattern, value), rest = goals[0], goals[1:]
-    if pattern in found.values:
-        if not pattern.agree(found.values[pattern], value):
+    if pattern in match.values:
+        if not pattern.agree(match.values[pattern], value):
             return None
-        return _solve(rest, found, inner)
-    values = {**found.values, pattern: value}
+        return _solve(rest, match, inner)
+    values = {**match.values, pattern: value}
     for way in pattern.ways(value):
-        taken = tuple(dict.fromkeys((*found.nodes, *way.nodes)))
+        taken = tuple(dict.fromkeys((*match.nodes, *way.nodes)))
         solved = _solve(
-            way.goals + rest, Match(found.root, taken, values), inner + way.inner
+            way.goals + rest, Match(match.root, taken, values), inner + way.inner
         )
         if solved is not None:
             return solved
     return None
 
 
-def _is_inside(value: ir.Value, found: Match) -> bool:
+def _is_inside(value: ir.Value, match: Match) -> bool:
     maker = value.producer()
     return (
         maker is not None
-        and maker.graph is found.root.graph
+        and maker.graph is match.root.graph
         and not value.is_graph_output()
         and not any(is_read(other) for other in maker.outputs[1:])
-        and all(reader in found.nodes for reader in value.consumers())
+        and all(reader in match.nodes for reader in value.consumers())
     )

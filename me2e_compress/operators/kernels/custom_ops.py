@@ -71,8 +71,8 @@ _register = ctypes.CFUNCTYPE(_POINTER, _POINTER, _POINTER)(_add)
 
 def _api(base: int) -> Any:
     get = ctypes.cast(base, ctypes.POINTER(_POINTER))[0]
-    found = ctypes.CFUNCTYPE(_POINTER, ctypes.c_uint32)(get)(abi.API_VERSION)
-    return ctypes.cast(found, ctypes.POINTER(_POINTER))
+    table = ctypes.CFUNCTYPE(_POINTER, ctypes.c_uint32)(get)(abi.API_VERSION)
+    return ctypes.cast(table, ctypes.POINTER(_POINTER))
 
 
 _KEPT: list[object] = []
@@ -82,7 +82,7 @@ _KEPT: list[object] = []
 def _operator(kernel: CompiledKernel, compute: int, block: int, base: int) -> Any:
     """Write an ``OrtCustomOp``, followed by the state of its kernels."""
     name = ctypes.create_string_buffer(kernel.op_type.encode())
-    said = [
+    texts = [
         ctypes.create_string_buffer(f"{kernel.op_type}: {each}".encode())
         for each in kernel.messages
     ]
@@ -109,10 +109,10 @@ def _operator(kernel: CompiledKernel, compute: int, block: int, base: int) -> An
     # The state of its kernels follows the struct
     api = _api(base)
     state = [api[place] for place in abi.CALLED_BY_KERNELS]
-    state += [block, _memory(base), *map(ctypes.addressof, said)]
+    state += [block, _memory(base), *map(ctypes.addressof, texts)]
     for index, word in enumerate(state):
         written[STATE_OFFSET // 8 + index] = word
-    _KEPT.extend((name, said, callbacks, written))
+    _KEPT.extend((name, texts, callbacks, written))
     return written
 
 
@@ -134,6 +134,6 @@ def _answer(result: Any, function: Callable[..., Any], *arguments: Any) -> Any:
 
 
 def _address(callback: Any) -> int:
-    found = ctypes.cast(callback, _POINTER).value
-    assert found is not None
-    return found
+    address = ctypes.cast(callback, _POINTER).value
+    assert address is not None
+    return address

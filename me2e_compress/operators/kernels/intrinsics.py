@@ -112,8 +112,8 @@ _slot = stack(types.int64, 1)
 @compiled
 def refused(t: Any, message: int) -> Word:
     """Return the status with a kernel's message, by index."""
-    create, said = t[abi.CREATE_STATUS], t[abi.MESSAGES + message]
-    return call(create, abi.INVALID_ARGUMENT, said, 0, 0, 0)
+    create, text = t[abi.CREATE_STATUS], t[abi.MESSAGES + message]
+    return call(create, abi.INVALID_ARGUMENT, text, 0, 0, 0)
 
 
 @compiled

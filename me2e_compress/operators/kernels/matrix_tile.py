@@ -173,10 +173,10 @@ class _Product:
             self.simd.store(total, place, mask)
 
     def _from(self, one: Any, two: Any, first: Any, second: Any) -> Any:
-        found = self.builder.phi(one.type)
-        found.add_incoming(one, first)
-        found.add_incoming(two, second)
-        return found
+        phi = self.builder.phi(one.type)
+        phi.add_incoming(one, first)
+        phi.add_incoming(two, second)
+        return phi
 
     def _places(self, row: Any, column: Any, rows: int, vectors: int) -> list[Any]:
         builder, places = self.builder, []

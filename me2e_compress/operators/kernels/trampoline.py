@@ -126,11 +126,11 @@ def private(folder: Path) -> Path | None:
     """Return a folder of mode 0700, made if needed; None if others may write to it."""
     try:
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-        found = folder.stat()
+        status = folder.stat()
     except OSError:
         return None
     others = stat.S_IWGRP | stat.S_IWOTH
-    mine = found.st_uid == os.getuid() and not found.st_mode & others
+    mine = status.st_uid == os.getuid() and not status.st_mode & others
     return folder if mine and os.access(folder, os.W_OK | os.X_OK) else None
 
 
@@ -159,9 +159,9 @@ class Trampoline:
 
     def address(self, name: str) -> int:
         """Return the address of a function."""
-        found = ctypes.cast(getattr(self.library, name), ctypes.c_void_p).value
-        assert found is not None
-        return found
+        address = ctypes.cast(getattr(self.library, name), ctypes.c_void_p).value
+        assert address is not None
+        return address
 
     def fill(self, callback: int) -> None:
         """Set the address that ``RegisterCustomOps`` jumps to."""

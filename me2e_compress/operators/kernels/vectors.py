@@ -53,16 +53,16 @@ class Vectors:
     def fetch(self, place: Any) -> None:
         """Begin to bring what is there into the caches; nothing need be there."""
         kind = ir.FunctionType(ir.VoidType(), [place.type, INT, INT, INT])
-        found = cgutils.get_or_insert_function(
+        function = cgutils.get_or_insert_function(
             self.builder.module, kind, "llvm.prefetch.p0"
         )
-        self.builder.call(found, [place, INT(0), INT(3), INT(1)])
+        self.builder.call(function, [place, INT(0), INT(3), INT(1)])
 
     def _masked(self, name: str, result: Any, arguments: list[Any]) -> Any:
         kind = ir.FunctionType(result, [each.type for each in arguments])
         name = f"llvm.masked.{name}.v{self.lanes}f32.p0"
-        found = cgutils.get_or_insert_function(self.builder.module, kind, name)
-        return self.builder.call(found, arguments)
+        function = cgutils.get_or_insert_function(self.builder.module, kind, name)
+        return self.builder.call(function, arguments)
 
     def within(self, first: Any, limit: Any) -> Any:
         """Return the lanes whose position, counted from ``first``, is in 0..limit."""

@@ -238,17 +238,17 @@ def wide_nodes(
     """
     # Operators, constants and positions decide without running the graph
     places = position_arithmetic(model, constant_values(model))
-    found: dict[ir.Node, str] = {}
+    reasons: dict[ir.Node, str] = {}
     for node in model.graph:
         reason = _by_operator(node) or _by_constants(node, types)
         if reason is None and node in places:
             reason = "positions: a half is right to 1/2048"
         if reason is not None:
-            found[node] = reason
+            reasons[node] = reason
     # Measured ranges and the nodes in between come last
     if frames is not None:
-        found |= _by_ranges(model, types, found, frames, provider)
-    return found | _between(model, found)
+        reasons |= _by_ranges(model, types, reasons, frames, provider)
+    return reasons | _between(model, reasons)
 
 
 def _by_operator(node: ir.Node) -> str | None:

@@ -365,12 +365,12 @@ class Sweep:
         if any(value is not None and value not in arrays for value in one.inputs):
             return None
         try:
-            found = run([one], [output], arrays, self.opset)[output]
+            array = run([one], [output], arrays, self.opset)[output]
         except REFUSALS:
             return None
         # It may be a sequence, or have another shape than the file claims
-        is_array = isinstance(found, np.ndarray) and found.shape == expected
-        return found if is_array else None
+        is_array = isinstance(array, np.ndarray) and array.shape == expected
+        return array if is_array else None
 
 
 def _shape(node: ir.Node, shape: tuple[int, ...]) -> Array:

@@ -60,7 +60,7 @@ def find_ego_layers(
     that no input changes.
     """
     sources = dict(_statuses(model))
-    found: dict[ir.Node, str] = {}
+    layers: dict[ir.Node, str] = {}
     for node in model.graph if sources else ():
         reads = [each for each in node.inputs if each is not None]
         changing = [each for each in reads if each not in constants]
@@ -69,11 +69,11 @@ def find_ego_layers(
         # its results are a status too, while they are small
         name = sources[changing[0]]
         if node.op_type in WEIGHTED:
-            found[node] = name
+            layers[node] = name
         sizes = [_elements(value) for value in node.outputs]
         if all(size is not None and size <= LARGEST for size in sizes):
             sources.update(dict.fromkeys(node.outputs, name))
-    return found
+    return layers
 
 
 def _statuses(model: ir.Model) -> Iterator[tuple[ir.Value, str]]:

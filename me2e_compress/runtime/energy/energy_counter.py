@@ -224,9 +224,9 @@ def check_counter(text: str) -> None:
     Raises:
         EnergyError: no such counter, an unknown option, or a file that is not usable.
     """
-    found = open_counter(text)
-    if isinstance(found, Reader):
-        found.close()
+    counter = open_counter(text)
+    if isinstance(counter, Reader):
+        counter.close()
 
 
 def integrated(times_s: Floats, watts: Floats) -> Floats:
@@ -288,15 +288,15 @@ def _recording(columns: Mapping[str, Sequence[str]], name: str) -> EnergyRecordi
         raise ValueError(f"frames go back at row {_row(np.diff(frames) < 0)}")
     # Check the columns against each other.
     counts = "joules" in columns
-    found = _numbers(columns, "joules" if counts else "watts")
-    if len({len(times), len(frames), len(found)}) > 1 or len(times) < 2:
+    values = _numbers(columns, "joules" if counts else "watts")
+    if len({len(times), len(frames), len(values)}) > 1 or len(times) < 2:
         raise ValueError("the columns are not of one length of 2 rows or more")
-    if counts and np.any(np.diff(found) < 0):
-        raise ValueError(f"joules go back at row {_row(np.diff(found) < 0)}")
-    if not counts and np.any(found < 0):
-        raise ValueError(f"watts are negative at row {_row(found < 0)}")
+    if counts and np.any(np.diff(values) < 0):
+        raise ValueError(f"joules go back at row {_row(np.diff(values) < 0)}")
+    if not counts and np.any(values < 0):
+        raise ValueError(f"watts are negative at row {_row(values < 0)}")
     # Power is integrated to joules.
-    joules = found if counts else integrated(times, found)
+    joules = values if counts else integrated(times, values)
     counter = "recorded" if counts else "recorded-power-integrated"
     return EnergyRecording(times, joules, frames, name, "as recorded", counter)
 
@@ -305,10 +305,10 @@ def _numbers(columns: Mapping[str, Sequence[str]], name: str) -> Floats:
     if name not in columns:
         there = ", ".join(columns) or "none"
         raise ValueError(f"no column {name}; there are {there}, wanted: {_COLUMNS}")
-    found = np.array([float(each) for each in columns[name]])
-    if not np.all(np.isfinite(found)):
-        raise ValueError(f"{name} is not finite at row {_row(~np.isfinite(found))}")
-    return found
+    values = np.array([float(each) for each in columns[name]])
+    if not np.all(np.isfinite(values)):
+        raise ValueError(f"{name} is not finite at row {_row(~np.isfinite(values))}")
+    return values
 
 
 def _row(wrong: Any) -> int:

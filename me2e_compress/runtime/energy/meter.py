@@ -258,23 +258,23 @@ def measure_energy(
     # Measure, take the recording, or say why there is no counter.
     opened = open_counter(counter)
     if isinstance(opened, Absent):
-        found = dict.fromkeys(models, EnergyResult(reason=opened.reason))
+        results = dict.fromkeys(models, EnergyResult(reason=opened.reason))
     elif isinstance(opened, EnergyRecording):
         if len(models) != 1:
             raise EnergyError(
                 f"energy {counter}: a recording is of one model, and there are"
                 f" {len(models)}: {', '.join(models)}"
             )
-        found = dict.fromkeys(models, opened.measured(schedule or EnergySchedule()))
+        results = dict.fromkeys(models, opened.measured(schedule or EnergySchedule()))
     else:
         with contextlib.closing(opened):
             work = _work_of(models, frames, threads, provider, said)
             meter = EnergyMeter(opened, schedule, on_window=on_window)
-            found = meter.measure(work)
+            results = meter.measure(work)
     # Each result carries the digest of its model's files.
     return {
         name: dataclasses.replace(result, model_sha256=digests[name])
-        for name, result in found.items()
+        for name, result in results.items()
     }
 
 

@@ -98,10 +98,10 @@ class NvmlReader(Reader):
         pynvml.nvmlShutdown()
 
     def _ask(self, question: Callable[[Any], int]) -> int:
-        found = _answer(question, self._handle)
-        if isinstance(found, str):
-            raise EnergyError(f"{self.counter} of {self.device}: {found}")
-        return found
+        answer = _answer(question, self._handle)
+        if isinstance(answer, str):
+            raise EnergyError(f"{self.counter} of {self.device}: {answer}")
+        return answer
 
 
 def _answer(question: Callable[..., T], *arguments: Any) -> T | str:
@@ -114,12 +114,12 @@ def _answer(question: Callable[..., T], *arguments: Any) -> T | str:
 
 def _instant_power(handle: Any) -> int:
     """Return the present milliwatts; nvmlDeviceGetPowerUsage averages over a second."""
-    (found,) = pynvml.nvmlDeviceGetFieldValues(
+    (field,) = pynvml.nvmlDeviceGetFieldValues(
         handle, [pynvml.NVML_FI_DEV_POWER_INSTANT]
     )
-    if found.nvmlReturn != pynvml.NVML_SUCCESS:
-        raise pynvml.NVMLError(found.nvmlReturn)
-    return int(found.value.uiVal)
+    if field.nvmlReturn != pynvml.NVML_SUCCESS:
+        raise pynvml.NVMLError(field.nvmlReturn)
+    return int(field.value.uiVal)
 
 
 def _name(handle: Any) -> str:

@@ -385,7 +385,7 @@ class GroundSampler:
         steps = depth / self.rig.focals_px[camera, None] * right
         centre = self.rig.positions[camera, :2] + depth * forward
         # slices of equal level
-        found, first = np.unique(levels, return_index=True)
+        distinct, first = np.unique(levels, return_index=True)
         last = [*first[1:].tolist(), len(levels)]
         shape = (len(levels), taps, self.rig.width)
         return RowGroup(
@@ -393,7 +393,7 @@ class GroundSampler:
             origins=centre - steps * self.rig.centre_px[0],
             steps=steps,
             levels=levels,
-            blocks=tuple(zip(found.tolist(), first.tolist(), last, strict=True)),
+            blocks=tuple(zip(distinct.tolist(), first.tolist(), last, strict=True)),
             coordinates=(np.empty(shape, np.float32), np.empty(shape, np.float32)),
             samples=np.empty((*shape, 4), np.uint8),
         )

@@ -125,12 +125,12 @@ class RoutePicture:
 
     def words(self, index: int, colour: Colour, row: int) -> list[Text]:
         """Return title, time and speed at a height of the caption; infractions red."""
-        said = f"{self.title}   {_state(self.moments[index])}"
-        texts = [Text(said, 6, row, 15, colour)]
+        caption = f"{self.title}   {_state(self.moments[index])}"
+        texts = [Text(caption, 6, row, 15, colour)]
         done = self.infractions(index)
         if done:
             names = list(dict.fromkeys(e.kind.replace("_", " ") for e in done))
-            left = 6 + text_width(said, 15) + 16
+            left = 6 + text_width(caption, 15) + 16
             texts.append(Text(", ".join(names), left, row, 15, RED))
         return texts
 

@@ -330,7 +330,7 @@ LATE = 0.2
 def walkers_at_light(stage: Stage) -> list[Walker]:
     """Draw people who cross while a light holds back the traffic."""
     random, schedule = stage.random("at_light"), stage.schedule
-    s, found = float(stage.parameters["light_m"]), list[Walker]()
+    s, walkers = float(stage.parameters["light_m"]), list[Walker]()
     plan, across = schedule.plans[-1], stage.light_across_m
     start = plan.begins_s(1)
     while start < HORIZON_S:
@@ -344,9 +344,9 @@ def walkers_at_light(stage: Stage) -> list[Walker]:
             stage.bodies.remove(walker)
             walker.going = walker.crosses = True
             schedule.add(float(at), walker)
-            found.append(walker)
+            walkers.append(walker)
         start += plan.cycle_s
-    return found
+    return walkers
 
 
 def pedestrians_on_exit(stage: Stage, crossing: Crossing) -> Script:

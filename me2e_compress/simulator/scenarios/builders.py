@@ -90,12 +90,12 @@ def _successors(network: Network) -> dict[LaneIndex, list[LaneIndex]]:
     """Return the lanes that begin where a lane ends."""
     lanes = [e for e in network.graph.lanes_dict() if e not in network.shoulders]
     begins = np.array([network.centre(index)[0] for index in lanes])
-    found: dict[LaneIndex, list[LaneIndex]] = {}
+    successors: dict[LaneIndex, list[LaneIndex]] = {}
     for index in lanes:
         away = np.hypot(*(begins - network.centre(index)[-1]).T)
-        found[index] = [lanes[i] for i in np.flatnonzero(away < 0.5).tolist()]
-        found[index] = [each for each in found[index] if each[0] == index[1]]
-    return found
+        successors[index] = [lanes[i] for i in np.flatnonzero(away < 0.5).tolist()]
+        successors[index] = [each for each in successors[index] if each[0] == index[1]]
+    return successors
 
 
 def _people(stage: Stage) -> None:
@@ -138,10 +138,10 @@ def pavements(network: Network) -> Iterator[Floats]:
         tangent = np.gradient(centre, axis=0)
         normal = np.stack([tangent[:, 1], -tangent[:, 0]], axis=1)
         normal /= np.hypot(*normal.T)[:, None]
-        found = set[bool]()
+        sides = set[bool]()
         for aside in asides:
             # the nearest line on each side that is off every road
-            if (aside > 0) in found:
+            if (aside > 0) in sides:
                 continue
             line = centre + (math.copysign(width / 2, aside) + aside) * normal
             s, r = table.coordinates(line * (1.0, -1.0))
@@ -149,7 +149,7 @@ def pavements(network: Network) -> Iterator[Floats]:
             inside &= s < table.length + OFF_M
             run = _longest(~np.max(inside, axis=1))
             if run is not None and run[1] - run[0] > 3 * END_M:
-                found.add(aside > 0)
+                sides.add(aside > 0)
                 yield line[run[0] + END_M : run[1] - END_M]
 
 

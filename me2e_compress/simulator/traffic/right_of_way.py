@@ -325,7 +325,7 @@ def conflicts_of(network: Network) -> dict[LaneIndex, list[Conflict]]:
     Lanes that leave one place, or follow each other, are no conflict: there drivers
     keep their distance.
     """
-    found: dict[LaneIndex, list[Conflict]] = {}
+    conflicts: dict[LaneIndex, list[Conflict]] = {}
     for a in network.ranks:
         mine = network.centre(a)
         for b in network.ranks:
@@ -344,8 +344,8 @@ def conflicts_of(network: Network) -> dict[LaneIndex, list[Conflict]]:
                     share = network.length(lane) / (len(touched) - 1)
                     at = np.flatnonzero(touched)
                     spans.append((float(at[0]) * share, float(at[-1]) * share))
-                found.setdefault(a, []).append(Conflict(b, spans[0], spans[1]))
-    return found
+                conflicts.setdefault(a, []).append(Conflict(b, spans[0], spans[1]))
+    return conflicts
 
 
 def _stops(light: Regulator, gap_m: float, speed: float) -> bool:

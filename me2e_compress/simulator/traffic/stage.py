@@ -120,15 +120,15 @@ class Schedule:
 
     def due(self, time_us: int, present: Sequence[Body]) -> list[Car | Walker]:
         """Return who appears now; who finds the place taken stays away for good."""
-        found = list[Car | Walker]()
+        arrivals = list[Car | Walker]()
         while self._next < len(self.arrivals):
             arrives_us, body = self.arrivals[self._next]
             if arrives_us > time_us:
                 break
             self._next += 1
-            if is_free(body, [*present, *found]):
-                found.append(body)
-        return found
+            if is_free(body, [*present, *arrivals]):
+                arrivals.append(body)
+        return arrivals
 
 
 def is_free(body: Body, present: Sequence[Body], room_m: float = 2.0) -> bool:
@@ -154,18 +154,18 @@ def arrival_times(
     Gaps are exponential beyond the shortest; with the probability ``platoons`` a car
     leads a platoon. The mean gap is the same either way.
     """
-    at, found = begin_s + float(random.uniform(0.0, mean_s)), list[float]()
+    at, times = begin_s + float(random.uniform(0.0, mean_s)), list[float]()
     while at < HORIZON_S:
-        found.append(at)
+        times.append(at)
         followers = 0
         if random.random() < platoons:
             followers = int(random.integers(1, PLATOON))
         for _ in range(followers):
             at += float(random.uniform(*PLATOON_S))
-            found.append(at)
+            times.append(at)
         rest = mean_s * (1 + followers) - followers * sum(PLATOON_S) / 2 - SHORTEST_S
         at += SHORTEST_S + float(random.exponential(max(rest, 0.5)))
-    return found
+    return times
 
 
 Script = Iterator[None]

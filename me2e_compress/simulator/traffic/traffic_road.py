@@ -56,12 +56,12 @@ def _change(car: Car, wanted_mps2: float) -> None:
 
 def _beside(car: Car, lane: int) -> list[LaneIndex] | None:
     """Return the rest of a car's chain in another lane; None if it is not all there."""
-    graph, found = car.network.graph.graph, list[LaneIndex]()
+    graph, lanes = car.network.graph.graph, list[LaneIndex]()
     for a, b, _ in car.lanes[car.leg :]:
         if not 0 <= lane < len(graph[a][b]) or (a, b, lane) in car.network.closed:
             return None
-        found.append((a, b, lane))
-    return found
+        lanes.append((a, b, lane))
+    return lanes
 
 
 def _wanted(car: Car, chain: list[LaneIndex]) -> float:
@@ -74,10 +74,10 @@ def _wanted(car: Car, chain: list[LaneIndex]) -> float:
 
 def _imposed(car: Car, chain: list[LaneIndex]) -> float:
     """Return the braking that a car imposes on who is behind it in another lane."""
-    found = car.road.follower(car, chain[0])
-    if found is None:
+    follower = car.road.follower(car, chain[0])
+    if follower is None:
         return 0.0
-    body, gap = found
+    body, gap = follower
     if gap < NEAREST_M:
         return math.inf
     if isinstance(body, Car):
@@ -189,8 +189,8 @@ class TrafficRoad(Road):  # type: ignore[misc]  # highway-env is untyped
             s, r = self._s[:, column], self._r[:, column]
             along = np.flatnonzero((s >= 0) & (s <= self.table.length[column]))
             columns = (s[along].tolist(), r[along].tolist(), along.tolist())
-            found = zip(*columns, strict=True)
-            self._lanes[column] = sorted(found, key=lambda each: each[0])
+            rows = zip(*columns, strict=True)
+            self._lanes[column] = sorted(rows, key=lambda each: each[0])
         return self._lanes[column]
 
     def follower(self, car: Car, index: LaneIndex) -> tuple[RoadObject, float] | None:

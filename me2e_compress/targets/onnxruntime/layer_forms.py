@@ -273,5 +273,5 @@ def _write_convolution(
 
 def _last_of(product: ir.Node) -> ir.Node:
     """Return the Add of a MatMul's bias, or the product itself."""
-    found = biased_end(product) if product.op_type == "MatMul" else None
-    return found or product
+    end = biased_end(product) if product.op_type == "MatMul" else None
+    return end or product

@@ -352,8 +352,8 @@ def scale_shapes(model: ir.Model) -> Iterator[LintFinding]:
         shape = open_shape(node.inputs[1])
         blocks = node.attributes.get_int("block_size", 0)
         if shape and len(shape) > 1 and not blocks:
-            said = f"its scale is {list(shape)}: one number, or a row of one a channel"
-            yield error("scale-shape", node, said)
+            text = f"its scale is {list(shape)}: one number, or a row of one a channel"
+            yield error("scale-shape", node, text)
 
 
 def operators(model: ir.Model) -> Iterator[LintFinding]:

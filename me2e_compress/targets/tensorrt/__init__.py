@@ -84,11 +84,11 @@ class TensorRT(Target):
         plugin gets the int8 directly, and its scale as an input (SparseDriveV2);
         BEVFormer_tensorrt's plugins expect it by implicit quantization.
         """
-        found = find(node)
-        if found is None or ir.DataType.INT8 not in found[1].operands[0].types:
+        plugin = find(node)
+        if plugin is None or ir.DataType.INT8 not in plugin[1].operands[0].types:
             return f"the plugin {node.op_type} takes float32 or float16 alone"
         # The scale must be an input that is not set yet.
-        scale, shape = found[1].int8_scale, static_shape(node.inputs[0])
+        scale, shape = plugin[1].int8_scale, static_shape(node.inputs[0])
         if scale is None:
             return f"the plugin {node.op_type} gets the scale of int8 not by QDQ"
         if shape is None or input_at(node, scale) is not None:
@@ -171,8 +171,8 @@ class _Pairs:
 
     def _feed(self, plugin: ir.Node, index: int) -> None:
         """Feed integers to a plugin, with their scale for every channel."""
-        value, found = plugin.inputs[index], find(plugin)
-        at = None if found is None else found[1].int8_scale
+        value, known = plugin.inputs[index], find(plugin)
+        at = None if known is None else known[1].int8_scale
         channels = (static_shape(value) or ())[-1:]
         if value is None or at is None or not channels:
             return

@@ -85,8 +85,8 @@ def zero_points(model: ir.Model) -> Iterator[LintFinding]:
         if value is not None and zero is None:
             yield error("zero-point", node, "the zero point is computed")
         elif zero is not None and zero.astype(np.float32).any():
-            found = float(zero.reshape(-1)[np.flatnonzero(zero)[0]])
-            yield error("zero-point", node, f"zero point {found:g}, must be 0")
+            point = float(zero.reshape(-1)[np.flatnonzero(zero)[0]])
+            yield error("zero-point", node, f"zero point {point:g}, must be 0")
 
 
 def _is_weight(node: ir.Node) -> bool:

@@ -108,8 +108,8 @@ def version_of(text: str) -> Version:
     Raises:
         ValueError: it is no version.
     """
-    if found := re.fullmatch(r"(\d{1,3})\.(\d{1,3})(\.\d{1,4}){0,2}", text):
-        return int(found[1]), int(found[2])
+    if match := re.fullmatch(r"(\d{1,3})\.(\d{1,3})(\.\d{1,4}){0,2}", text):
+        return int(match[1]), int(match[2])
     raise ValueError(f"{text!r} is no version of TensorRT, such as 10.13")
 
 
@@ -148,19 +148,19 @@ class Parser:
         """Check the graph's opset against those that parsers read."""
         (_, opset), last = on_disk(model), max(NEWEST_OPSETS.values())
         if not OLDEST_OPSET <= opset <= last:
-            said = f"opset {opset}: parsers read {OLDEST_OPSET} to {last}"
+            message = f"opset {opset}: parsers read {OLDEST_OPSET} to {last}"
             if opset < OLDEST_OPSET:
-                yield error("opset", None, said)
+                yield error("opset", None, message)
             else:
                 more = "; TensorRT-RTX 1.7 parses newer (measured)"
-                yield warning("opset", None, f"{said}, by their pages{more}")
+                yield warning("opset", None, f"{message}, by their pages{more}")
             return
         # never an error: it was read from some version in between on
         since = next(each for each, newest in NEWEST_OPSETS.items() if opset <= newest)
         oldest, given = next(iter(NEWEST_OPSETS)), self.version
         if since != oldest and (given is None or given < version_of(since)):
-            said = f"TensorRT {since} reads it, {oldest} reads {NEWEST_OPSETS[oldest]}"
-            yield warning("opset", None, f"opset {opset}: {said}")
+            text = f"TensorRT {since} reads it, {oldest} reads {NEWEST_OPSETS[oldest]}"
+            yield warning("opset", None, f"opset {opset}: {text}")
 
     def operators(self, model: ir.Model) -> Iterator[LintFinding]:
         """Find operators that the parser refuses, or that are unknown."""
@@ -190,8 +190,8 @@ class Parser:
             if kind in late:
                 yield from self._late("element-type", node, what, since)
             elif kind == ir.DataType.DOUBLE:  # TensorRT casts it down by itself
-                said = f"{node.op_type} of float64 is cast down"
-                yield warning("element-type", node, said)
+                message = f"{node.op_type} of float64 is cast down"
+                yield warning("element-type", node, message)
             elif kind not in taken and node.op_type not in _UNTYPED:
                 names = ", ".join(sorted(each.name.lower() for each in taken))
                 yield error("element-type", node, f"{what}; it accepts {names}")
@@ -204,8 +204,8 @@ class Parser:
             yield warning(rule, node, f"{what} needs TensorRT {since} or later")
         elif self.version < version_of(since):
             given = ".".join(map(str, self.version))
-            said = f"{what} needs TensorRT {since} or later, not {given}"
-            yield error(rule, node, said)
+            message = f"{what} needs TensorRT {since} or later, not {given}"
+            yield error(rule, node, message)
 
 
 def one_type(model: ir.Model) -> Iterator[LintFinding]:
@@ -216,9 +216,9 @@ def one_type(model: ir.Model) -> Iterator[LintFinding]:
             continue
         # Integers do not matter, only float types.
         kinds = {each.dtype for each in node.inputs if each is not None}
-        found = [each.name.lower() for each in floats if each in kinds]
-        if len(found) > 1:
-            message = f"{node.op_type} of {' and '.join(found)}: cast one of them"
+        names = [each.name.lower() for each in floats if each in kinds]
+        if len(names) > 1:
+            message = f"{node.op_type} of {' and '.join(names)}: cast one of them"
             yield error("mixed-types", node, message)
 
 
@@ -295,14 +295,14 @@ def restrictions(model: ir.Model) -> Iterator[LintFinding]:
 def rtx(model: ir.Model) -> Iterator[LintFinding]:
     """Find what TensorRT takes, and TensorRT-RTX 1.7 does not: measured."""
     for node in nodes_of(model):
-        said, value = "", graph.input_at(node, 0)
+        message, value = "", graph.input_at(node, 0)
         floats = value is not None and value.dtype == ir.DataType.FLOAT
         if node.op_type == "Attention" and floats:
-            said = "is parsed, and not built, of float32: convert-float16 helps"
+            message = "is parsed, and not built, of float32: convert-float16 helps"
         elif node.op_type == "ScatterElements" and _no_reduction(node):
-            said = "is not parsed with a reduction"
-        if said and is_standard(node):
-            message = f"{node.op_type} {said}, by TensorRT-RTX 1.7 (measured)"
+            message = "is not parsed with a reduction"
+        if message and is_standard(node):
+            message = f"{node.op_type} {message}, by TensorRT-RTX 1.7 (measured)"
             yield warning("rtx", node, message)
 
 
@@ -318,8 +318,8 @@ def _four(node: ir.Node) -> str | None:
 
 
 def _undilated(node: ir.Node) -> str | None:
-    found = node.attributes.get_ints("dilations", ())
-    return None if set(found) <= {1} else f"dilations {list(found)}, must be 1"
+    dilations = node.attributes.get_ints("dilations", ())
+    return None if set(dilations) <= {1} else f"dilations {list(dilations)}, must be 1"
 
 
 def _first_output(node: ir.Node) -> str | None:
@@ -347,8 +347,8 @@ def _top_k(node: ir.Node) -> str | None:
 
 
 def _no_reduction(node: ir.Node) -> str | None:
-    found = node.attributes.get_string("reduction", "none")
-    return None if found == "none" else f"reduction {found}, must be none"
+    reduction = node.attributes.get_string("reduction", "none")
+    return None if reduction == "none" else f"reduction {reduction}, must be none"
 
 
 def _no_layout(node: ir.Node) -> str | None:
