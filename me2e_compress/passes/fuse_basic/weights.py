@@ -103,21 +103,21 @@ def _is_per_channel(match: Match) -> bool:
     return same and shape is not None and shape[1] == full[1]
 
 
-def _fold_affine(found: Match, kit: Kit) -> str | None:
-    layer, affine = found.node(LAYER), _affine(found)
+def _fold_affine(match: Match, kit: Kit) -> str | None:
+    layer, affine = match.node(LAYER), _affine(match)
     bias, what = _bias(layer), layer.op_type
-    if affine is None or bias is None or not holds_numbers(found[SHARED]):
+    if affine is None or bias is None or not holds_numbers(match[SHARED]):
         return f"{what} whose weights are computed"
     # Compute the new weight and bias in float64
-    stored, shift = found.array(SHARED), affine[1]
+    stored, shift = match.array(SHARED), affine[1]
     scale = _per_output(layer, affine[0])
-    weight = _scaled(layer, found.numbers(SHARED), scale)
+    weight = _scaled(layer, match.numbers(SHARED), scale)
     bias = np.broadcast_to(bias * scale + shift, scale.shape)
     if overflow(weight, stored) or overflow(bias, stored):
         return f"{what} whose weights would overflow"
     # Store them, unless copies of a shared weight cost too much
-    name = found[SHARED].name or layer.name or "layer"
-    if not _give(layer, found[SHARED], weight.astype(stored.dtype), scale, kit):
+    name = match[SHARED].name or layer.name or "layer"
+    if not _give(layer, match[SHARED], weight.astype(stored.dtype), scale, kit):
         return f"{what} that shares its weights"
     kit.refill(
         layer, 2, bias.astype(stored.dtype), f"{name.removesuffix('.weight')}.bias"
@@ -164,15 +164,15 @@ def _is_worth_copies(shared: ir.Value) -> bool:
     copies, stays, worth = set[str](), shared.is_graph_output(), 0.0
     for layer, index in shared.uses():
         reader = sole_reader(layer.outputs[0]) if index == 1 else None
-        found = affine = None
+        matched = affine = None
         if reader is not None and not reader.attributes.get_int("training_mode", 0):
-            found = match(AFFINE, reader)
-        if found is not None and found.node(LAYER) is layer:
-            affine = _affine(found)
-        if found is None or affine is None:
+            matched = match(AFFINE, reader)
+        if matched is not None and matched.node(LAYER) is layer:
+            affine = _affine(matched)
+        if matched is None or affine is None:
             stays = True
             continue
-        worth += BYTES_PER_NODE * work(found.root)
+        worth += BYTES_PER_NODE * work(matched.root)
         copies.add(_copy_name(layer, shared, _per_output(layer, affine[0])))
     made = shared.graph.initializers if shared.graph is not None else {}
     growth = sum(name not in made for name in copies) - (not stays)

@@ -59,12 +59,12 @@ def fuse_attention(node: ir.Node, call: FusedCall) -> ir.Value | None:
     as it is, and Transposes behind y that undo it go too.
     """
     softmax = maker(node.inputs[0], "Softmax")
-    found = None if softmax is None else _found(node, softmax)
-    if found is None or softmax is None:
+    attention = None if softmax is None else _found(node, softmax)
+    if attention is None or softmax is None:
         return None
     if call.opset < _OPSET:
         raise PreconditionError(f"fused nodes need opset {_OPSET} or later")
-    return _fused(call, found, _checked(found, softmax))
+    return _fused(call, attention, _checked(attention, softmax))
 
 
 def _found(node: ir.Node, softmax: ir.Node) -> _Attention | None:
@@ -89,23 +89,23 @@ def _found(node: ir.Node, softmax: ir.Node) -> _Attention | None:
 
 def _unscaled(value: ir.Value | None) -> tuple[ir.Value | None, float]:
     """Return what is multiplied by a number, and the number."""
-    found = None if value is None else factors_of(value)
-    if found is None or len(found.factors) != 1:
+    product = None if value is None else factors_of(value)
+    if product is None or len(product.factors) != 1:
         return value, 1.0
-    return found.factors[0], found.scale
+    return product.factors[0], product.scale
 
 
-def _checked(found: _Attention, softmax: ir.Node) -> _Shape:
+def _checked(attention: _Attention, softmax: ir.Node) -> _Shape:
     """Return the shape [.., Q, C] of the query; refuse what the kernel cannot do."""
-    shapes = [static_shape(each) for each in found[:3]]
+    shapes = [static_shape(each) for each in attention[:3]]
     query, key, value = shapes
     if query is None or key is None or value is None:
         raise PreconditionError("its shapes are not known")
     if min(map(len, (query, key, value))) < 2:
         raise PreconditionError("one of its operands is a vector")
-    if any(maker(each, "DequantizeLinear") for each in found[:3]):
+    if any(maker(each, "DequantizeLinear") for each in attention[:3]):
         raise PreconditionError("its products are int8")
-    if any(each.dtype != ir.DataType.FLOAT for each in found[:3]):
+    if any(each.dtype != ir.DataType.FLOAT for each in attention[:3]):
         raise PreconditionError("it is not of float32 numbers")
     count, width = query[-2:]
     keys = key[-1]
@@ -122,11 +122,11 @@ def _checked(found: _Attention, softmax: ir.Node) -> _Shape:
     return query
 
 
-def _fused(call: FusedCall, found: _Attention, shape: _Shape) -> ir.Value:
+def _fused(call: FusedCall, attention: _Attention, shape: _Shape) -> ir.Value:
     """Write attention of the rows that Transposes read, or of heads in the batch."""
     rank, width = len(shape), shape[-1]
-    factor = found.scale * math.sqrt(width)
-    turns = [maker(value, "Transpose") for value in found[:3]]
+    factor = attention.scale * math.sqrt(width)
+    turns = [maker(value, "Transpose") for value in attention[:3]]
     orders = [_ROWS.get(rank), _KEYS.get(rank), _ROWS.get(rank)]
     reads = [
         turn.inputs[0]
@@ -147,8 +147,8 @@ def _fused(call: FusedCall, found: _Attention, shape: _Shape) -> ir.Value:
     if turns[1] is not None and permutation_of(turns[1]) == last:
         key = turns[1].inputs[0]
     else:
-        key = call.transpose(found.turned_key, last)
-    rows = [_viewed(call, each, -1) for each in (found.query, key, found.value)]
+        key = call.transpose(attention.turned_key, last)
+    rows = [_viewed(call, each, -1) for each in (attention.query, key, attention.value)]
     return call.reshape(_attention(call, rows, factor, 1), shape)
 
 

@@ -114,7 +114,7 @@ def _source_rows(image: ir.Value, sizes: _Sizes) -> ir.Value | None:
 
 def _turned_readers(value: ir.Value, sizes: _Sizes) -> list[ir.Node]:
     """Return the Transposes, behind views, that put the channels last."""
-    found, waiting = [], [use.node for use in value.uses()]
+    readers, waiting = [], [use.node for use in value.uses()]
     while waiting:
         node = waiting.pop()
         source = node.inputs[0]
@@ -126,8 +126,8 @@ def _turned_readers(value: ir.Value, sizes: _Sizes) -> list[ir.Node]:
         shape, order = static_shape(source), permutation_of(node)
         turns = node.op_type == "Transpose" and shape is not None and order is not None
         if turns and _puts_channels_last(shape or (), order or [], sizes):
-            found.append(node)
-    return found
+            readers.append(node)
+    return readers
 
 
 def _puts_channels_last(shape: tuple[int, ...], order: list[int], s: _Sizes) -> bool:

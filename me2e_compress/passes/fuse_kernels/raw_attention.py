@@ -115,20 +115,20 @@ def fuse_raw_attention(node: ir.Node, call: FusedCall) -> ir.Value | None:
     Operands are read before they are repeated. What is no such sum or softmax, or is
     read by others too, is read as it is.
     """
-    found = _find(node) if call.opset >= SOFTMAX_OPSET else None
-    if found is None:
+    form = _find(node) if call.opset >= SOFTMAX_OPSET else None
+    if form is None:
         return None
     body = node.graph
     assert isinstance(body, ir.Graph)
     known = set(body.initializers)
     result = call.add(
-        RAW_ATTENTION, [*node.inputs[:3], *_written(call, found)], domain=OWN_DOMAIN
+        RAW_ATTENTION, [*node.inputs[:3], *_written(call, form)], domain=OWN_DOMAIN
     )
     result.shape, result.type = node.outputs[0].shape, node.outputs[0].type
     try:
-        _prove(call, result, found.views)
+        _prove(call, result, form.views)
     except (PreconditionError, GraphError) as reason:
-        stops = [*(view.value for view in found.views), *filter(None, node.inputs)]
+        stops = [*(view.value for view in form.views), *filter(None, node.inputs)]
         take_back(body, nodes_between(result, stops), known)
         raise PreconditionError(str(reason)) from reason
     return result
@@ -146,21 +146,21 @@ def _find(node: ir.Node) -> _Found | None:
     share = View(weights, sizes.weights)
     plain = _Found(sizes, None, at, None, ((),) * 5, (share,), 1.0)
     # The sum and the softmax, if they are there
-    found = _product(share, plain) or plain
+    form = _product(share, plain) or plain
     places = _sum(at)
     if places is not None:
-        found = dataclasses.replace(found, near=places[0], away=places[1])
-    if found == plain:
+        form = dataclasses.replace(form, near=places[0], away=places[1])
+    if form == plain:
         return None
     # Every operand is read where that moves the least data
-    near, scores = found.near, found.scores
+    near, scores = form.near, form.scores
     return dataclasses.replace(
-        found,
+        form,
         near=near and _cheapest(near, lambda each: _pairs(sizes.form([each]))),
-        away=_cheapest(found.away, lambda each: _away(sizes, each)),
-        scores=scores and _cheapest(scores, lambda each: found.rows),
+        away=_cheapest(form.away, lambda each: _away(sizes, each)),
+        scores=scores and _cheapest(scores, lambda each: form.rows),
         masks=tuple(
-            _cheapest(mask, lambda each: sizes.form([each])) for mask in found.masks
+            _cheapest(mask, lambda each: sizes.form([each])) for mask in form.masks
         ),
     )
 
@@ -185,21 +185,21 @@ def _away(sizes: _Sizes, view: View) -> Layout:
     return _pairs((*outer, sizes.form([view], of_camera=False)[3], points))
 
 
-def _written(call: FusedCall, found: _Found) -> list[ir.Value]:
+def _written(call: FusedCall, read: _Found) -> list[ir.Value]:
     """Write the operands from reference points to mask."""
-    zeros, like, form = np.zeros((1, 1, 1, 1, 1, 2)), found.away.value, found.sizes.form
+    zeros, like, form = np.zeros((1, 1, 1, 1, 1, 2)), read.away.value, read.sizes.form
     # Zeros stand for no reference point, and for weights without a softmax
     near = call.numbers(zeros, like)
-    if found.near is not None:
-        near = laid_out(call, found.near, _pairs(form([found.near])))
-    away = laid_out(call, found.away, _away(found.sizes, found.away))
+    if read.near is not None:
+        near = laid_out(call, read.near, _pairs(form([read.near])))
+    away = laid_out(call, read.away, _away(read.sizes, read.away))
     scores = call.numbers(zeros[..., 0], like)
-    if found.scores is not None:
-        scores = laid_out(call, found.scores, found.rows)
-    mask = call.numbers(np.full((1, 1, 1, 1, 1), found.scale), like)
-    if found.masks:
-        product = combined(call, "Mul", found.masks, form(found.masks))
-        mask = product if found.scale == 1.0 else call.add("Mul", [product, mask])
+    if read.scores is not None:
+        scores = laid_out(call, read.scores, read.rows)
+    mask = call.numbers(np.full((1, 1, 1, 1, 1), read.scale), like)
+    if read.masks:
+        product = combined(call, "Mul", read.masks, form(read.masks))
+        mask = product if read.scale == 1.0 else call.add("Mul", [product, mask])
     return [near, away, scores, mask]
 
 
@@ -267,10 +267,10 @@ def _product(view: View, plain: _Found) -> _Found | None:
         if each is not None and shape is not None
     )
     for one, other in ((left, right), (right, left)):
-        found = _product(one, plain)
-        if found is not None:
-            masks, scale = (*found.masks, other), found.scale * last.scale
-            return dataclasses.replace(found, masks=masks, scale=scale)
+        inner = _product(one, plain)
+        if inner is not None:
+            masks, scale = (*inner.masks, other), inner.scale * last.scale
+            return dataclasses.replace(inner, masks=masks, scale=scale)
     return None
 
 

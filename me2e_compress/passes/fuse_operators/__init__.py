@@ -161,9 +161,9 @@ class _Run:
         reason: Exception = PreconditionError("it is not a sum of four corners")
         for guess in gathered.guesses(node, self.opset):
             inputs = [view.value for view in (guess.image, *guess.at)]
-            found = guess.result.value, inputs, guess.write, guess.draw
+            sampling = guess.result.value, inputs, guess.write, guess.draw
             try:
-                self._replace(body, *found, least=guess.draws)
+                self._replace(body, *sampling, least=guess.draws)
             except (PreconditionError, GraphError) as error:
                 reason = error
                 continue

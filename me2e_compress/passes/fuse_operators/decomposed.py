@@ -102,14 +102,14 @@ def find(node: ir.Node) -> Decomposed:
     )
 
 
-def with_images(found: Decomposed) -> Decomposed:
+def with_images(decomposed: Decomposed) -> Decomposed:
     """Include a sum or mean over images that follows, masked or not, if there is one.
 
     Each image becomes one more level. BEVFormer (Li et al., 2022) adds up the cameras
     that see a pillar and takes the mean over this frame and the last.
     """
     # An optional mask, then the sum or mean
-    end, mask = found.results[-1], None
+    end, mask = decomposed.results[-1], None
     node = sole_reader(end.value)
     try:
         if node is not None and node.op_type == "Mul":
@@ -117,15 +117,15 @@ def with_images(found: Decomposed) -> Decomposed:
             end = list(results(product))[-1]
         total, mean = _total(end, ("ReduceSum", "ReduceMean"))
     except PreconditionError:
-        return found
+        return decomposed
     # Only axes of the batch may be summed over
     left = flat(total.layout)
     gone = tuple(digit for digit in flat(end.layout) if digit not in left)
     if not gone or any(digit.axis != BATCH for digit in gone):
-        return found
+        return decomposed
     count = math.prod(digit.size for digit in gone)
     return dataclasses.replace(
-        found,
+        decomposed,
         results=tuple(results(total)),
         mask=mask,
         images=gone,

@@ -265,7 +265,7 @@ OP_TYPE = "MultiScaleDeformableAttention"
 class Plan:
     """How a deformable attention becomes one node; ``cost`` is in bytes of layouts."""
 
-    found: Decomposed
+    decomposed: Decomposed
     heads: int
     value: Source
     locations: Source
@@ -282,29 +282,29 @@ class Plan:
         return (*(view for each in sources for view in each.views), *mask)
 
 
-def plan(found: Decomposed) -> Plan:
+def plan(decomposed: Decomposed) -> Plan:
     """Choose where to read and what to replace, so that the least data is moved.
 
     Images can be added up only if levels are contiguous, else PreconditionError.
     """
     # List where each operand can be read
-    value = options_of([level.image for level in found.levels], join_pixels)
-    plain = options_of([level.grid for level in found.levels], join_levels)
+    value = options_of([level.image for level in decomposed.levels], join_pixels)
+    plain = options_of([level.grid for level in decomposed.levels], join_levels)
     # of equals the last one is taken: sums are the last resort
     locations = [*(each for option in plain for each in sums_of(option)), *plain]
-    if found.images:  # their levels lie image by image: there is nothing to join
+    if decomposed.images:  # their levels lie image by image: there is nothing to join
         value = [each for each in value if len(each.views) == 1]
         locations = [each for each in locations if len(each.views) == 1 or each.total]
         if not (value and locations):
             raise PreconditionError("its levels are made apart")
-    weights = [Source((view,)) for view in whole_views(found.weights)]
-    masks = [] if found.mask is None else whole_views(found.mask)
+    weights = [Source((view,)) for view in whole_views(decomposed.weights)]
+    masks = [] if decomposed.mask is None else whole_views(decomposed.mask)
     known = [view for each in (*value, *locations, *weights) for view in each.views]
     # Price every number of heads with the best source of each operand
     plans = []
-    for heads in _head_counts(found, [*known, *masks, *found.results]):
-        form = _Form(found, heads)
-        covered = flat(found.mask.layout) if found.mask is not None else ()
+    for heads in _head_counts(decomposed, [*known, *masks, *decomposed.results]):
+        form = _Form(decomposed, heads)
+        covered = flat(decomposed.mask.layout) if decomposed.mask is not None else ()
         read = cheapest(value, form.value)
         places = cheapest(locations, form.locations)
         shares = cheapest(weights, form.weights, covered)
@@ -314,10 +314,10 @@ def plan(found: Decomposed) -> Plan:
             default=None,
         )
         # of the results, the one furthest behind takes the most with it
-        last = min(reversed(found.results), key=lambda view: form.result_cost(view))
+        last = min(reversed(decomposed.results), key=form.result_cost)
         cost = read[0] + places[0] + shares[0] + form.result_cost(last)
         plans.append(
-            Plan(found, heads, read[1], places[1], shares[1], mask, last, cost)
+            Plan(decomposed, heads, read[1], places[1], shares[1], mask, last, cost)
         )
     best = min(plans, key=lambda each: each.cost)
     if best.cost == math.inf:
@@ -327,11 +327,11 @@ def plan(found: Decomposed) -> Plan:
 
 def write(chosen: Plan, call: FusedCall) -> ir.Value:
     """Write the fused node and its layouts before the old node; return its result."""
-    found = chosen.found
-    form = _Form(found, chosen.heads)
-    images = math.prod(digit.size for digit in found.images)
+    decomposed = chosen.decomposed
+    form = _Form(decomposed, chosen.heads)
+    images = math.prod(digit.size for digit in decomposed.images)
     # Weights with their mask and scale; each image is one more set of levels
-    shapes = np.array([level.size for level in found.levels] * images, np.int64)
+    shapes = np.array([level.size for level in decomposed.levels] * images, np.int64)
     areas = shapes.prod(axis=1)
     operands = [
         _operand(call, chosen.value, form.value, 1),
@@ -341,8 +341,8 @@ def write(chosen: Plan, call: FusedCall) -> ir.Value:
     ]
     factors = [*chosen.weights.views, *([chosen.mask] if chosen.mask else [])]
     weights = combined(call, "Mul", factors, form.weights(None))
-    if found.scale != 1.0:
-        weights = call.add("Mul", [weights, call.numbers(found.scale, weights)])
+    if decomposed.scale != 1.0:
+        weights = call.add("Mul", [weights, call.numbers(decomposed.scale, weights)])
     made = call.add(OP_TYPE, [*operands, weights], domain=OWN_DOMAIN)
     # Bring the result to the layout of the replaced value
     made.dtype = ir.DataType.FLOAT
@@ -354,50 +354,50 @@ def write(chosen: Plan, call: FusedCall) -> ir.Value:
 class _Form:
     """The layouts of the fused node's operands, for a number of heads."""
 
-    found: Decomposed
+    decomposed: Decomposed
     heads: int
 
     def value(self, level: int | None) -> Layout:
-        levels = self.found.levels
+        levels = self.decomposed.levels
         total = sum(each.pixels for each in levels)
         pixels = whole(PIXEL, total if level is None else levels[level].pixels)
-        outer = self._outer((*self.found.images, *pixels))
-        return (*outer, whole(CHANNEL, self.found.channels))
+        outer = self._outer((*self.decomposed.images, *pixels))
+        return (*outer, whole(CHANNEL, self.decomposed.channels))
 
     def locations(self, level: int | None) -> Layout:
         return (*self.weights(level), whole(XY, 2))
 
     def weights(self, level: int | None) -> Layout:
-        levels = len(self.found.levels) if level is None else 1
-        outer = self._outer(self.found.queries)
-        both = (*self.found.images, *whole(LEVEL, levels))
-        return (*outer, both, self.found.points)
+        levels = len(self.decomposed.levels) if level is None else 1
+        outer = self._outer(self.decomposed.queries)
+        both = (*self.decomposed.images, *whole(LEVEL, levels))
+        return (*outer, both, self.decomposed.points)
 
     @property
     def result(self) -> Layout:
-        outer = self._outer(self.found.queries)
-        return (*outer, whole(CHANNEL, self.found.channels))
+        outer = self._outer(self.decomposed.queries)
+        return (*outer, whole(CHANNEL, self.decomposed.channels))
 
     def result_cost(self, view: View) -> float:
         return cost_of(View(view.value, self.result), view.layout)
 
     def _outer(self, middle: tuple[Digit, ...]) -> Layout:
-        images = self.found.batch // self.heads
+        images = self.decomposed.batch // self.heads
         batch = (Digit(BATCH, self.heads, images),) if images > 1 else ()
         # Images that are added up become levels
-        kept = split_like(batch, self.found.images)
-        kept = tuple(digit for digit in kept if digit not in self.found.images)
+        kept = split_like(batch, self.decomposed.images)
+        kept = tuple(digit for digit in kept if digit not in self.decomposed.images)
         return (kept, middle, whole(BATCH, self.heads))
 
 
-def _head_counts(found: Decomposed, views: Sequence[View]) -> list[int]:
+def _head_counts(decomposed: Decomposed, views: Sequence[View]) -> list[int]:
     """Return the numbers of heads that the layouts suggest, largest first."""
-    counts = {1, found.batch}
+    counts = {1, decomposed.batch}
     for view in views:
         for digit in flat(view.layout):
             if digit.axis == BATCH:
                 counts |= {digit.stride, digit.end}
-    least = min((digit.stride for digit in found.images), default=found.batch)
+    least = min((digit.stride for digit in decomposed.images), default=decomposed.batch)
     return sorted((count for count in counts if count <= least), reverse=True)
 
 

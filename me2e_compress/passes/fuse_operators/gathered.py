@@ -128,22 +128,22 @@ def is_sampler(node: ir.Node) -> bool:
 
 def floors_of(node: ir.Node) -> tuple[ir.Value, ...]:
     """Return the values whose floors a Gather's indices are made of."""
-    found = (n.inputs[0] for n in _behind(node.inputs[1]) if n.op_type == "Floor")
-    return tuple(dict.fromkeys(value for value in found if value is not None))
+    values = (n.inputs[0] for n in _behind(node.inputs[1]) if n.op_type == "Floor")
+    return tuple(dict.fromkeys(value for value in values if value is not None))
 
 
 def _behind(index: ir.Value | None) -> list[ir.Node]:
     """List the nodes that make an index, back to the floors of positions."""
-    found: dict[ir.Node, None] = {}
+    nodes: dict[ir.Node, None] = {}
     waiting = [index]
     while waiting:
         node = producer_of(waiting.pop())
-        if node is None or node in found or not is_standard(node):
+        if node is None or node in nodes or not is_standard(node):
             continue
         if node.op_type == "Floor" or node.op_type in _INDEX:
-            found[node] = None
+            nodes[node] = None
             waiting.extend(() if node.op_type == "Floor" else node.inputs)
-    return list(found)
+    return list(nodes)
 
 
 def guesses(node: ir.Node, opset: int) -> Iterator[Sampling]:
@@ -259,12 +259,12 @@ def _position(value: ir.Value, *, is_pair: bool) -> View:
 
 def _sums(node: ir.Node) -> list[ir.Value]:
     """Return the sums that follow a Gather, the last first."""
-    found: list[ir.Value] = []
+    terms: list[ir.Value] = []
     value = node.outputs[0]
     while (reader := sole_reader(value)) is not None and is_standard(reader):
         if reader.op_type not in _AFTER:
             break
         value = reader.outputs[0]
         if reader.op_type in _SUMS and static_shape(value) is not None:
-            found.append(value)
-    return found[::-1]
+            terms.append(value)
+    return terms[::-1]
