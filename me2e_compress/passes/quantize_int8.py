@@ -11,7 +11,12 @@ from me2e_compress.calibration.review import review
 from me2e_compress.display import counted
 from me2e_compress.errors import PreconditionError
 from me2e_compress.passes.base import Context, Pass, PassResult
-from me2e_compress.quantization.decision import Overrides, QuantPlan, stamp_plan
+from me2e_compress.quantization.decision import (
+    METADATA,
+    Overrides,
+    QuantPlan,
+    stamp_plan,
+)
 from me2e_compress.quantization.plan import make_plan
 from me2e_compress.quantization.rules import DEFAULT_RULES, RULE_SETS, RuleSet
 from me2e_compress.quantization.scheme import QuantScheme
@@ -67,23 +72,18 @@ class QuantizeInt8(Pass):
         """Plan, calibrate, and place quantizers.
 
         Raises:
-            PreconditionError: the graph is quantized already, of opset below 13, or in
-                float16 that its target or opset has no int8 for.
+            PreconditionError: a plan quantized the graph, or somebody all of its
+                layers; it is of opset below 13, or in float16 that its target or opset
+                has no int8 for.
             FramesError: neither frames nor ranges, or they are of another graph.
         """
-        if found := describe_quantized(model):
-            # what is quantized while it runs has no ranges that could be written down
-            pairs = any(node.op_type == QUANTIZE for node in pairs_of(model))
-            rewrite = ", or let lower-int8 rewrite this one for onnxruntime"
-            raise PreconditionError(
-                f"the graph is quantized already: {found}; int8 is not put on int8,"
-                f" give the float graph that it was made of{rewrite if pairs else ''}"
-            )
+        _refuse(model, all_decided=METADATA in model.metadata_props)
         # Plan, and stop if there is nothing to do
         target, plan = self._runtime, self.plan(model, context)
         target.check_types(plan, model)
         tensors = target.tensors(plan, model)
         if not tensors:
+            _refuse(model, all_decided=True)
             return PassResult(model, 0, ("nothing to quantize", plan.headline))
         # Calibrate
         method, saved = self.method_of_ranges, self.ranges
@@ -125,3 +125,16 @@ class QuantizeInt8(Pass):
     def _rules(self) -> RuleSet:
         named = self.rules
         return RULE_SETS.parse(named) if isinstance(named, str) else named
+
+
+def _refuse(model: ir.Model, *, all_decided: bool) -> None:
+    """Refuse a quantized graph in which no layer is left to be decided."""
+    already = describe_quantized(model)
+    if already and all_decided:
+        # what is quantized while it runs has no ranges that could be written down
+        pairs = any(node.op_type == QUANTIZE for node in pairs_of(model))
+        rewrite = ", or let lower-int8 rewrite this one for onnxruntime"
+        raise PreconditionError(
+            f"the graph is quantized already: {already}; int8 is not put on int8,"
+            f" give the float graph that it was made of{rewrite if pairs else ''}"
+        )

@@ -15,6 +15,7 @@ from me2e_compress.graph import (
     provenance,
     static_shape,
 )
+from me2e_compress.graph.nodes import maker
 from me2e_compress.graph.shapes import is_one_matrix
 from me2e_compress.operators import int8_inputs
 from me2e_compress.quantization.costs import CostsOf
@@ -274,6 +275,8 @@ def _residuals(
         fused = [i for i in (0, 1) if _ends_convolution(node.inputs[i], decided)]
         if not fused or any(each in facts.constants for each in node.inputs):
             continue
+        if any(maker(each, "DequantizeLinear") for each in node.inputs):
+            continue  # a branch is read as int8 already
         if static_shape(node.inputs[0]) != static_shape(node.inputs[1]):
             continue
         # the longer path is fused, the other is the residual

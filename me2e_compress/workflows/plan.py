@@ -20,6 +20,7 @@ from me2e_compress.passes.freeze_inputs import advice
 from me2e_compress.passes.lower_int8 import LowerInt8
 from me2e_compress.passes.quantize_int8 import QuantizeInt8
 from me2e_compress.quantization.decision import (
+    METADATA,
     QuantPlan,
     load_plan,
     plan_of,
@@ -60,14 +61,14 @@ class PreparedGraph:
         """Run the passes before the first that reads ranges, unverified.
 
         A module map of None finds the preset; passes of None stand for the recipe
-        ``exact``. A graph that is quantized already, and is to become int8, raises
+        ``exact``. A graph that a plan quantized, and is to become int8, raises
         PreconditionError.
         """
         chosen = tuple(recipe.load("exact") if passes is None else passes)
         at = next((at for at, each in enumerate(chosen) if each.reads_ranges), None)
         reader = None if at is None else chosen[at]
-        # a quantized graph may only be rewritten, not quantized again
-        quantized = describe_quantized(loaded)
+        # what a plan quantized may only be rewritten, not quantized again
+        quantized = METADATA in loaded.metadata_props and describe_quantized(loaded)
         if quantized and (reader is None or reader.quantizes):
             raise PreconditionError(
                 f"{file}: the graph is quantized already: {quantized}; give the float"

@@ -1,5 +1,6 @@
 """Int8 where a plan says so, of float32 and of float16, and lowered for a CPU."""
 
+import dataclasses
 import re
 from pathlib import Path
 
@@ -140,14 +141,87 @@ def test_what_is_quantized_while_it_runs_is_not_lowered(context: Context) -> Non
 
 
 def test_a_quantized_graph_is_not_quantized_again(context: Context) -> None:
-    once = PAPER.run(conv_attention(), context).model
+    # its plan has decided of the layers, too, that are float
+    half = dataclasses.replace(PAPER, modules=("backbone",))
+    once = half.run(conv_attention(), context).model
 
     with pytest.raises(PreconditionError) as caught:
         PAPER.run(once, context)
 
     message = str(caught.value)
-    assert "quantized already: 7 DequantizeLinear, 5 QuantizeLinear" in message
+    assert "quantized already: 2 DequantizeLinear, 1 QuantizeLinear" in message
     assert "int8 with zero points 0; it carries the plan it was made by" in message
+
+
+PARTLY = """
+<ir_version: 13, opset_import: ["" : 25]>
+partly (float[1,3,8,8] image, packed[8,3,3,3] q, float[8,8,1,1] w, float[8,8,1,1] v)
+    => (float[1,8,6,6] y) <float half = {0.5}, int8 zero = {0}> {
+    i = QuantizeLinear(image, half, zero)
+    d = DequantizeLinear(i, half, zero)
+    ["/backbone/A"] %s
+    ["/backbone/B"] b = Conv(a, w)
+    %s
+}
+"""
+PACKED = {
+    "weights": "p = DequantizeLinear(q, half) a = Conv(image, p)",
+    "moved": "f = DequantizeLinear(q, half) u = Transpose<perm=[0,1,3,2]>(f)"
+    " p = Mul(u, half) a = Conv(image, p)",
+    "activations": "p = Cast<to=1>(q) n = Identity(d) a = Conv(n, p)",
+}
+
+
+@pytest.mark.parametrize("target", ["onnxruntime", "tensorrt"])
+@pytest.mark.parametrize(
+    ("packed", "form"),
+    [
+        *((kind, "weights") for kind in ("INT4", "UINT4", "INT2", "UINT2", "INT8")),
+        *(("INT4", "moved"), ("INT8", "activations")),
+    ],
+)
+def test_what_is_quantized_already_stays_and_the_rest_becomes_int8(
+    packed: str, form: str, target: str, context: Context, frames: CalibrationSet
+) -> None:
+    model = partly(packed, form, "r = Conv(b, v) s = QuantizeLinear(b, half, zero)"
+        " t = DequantizeLinear(s, half, zero) y = Add(r, t)")  # fmt: skip
+    result = QuantizeInt8(rules="paper", target=target).run(model, context)
+
+    plan = plan_of(result.model)
+    assert plan is not None
+    stays, *others = (each for each in plan.decisions if each.op in ("Conv", "Add"))
+    assert stays.reason == f"quantized already: it reads {packed.lower()}"
+    # nor is a branch put in pairs that comes out of one
+    assert [each.dtype for each in others] == ["int8", "int8", "float"]
+    stored = result.model.graph.initializers["q"].const_value
+    assert stored is not None
+    assert stored.dtype == ir.DataType[packed]
+    (found,) = compare(Session(model), Session(result.model), frames).outputs
+    assert found.sqnr_db > 20
+
+
+def test_where_no_layer_is_left_the_graph_is_refused(context: Context) -> None:
+    model = partly("UINT4", "weights", "y = Identity(b)")
+    (_, float_layer) = (node for node in model.graph if node.op_type == "Conv")
+    float_layer.op_type = "Add"
+    with pytest.raises(PreconditionError, match="already: 2 DequantizeLinear, 1 Quan"):
+        QuantizeInt8(rules="paper").run(model, context)
+
+
+def partly(packed: str, form: str, end: str) -> ir.Model:
+    """A layer that is quantized by its weight or input, before a float one."""
+    generator = np.random.default_rng(0)
+    shapes = {"q": (8, 3, 3, 3), "w": (8, 8, 1, 1), "v": (8, 8, 1, 1)}
+    arrays = {name: generator.normal(size=shape) for name, shape in shapes.items()}
+    text = PARTLY % (PACKED[form], end)
+    model = net(text.replace("packed", packed.lower()), arrays)
+    whole = np.clip(np.round(arrays["q"]), 0 if packed[0] == "U" else -2, 1)
+    kind = ir.DataType[packed]
+    value = model.graph.initializers["q"]
+    value.const_value = ir.tensor(whole.astype(kind.numpy()), kind, name="q")
+    value.type = ir.TensorType(kind)
+    graph.infer_shapes(model)
+    return model
 
 
 def test_overrides_are_read_from_a_file(context: Context, tmp_path: Path) -> None:

@@ -15,6 +15,7 @@ from me2e_compress.graph import (
     provenance,
     static_shape,
 )
+from me2e_compress.graph.nodes import LAYOUT_OPERATORS, producer_of
 from me2e_compress.graph.shapes import PRODUCTS, extent
 from me2e_compress.operators import int8_inputs
 from me2e_compress.quantization.find_attention import is_fused
@@ -80,8 +81,13 @@ class WeightOperand(Rule):
     firm: ClassVar[bool] = True
 
     def objection(self, node: ir.Node, facts: RuleFacts) -> str | None:
-        """Object to computed weights, constants on the left, other element types."""
+        """Object to computed weights, constants on the left, other element types.
+
+        And to what is quantized already, which stays as it is.
+        """
         left, right = node.inputs[0], node.inputs[1]
+        if stored := _integers(node, facts):
+            return f"quantized already: it reads {stored}"
         if int8_inputs(node):
             if left is None or left in facts.constants:
                 return "what it samples is constant"
@@ -105,6 +111,25 @@ class WeightOperand(Rule):
         if node in facts.attention:
             return None
         return "both operands are computed, and no softmax follows: not a layer"
+
+
+def _integers(node: ir.Node, facts: RuleFacts) -> str:
+    """Name the type of the integers that an operand is unpacked from; empty of floats.
+
+    Between the DequantizeLinear and the layer may stand what moves elements and, behind
+    a stored tensor, any arithmetic.
+    """
+    waiting = list(dict.fromkeys(node.inputs[:2]))
+    for value in waiting:
+        made = producer_of(value)
+        if made is None:
+            continue
+        if made.op_type == "DequantizeLinear" and made.inputs[0] is not None:
+            kind = made.inputs[0].dtype
+            return "integers" if kind is None else kind.name.lower()
+        if value in facts.constants or made.op_type in LAYOUT_OPERATORS:
+            waiting += [each for each in made.inputs if each not in waiting]
+    return ""
 
 
 @dataclasses.dataclass(frozen=True)
