@@ -32,7 +32,7 @@ from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, PositiveInt
 
 from me2e_compress.display import reason
 from me2e_compress.errors import FramesError, PreconditionError
-from me2e_compress.graph import static_shape
+from me2e_compress.graph import array_of, static_shape
 from me2e_compress.graph.recurrence import not_fed_back, recurrent_inputs, sides
 from me2e_compress.registry import documents, drafts
 from me2e_compress.registry.documents import UNREADABLE, check_regular
@@ -331,13 +331,14 @@ class CalibrationSet:
         """Read every frame of the whole once and check it against a model's inputs.
 
         Recurrent inputs may be absent. Names that the model lacks are an error, except
-        those that ``freeze-inputs`` made constants: their values must be the same.
+        those of constants, by ``freeze-inputs`` or in the file: their values must be
+        the same.
 
         Raises:
             FramesError: an array is missing, unknown, of another shape or dtype, or not
                 finite.
         """
-        frozen = frozen_inputs(model)
+        frozen, weights = frozen_inputs(model), model.graph.initializers
         inputs = [str(each.name) for each in model.graph.inputs]
         for name in self.pixels:
             if name not in inputs and name not in frozen:
@@ -348,6 +349,9 @@ class CalibrationSet:
         for path in self.files:
             # Compare headers before any array is read.
             held = self._as_fed(path, declared(path), PixelInput.fed)
+            for name in held:
+                if (array := array_of(weights.get(name))) is not None:
+                    frozen.setdefault(name, digest_of(array))
             asked = {name: held[name] for name in held if name not in frozen}
             _check_frame(asked, model, str(path))
             for name, array in load_arrays(path).items():
@@ -358,7 +362,7 @@ class CalibrationSet:
                         f"{path}: {name} is {kind} at {at}, expected finite numbers"
                     )
                 if name in frozen and digest_of(array) != frozen[name]:
-                    line = "is not the one that the graph was made for (freeze-inputs)"
+                    line = "is not the one that the graph was made for, a constant"
                     raise FramesError(f"{path}: {name} {line}")
 
 

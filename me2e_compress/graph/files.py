@@ -82,8 +82,10 @@ def _freeze_defaults(model: ir.Model) -> None:
     names = [str(each.name) for each in model.graph.inputs if each.is_initializer()]
     common.RemoveInitializersFromInputsPass()(model)
     if names and model.ir_version >= PLAIN_INITIALIZERS_SINCE_IR:
-        held = f"{', '.join(names)} held a value: no input any more, but a constant"
-        note_change(model, held)
+        more = f" and {len(names) - 8} more" if len(names) > 8 else ""
+        held = f"{', '.join(names[:8])}{more} held a value: no input any more, but a"
+        way = "what is to stay one, take out of the initializers"
+        note_change(model, f"{held} constant; {way}")
 
 
 def _built(proto: onnx.ModelProto, in_order: bool) -> ir.Model:

@@ -7,12 +7,14 @@ import onnx_ir as ir
 import pytest
 
 from me2e_compress import graph
-from me2e_compress.errors import GraphError
+from me2e_compress.calibration.dataset import CalibrationSet, synthetic
+from me2e_compress.errors import FramesError, GraphError
 from me2e_compress.graph.opset import read_as
 from me2e_compress.graph.runtime_operators import newest_ir, newest_opset
 from me2e_compress.runtime.session import Session
 from me2e_compress.targets.onnxruntime import OnnxRuntime
 from me2e_compress.targets.tensorrt import TensorRT
+from tests.frames import record
 
 
 def written(folder: Path, body: str, *, opset: int = 28, version: int = 15) -> Path:
@@ -153,4 +155,10 @@ def test_an_input_that_holds_a_value_is_a_constant_and_that_is_said(
     found = graph.load(path)
 
     assert [each.name for each in found.graph.inputs] == ["x", "x4", "c", "i"]
-    assert read_as(found) == "a held a value: no input any more, but a constant"
+    assert "a held a value: no input any more, but a constant; what" in read_as(found)
+    # frames that were recorded with it hold that value
+    (frame,) = (dict(each.arrays) for each in synthetic(found, seed=0, count=1))
+    CalibrationSet(record(tmp_path / "2", [frame | {"a": held.numpy()}])).check(found)
+    other = CalibrationSet(record(tmp_path / "3", [frame | {"a": held.numpy() + 1}]))
+    with pytest.raises(FramesError, match="a is not the one that the graph was made"):
+        other.check(found)

@@ -1,9 +1,11 @@
 """Sequences that a graph only takes apart again become plain operators."""
 
 import numpy as np
+import onnx
 import onnx_ir as ir
 import pytest
 
+from me2e_compress.graph import infer_shapes, provenance
 from me2e_compress.passes.sequences import unpack_sequences
 from me2e_compress.runtime.session import run_once
 
@@ -62,3 +64,55 @@ def test_a_sequence_becomes_its_tensors(body: str) -> None:
 def test_other_sequences_stay(body: str) -> None:
     model = graph_of(body)
     assert unpack_sequences(model, "test") == 0
+
+
+BODIES = """<ir_version: 9, opset_import: ["" : 17]>
+    g (bool c, float[2,6] x) => (float[2,4] y) <
+        int64[2] parts = {2, 4}, int64 one = {1}, float[1] s_lengths = {1}
+    > {
+    ["/whole"] whole = SplitToSequence<axis = 1>(x, parts)
+    ["/s_Split_0"] s_Split_0 = Neg(x)
+    ["/if"] y = If(c) <then_branch = t () => (float[2,4] a) {
+        ["s"] s = SplitToSequence<axis = 1>(s_Split_0, parts)
+        ["/at"] at = SequenceAt(s, one)
+        ["/length"] length = SequenceLength(s)
+        ["/cast"] wide = Cast<to = 1>(length)
+        ["/mul"] scaled = Mul(at, wide)
+        ["/a"] a = Mul(scaled, s_lengths)
+    }, else_branch = e () => (float[2,4] b) {
+        ["/outer"] outer = SequenceAt(whole, one)
+        ["/joined"] pair = SequenceConstruct(outer, outer)
+        ["/stack"] stacked = ConcatFromSequence<axis = 0, new_axis = 1>(pair)
+        ["/b"] b = ReduceMax<axes = [0], keepdims = 0>(stacked)
+    }>
+}"""
+
+
+@pytest.mark.parametrize("taken", [True, False])
+def test_bodies_too_have_tensors_with_a_type_a_name_and_a_past(taken: bool) -> None:
+    model = ir.from_onnx_text(BODIES)
+    infer_shapes(model)
+    for node in model.graph.all_nodes():
+        own = provenance.Provenance("planner", (str(node.name),))
+        provenance.stamp(node, own)
+    feeds = {"c": np.array(taken), "x": np.arange(12, dtype=np.float32).reshape(2, 6)}
+    before = run_once(model, feeds)["y"]
+
+    assert unpack_sequences(model, "test") == 3 + 2 + 2
+
+    onnx.checker.check_model(ir.to_proto(model), full_check=True)
+    np.testing.assert_array_equal(run_once(model, feeds)["y"], before)
+    made = {
+        f"{node.op_type} of {past.origins[0]}": past
+        for node in model.graph.all_nodes()
+        if (past := provenance.read(node)) is not None and past.passes == ("test",)
+    }
+    assert {past.module for past in made.values()} == {"planner"}
+    # a new axis is put into both tensors of the pair
+    assert list(made) == [
+        "Split of /whole", "Split of s", "Identity of /at", "Identity of /length",
+        "Identity of /outer", "Unsqueeze of /stack", "Concat of /stack",
+    ]  # fmt: skip
+    splits = [node for node in model.graph.all_nodes() if node.op_type == "Split"]
+    types = {value.dtype for node in splits for value in node.outputs}
+    assert types == {ir.DataType.FLOAT}
