@@ -20,7 +20,7 @@ __all__ = [
 ]
 
 _NOW = "is gone since 0.3.0: use"
-FORMER = {
+_FORMER = {
     "calibration method entropy": f"entropy {_NOW} mse",
     "calibration method moving-average": f"moving-average {_NOW} max-min",
     "quantize-int8 weight_only_gemv": f"weight_only_gemv {_NOW} "
@@ -51,8 +51,8 @@ FORMER = {
     "--on-road": f"search --on-road {_NOW} a study that names the schemes",
     "--most-ablated": f"--most-ablated {_NOW} a study that names the schemes",
     "--baseline-median-s": f"--baseline-median-s {_NOW} a study's key of that name",
-    "--records": f"study --records {_NOW} python -m benchmarks.paper in the repository",
-    "--weigh": f"study --weigh {_NOW} python -m benchmarks.paper in the repository",
+    "--records": f"study --records {_NOW} python -m benchmarks.paper",
+    "--weigh": f"study --weigh {_NOW} python -m benchmarks.paper",
     "--plugins": f"--plugins {_NOW} --provider 'cpu{{plugins=[LIB.so]}}'",
     "--set-dim": f"--set-dim {_NOW} compress M.onnx -r exact --set-dim DIM=N -o"
     " FIXED.onnx, and FIXED.onnx here",
@@ -130,11 +130,18 @@ FORMER = {
     "study condition.limit_fps": f"limit_fps {_NOW} 'limited{{source=trace,fps=10}}'",
     "study road": "the key road is gone since 0.3.0: there is one road, with traffic",
     "study record.road": "the key road is gone since 0.3.0: there is one road",
-    "model expert": f"expert {_NOW} models.driver.expert:Expert, in the repository",
-    "model blind": f"blind {_NOW} models.driver.expert:Blind, in the repository",
+    "model expert": f"expert {_NOW} models.driver.expert:Expert",
+    "model blind": f"blind {_NOW} models.driver.expert:Blind",
     "policy highway-2": f"highway-2 {_NOW} highway",
     "model highway-2": f"highway-2 {_NOW} highway",
     "pass static-geometry": f"static-geometry {_NOW} freeze-inputs, with --frames",
+}
+_NOT_INSTALLED = ("benchmarks", "docs/", "examples/", "models.")
+FORMER = {
+    name: f"{line}, in the repository"
+    if any(each in line for each in _NOT_INSTALLED)
+    else line
+    for name, line in _FORMER.items()
 }
 """Names of 0.2, by kind, and what replaces them; to be deleted with 0.4.0."""
 

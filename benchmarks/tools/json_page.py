@@ -29,7 +29,7 @@ HEAD = """\
 
 With `--json` every command prints one document on standard output, strict JSON: a number that is not finite is null. A command that fails exits with 1 and, unless it found something, prints none. In Python: `result.document()`.
 
-`python -m benchmarks.tools.json_page` writes this page from the result classes (`make docs`). Keys may be added; one that goes, or changes its meaning, raises `schema`.
+`python -m benchmarks.tools.json_page` writes this page from the result classes. Keys may be added; one that goes, or changes its meaning, raises `schema`.
 
 `[T]` is an array of T, `{T}` an object whose keys are names of yours, `{key: T}` one with these keys; `T?` may be null, `key?` may be left out, `+: T` are all keys of T. Capitals begin [objects](#objects); a command's name stands for its document.
 """  # noqa: E501 - a paragraph of the page is one line

@@ -147,7 +147,7 @@ def frames(
 
     The driver that ships drives fresh routes, and the model looks on: highway, or any
     ONNX file that keeps the policy contract (--adapter). With --from, recorded driving
-    is laid out as the file takes it (docs/writing-logs.md).
+    is laid out as the file takes it: docs/writing-logs.md in the repository.
 
     Args:
         stack: highway, or M.onnx

@@ -160,8 +160,8 @@ def load_routes(path: Path = SHIPPED) -> tuple[Route, ...]:
         check_version(path, records[0].get(VERSION))
     if routes and records[0].get(DIGEST) != digest_of(routes):
         raise EvaluationError(
-            f"{path}: was changed after its routes were admitted (its {DIGEST} does not"
-            " fit them); make a set with: python -m benchmarks.tools.admit_routes"
+            f"{path}: changed after its routes were admitted (its {DIGEST} does not fit"
+            " them); in the repository python -m benchmarks.tools.admit_routes makes a set"
         )
     # ids are unique
     seen: dict[str, int] = {}

@@ -221,7 +221,7 @@ def doctor() -> DoctorResult:
 def _energy() -> Checkup:
     found = open_counter()
     if isinstance(found, Absent):
-        advice = f"joules are not measured here: {found.reason}; docs/energy.md"
+        advice = f"joules are not measured here: {found.reason}"
         return Checkup("energy counter", None, advice)
     if isinstance(found, EnergyRecording):
         return Checkup("energy counter", found.counter)

@@ -8,6 +8,7 @@ from collections.abc import Iterator
 
 import pytest
 
+from me2e_compress.errors import FORMER
 from tests.docs.pages import ROOT
 
 TEXT = (ROOT / "docs" / "words.md").read_text(encoding="utf-8")
@@ -49,3 +50,13 @@ def test_a_word_stands_for_one_thing_and_private_ones_are_not_used() -> None:
     classes = Counter(n.name for _, _, n in seen if isinstance(n, ast.ClassDef))
     assert {word: classes[word] for word, _ in WORDS if classes[word] != 1} == {}
     assert [f"{at}: {text[:80]}" for at, text, _ in seen if PATTERN.search(text)] == []
+
+
+def test_what_is_not_installed_is_said_to_be_in_the_repository() -> None:
+    apart = re.compile(
+        r"(?<![`/\w])(python -m [bm]|use benchmarks/|examples/|docs/w|models\.[a-z])"
+    )
+    own = (text for at, text, _ in names_and_texts() if "errors.py" not in at)
+    named = [text for text in (*own, *FORMER.values()) if apart.search(text)]
+    assert len(named) > 20
+    assert [text for text in named if "the repository" not in text] == []
