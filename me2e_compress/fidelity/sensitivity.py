@@ -13,7 +13,12 @@ from me2e_compress import graph
 from me2e_compress.calibration.ranges import Ranges
 from me2e_compress.display import significant
 from me2e_compress.errors import EvaluationError
-from me2e_compress.fidelity.compare import Fidelity, Reference
+from me2e_compress.fidelity.compare import (
+    Fidelity,
+    OutputFidelity,
+    Reference,
+    SetTally,
+)
 from me2e_compress.graph.modules.module_map import ModuleMap
 from me2e_compress.quantization.decision import (
     RESIDUAL,
@@ -80,8 +85,14 @@ class Score:
         """
         if self.fidelity.plan is not None:
             return self.fidelity.plan.mean_m
-        worst = min(each.sqnr_db for each in self.fidelity.outputs)
-        return float(10 ** (-worst / 20))
+        return float(10 ** (-self.worst.sqnr_db / 20))
+
+    @property
+    def worst(self) -> OutputFidelity:
+        """The noisiest output; whole numbers count where there is nothing else."""
+        return min(
+            self.fidelity.outputs, key=lambda each: (each.discrete, each.sqnr_db)
+        )
 
     @property
     def unit(self) -> str:
@@ -90,7 +101,7 @@ class Score:
 
 
 class Trials:
-    """Makes int8 variants of a model and judges them; each choice once.
+    """Makes int8 variants of a model and judges them, sets by agents; each choice once.
 
     ``model`` is the float graph after the exact passes, shapes inferred; fidelity is
     judged on the graph as ``target`` writes it; ``ranges`` cover every tensor that any
@@ -137,11 +148,19 @@ class Trials:
     def score(self, choice: Int8Choice) -> Score:
         """Build, run and judge a choice."""
         if choice not in self._known:
-            graph_of_choice = self.variant(choice)
-            self._known[choice] = Score(
-                self.reference.compare(self._session(graph_of_choice)),
-                graph.size(graph_of_choice).weight_bytes,
+            made = self.variant(choice)
+            session, float_session = self._session(made), self.reference.session
+            sets = SetTally.of(float_session, session)
+            watching = () if sets is None else (sets.add,)
+            fidelity = self.reference.compare(session, watching)
+            # agents in another order are no noise: those that match are compared
+            matched = {} if sets is None else sets.result().sqnr_db
+            outputs = tuple(
+                dataclasses.replace(e, sqnr_db=matched.get(e.name, e.sqnr_db))
+                for e in fidelity.outputs
             )
+            fidelity = dataclasses.replace(fidelity, outputs=outputs)
+            self._known[choice] = Score(fidelity, graph.size(made).weight_bytes)
             self.done += 1
         return self._known[choice]
 

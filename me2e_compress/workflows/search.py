@@ -249,7 +249,7 @@ class SensitivityResult(Result):
             for each in found.findings
         ]
         rows.append(("together", "", *_cells(found.together)))
-        columns = ("module", "nodes", f"loss {unit}", "worst dB")
+        columns = ("module", "nodes", f"loss {unit}", "worst output, dB")
         size = megabytes(found.together.weight_bytes)
         note = f"{counted(found.trials, 'variant')} run; all together {size} MB"
         lines = [
@@ -302,5 +302,5 @@ def measure_sensitivity(
 
 
 def _cells(score: Score) -> tuple[str, str]:
-    worst = min(item.sqnr_db for item in score.fidelity.outputs)
-    return significant(score.loss), f"{worst:.1f}"
+    worst = score.worst
+    return significant(score.loss), f"{worst.name} {worst.sqnr_db:.1f}"

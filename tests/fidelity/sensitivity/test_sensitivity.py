@@ -1,13 +1,14 @@
 import dataclasses
 from pathlib import Path
 
+import numpy as np
 import onnx_ir as ir
 import pytest
 
 from me2e_compress import graph
 from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.errors import EvaluationError
-from me2e_compress.fidelity.compare import Displacement, Fidelity
+from me2e_compress.fidelity.compare import Displacement, Fidelity, Reference
 from me2e_compress.fidelity.sensitivity import (
     Budget,
     Candidate,
@@ -24,9 +25,11 @@ from me2e_compress.fidelity.sensitivity import (
 from me2e_compress.manager import recipe
 from me2e_compress.passes import Context
 from me2e_compress.passes.quantize_int8 import QuantizeInt8
+from me2e_compress.runtime.frames import Frame
+from me2e_compress.runtime.session import Session
 from me2e_compress.workflows.search import SearchResult
 from tests.fidelity.sensitivity.delicate import delicate, trials
-from tests.nets import MODULES
+from tests.nets import MODULES, parsed
 
 
 @pytest.mark.parametrize("bad", [2, 3, 5])
@@ -168,6 +171,34 @@ def test_a_model_without_a_plan_is_judged_by_its_worst_output(tmp_path: Path) ->
     sqnr_db = score.fidelity.outputs[0].sqnr_db
     assert bare.loss == pytest.approx(10 ** (-sqnr_db / 20))
     assert bare.unit == "of the signal"
+
+
+def test_the_worst_output_is_of_agents_that_match_and_no_whole_number(
+    tmp_path: Path,
+) -> None:
+    def seen(order: str, noise: str) -> ir.Model:
+        return parsed(f"""
+            seen (float[1,4] x) => (float[1,4,3] boxes, float[1,4] s, int32[1,4] kind,
+                float[1,4] pose) <int64[4] order = {{{order}}}, float[1] noise =
+                {{{noise}}}, int64[1] two = {{2}}, float[3] far = {{10, 20, 1}}> {{
+            s = Gather<axis=1>(x, order)
+            u = Unsqueeze(s, two) boxes = Mul(u, far) kind = Cast<to=6>(s)
+            pose = Add(x, noise)
+        }}""")  # fmt: skip
+
+    judge, other = trials(tmp_path, 3), seen("3, 1, 0, 2", "0.01")
+    model = seen("0, 1, 2, 3", "0")
+    model.metadata_props["me2e.sets"] = '{"boxes": "boxes", "scores": "s"}'
+    frames = (Frame(0, True, {"x": np.array([[1, 2, 3, 4]], np.float32)}),)
+    judge.reference = Reference.of(Session(model), frames)
+    judge.variant = lambda choice: other  # type: ignore[method-assign]
+
+    score = judge.score(Int8Choice(("head",)))
+
+    _, _, kind, pose = score.fidelity.outputs
+    assert kind.sqnr_db < pose.sqnr_db
+    assert score.worst == pose
+    assert score.loss == pytest.approx(10 ** (-pose.sqnr_db / 20))
 
 
 # The search: int8 modules within budgets, and what is said when nothing fits.
