@@ -9,7 +9,7 @@ from google.protobuf.message import DecodeError
 
 from me2e_compress import graph
 from me2e_compress.calibration.dataset import CalibrationSet
-from me2e_compress.driving.adapter.outputs import stated
+from me2e_compress.driving.adapter.outputs import state_and_plan
 from me2e_compress.driving.host_stage import HOST_STAGES
 from me2e_compress.driving.policies import Driver, driver_named
 from me2e_compress.errors import GraphError, Me2eError, StudyError
@@ -101,7 +101,7 @@ def prepare_variant(
         origin = _reported_beside(model) or origin
     loaded = graph.load(model)
     weights = loaded.metadata_props.get(WEIGHTS, "")
-    said, known = stated(loaded, model, variant.adapter, variant.module_map, {})
+    said, known = state_and_plan(loaded, model, variant.adapter, variant.module_map, {})
     if slow := slow_here(loaded, study.provider):
         listener.on_warning(f"variant {variant.name}: {slow}")
     size = graph.file_bytes(model)

@@ -33,7 +33,7 @@ import platformdirs
 from me2e_compress import graph
 from me2e_compress.calibration.dataset import CalibrationSet, archive_of
 from me2e_compress.display import counted
-from me2e_compress.driving.adapter.outputs import adapted, stated
+from me2e_compress.driving.adapter.outputs import adapted, state_and_plan
 from me2e_compress.errors import FORMER, GraphError
 from me2e_compress.graph.modules.assign import map_of
 from me2e_compress.graph.modules.module_map import ModuleMap
@@ -412,7 +412,7 @@ def opened(
     model = graph.load(path)
     module_map = options.module_map or own_map(path)
     own = {each: graph.load(each).metadata_props for each in others if each != path}
-    known = stated(model, path, options.adapter, module_map, own)
+    known = state_and_plan(model, path, options.adapter, module_map, own)
     recording.check(model)
     provider = options.runs_on
     try_first(

@@ -105,11 +105,11 @@ def adapted(
     returned, for a session that opens the file itself. What does not fit the graph
     raises EvaluationError.
     """
-    said = dict[str, str]()
+    metadata = dict[str, str]()
     if module_map is not None:
         modules = ModuleMap.load(str(module_map))
         for ports in (*modules.optional, modules.ports):
-            said |= _stated(model, modules, ports, said)
+            metadata |= _of_map(model, modules, ports, metadata)
     if adapter is not None:
         found = Adapter.load(adapter_file(Path(adapter)))
         inputs = [str(each.name) for each in model.graph.inputs]
@@ -120,13 +120,13 @@ def adapted(
                     f"adapter {adapter}: it feeds input {name}; there are"
                     f" {', '.join(inputs)}"
                 )
-        said |= found.metadata({**model.metadata_props, **said})
-        _check_stated(model, f"adapter {adapter}", found.plan, said)
-    model.metadata_props.update(said)
-    return said
+        metadata |= found.metadata({**model.metadata_props, **metadata})
+        _check_fit(model, f"adapter {adapter}", found.plan, metadata)
+    model.metadata_props.update(metadata)
+    return metadata
 
 
-def stated(
+def state_and_plan(
     model: ir.Model,
     path: Path,
     adapter: Given,
@@ -148,8 +148,8 @@ def stated(
     for origin, given in (("map", (None, module_map)), ("adapter", (adapter, None))):
         named = Path(str(given[0] or given[1])).name
         sources.append((f"{origin} {named}", adapted(model, *given)))
-    said = {key: text for _, own in sources[1:] for key, text in own.items()}
-    # what is known, by where it was said last
+    added = {key: text for _, own in sources[1:] for key, text in own.items()}
+    # what is known, by where it stands last
     pairs, plan = dict[str, tuple[str | None, str]](), ("", "its name")
     for origin, own in sources:
         for name, answer in (declared_pairs(own) or {}).items():
@@ -166,7 +166,7 @@ def stated(
     if (found := PlanAdapter.of(model.metadata_props, outputs)) is not None:
         known.setdefault(plan[1], []).append(f"plan {found.output}")
     line = "; ".join(f"{', '.join(each)}: {origin}" for origin, each in known.items())
-    return said, line
+    return added, line
 
 
 def _lent(model: ir.Model, metadata: Mapping[str, str]) -> dict[str, str]:
@@ -189,7 +189,7 @@ def _lent(model: ir.Model, metadata: Mapping[str, str]) -> dict[str, str]:
     return lent
 
 
-def _stated(
+def _of_map(
     model: ir.Model, modules: ModuleMap, ports: Ports, before: Mapping[str, str]
 ) -> dict[str, str]:
     """Return the metadata that a map states; none where optional ports do not fit."""
@@ -206,9 +206,9 @@ def _stated(
         return {}
     origin = f"map {modules.name}"
     found = Adapter.parse({"plan": plan, "recurrent": pairs}, origin)
-    said = found.metadata(own) | sets
+    metadata = found.metadata(own) | sets
     try:
-        _check_stated(model, origin, found.plan, said)
+        _check_fit(model, origin, found.plan, metadata)
         outputs = [str(each.name) for each in model.graph.outputs]
         for name in np.hstack([np.array([], str), *ports.sets.values()]):
             if name not in outputs:
@@ -220,20 +220,20 @@ def _stated(
             return {}
         words = str(error).removeprefix(f"{origin}: ")
         raise EvaluationError(f"{origin}: {words}") from error
-    return said
+    return metadata
 
 
-def _check_stated(
-    model: ir.Model, origin: str, plan: PlanAdapter | None, said: Mapping[str, str]
+def _check_fit(
+    model: ir.Model, origin: str, plan: PlanAdapter | None, metadata: Mapping[str, str]
 ) -> None:
     """Check that plan and recurrent state are found under the new metadata."""
     outputs = [str(each.name) for each in model.graph.outputs]
     try:
         if plan is not None:
             plan_of(plan, {}, outputs)
-        recurrence({**model.metadata_props, **said}, *sides(model))
+        recurrence({**model.metadata_props, **metadata}, *sides(model))
     except (EvaluationError, GraphError) as error:
-        # whoever stated it is to blame, not the graph
+        # the map or adapter is to blame, not the graph
         words = str(error).replace(f"metadata {RECURRENT}", "[recurrent]")
         raise EvaluationError(f"{origin}: {words}") from error
 
