@@ -121,6 +121,12 @@ def counted(count: float, noun: str) -> str:
     return f"{text} {noun}{'' if text == '1' else 's'}"
 
 
+def some_of(names: Sequence[str], most: int = 5) -> str:
+    """Write the first of many names, and how many more there are."""
+    more = f" and {len(names) - most:,} more" if len(names) > most else ""
+    return ", ".join(names[:most]) + more
+
+
 def duration(seconds: float) -> str:
     """Write a time as people say it: ``40 s``, ``3 min``, ``2 h 5 min``."""
     if seconds < 90:

@@ -438,9 +438,10 @@ def synthetic(model: ir.Model, *, seed: int, count: int) -> Iterator[Frame]:
                 " a static shape, give frames instead, or sizes"
                 " (compress --set-dim)"
             )
-        if value.dtype.numpy().kind not in "fiub":
+        tensors = isinstance(value.type, ir.TensorType)
+        if not tensors or value.dtype.numpy().kind not in "fiub":
             raise PreconditionError(
-                f"input {value.name} is {value.dtype.name}: seeded inputs are numbers"
+                f"input {value.name} is {value.type}: seeded inputs are numbers"
             )
     # Frames are drawn lazily, all from one generator.
     generator = np.random.default_rng(seed)

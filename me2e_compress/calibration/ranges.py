@@ -11,7 +11,7 @@ import pydantic
 
 from me2e_compress.calibration.observers import OBSERVERS, MaxMin, Observer
 from me2e_compress.calibration.statistics import ALL_ZERO, NOT_FINITE, Statistics
-from me2e_compress.display import counted
+from me2e_compress.display import counted, some_of
 from me2e_compress.errors import FramesError
 from me2e_compress.registry import documents
 from me2e_compress.runtime.atomic import write_document
@@ -212,8 +212,8 @@ class Ranges:
             if self.method == IMPORTED:
                 again = "give the overrides that stand beside it (--overrides)"
             raise FramesError(
-                f"{named}: lacks {missing[0]} and {len(missing) - 1} more of"
-                f" {len(tensors)} tensors; {again}"
+                f"{named}: of {len(tensors)} tensors lacks {some_of(missing, 1)};"
+                f" {again}"
             )
 
 

@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 import onnx_ir as ir
 
-from me2e_compress.display import counted
+from me2e_compress.display import counted, some_of
 from me2e_compress.errors import FramesError
 from me2e_compress.graph.nodes import FLOATS, grid_of, reads_of
 from me2e_compress.runtime.frames import Array
@@ -203,9 +203,9 @@ def check_finite(
     # Name the first tensor, and how many more there are.
     names = [tensors[at] for at in np.flatnonzero(bad).tolist()]
     kind = "NaN" if np.isnan(readings[bad][0]).any() else "infinite"
-    more = f" ({', '.join(names[1:5])}{', ...' if len(names) > 5 else ''})"
+    more = f", and of {len(tensors)} {some_of(names[1:], 4)}"
     raise FramesError(
-        f"frame {place} makes tensor {names[0]} {kind}, and {len(names) - 1} more of"
-        f" {len(tensors)}{more if len(names) > 1 else ''}: no range can be read from it"
+        f"frame {place} makes tensor {names[0]} {kind}{more if len(names) > 1 else ''}:"
+        " no range can be read from it"
         f"{cause and f'; {cause}'}"
     )

@@ -13,11 +13,12 @@ import onnx_ir as ir
 import onnx_ir.passes.common as common
 from google.protobuf.message import DecodeError
 
-from me2e_compress.display import reason
+from me2e_compress.display import reason, some_of
 from me2e_compress.errors import GraphError
 from me2e_compress.graph import provenance, structure
 from me2e_compress.graph.nodes import STANDARD, nodes_of
 from me2e_compress.graph.opset import fit, note_change
+from me2e_compress.graph.recurrence import recurrent_inputs
 from me2e_compress.graph.summary import weight_bytes
 from me2e_compress.graph.validity import PLAIN_INITIALIZERS_SINCE_IR
 from me2e_compress.registry import drafts
@@ -77,15 +78,22 @@ def load(path: str | Path) -> ir.Model:
 def _freeze_defaults(model: ir.Model) -> None:
     """Make constants of inputs that have initializers, and note that in the model.
 
-    Before IR version 4 every initializer had to be an input: nobody fed those.
+    Before IR version 4 every initializer had to be an input: nobody fed those. A state
+    stays an input: it is fed back, and begins as zeros.
     """
+    weights = model.graph.initializers
+    if any(each.is_initializer() for each in model.graph.inputs):
+        for name in filter(weights.__contains__, recurrent_inputs(model)):
+            state = weights.pop(name)
+            if state.const_value is not None and state.const_value.numpy().any():
+                note_change(model, f"state {name} held a value, and begins as zeros")
+            state.const_value = None
     names = [str(each.name) for each in model.graph.inputs if each.is_initializer()]
     common.RemoveInitializersFromInputsPass()(model)
     if names and model.ir_version >= PLAIN_INITIALIZERS_SINCE_IR:
-        more = f" and {len(names) - 8} more" if len(names) > 8 else ""
-        held = f"{', '.join(names[:8])}{more} held a value: no input any more, but a"
+        held = f"{some_of(names)} held a value: no input any more, but a constant"
         way = "what is to stay one, take out of the initializers"
-        note_change(model, f"{held} constant; {way}")
+        note_change(model, f"{held}; {way}")
 
 
 def _built(proto: onnx.ModelProto, in_order: bool) -> ir.Model:

@@ -99,12 +99,14 @@ class Int8Outcome:
         layers = [each for each in plan.decisions if each.op in WEIGHTED]
         placed = {each.output for each in plan.placed}
         left = [each for each in layers if each.output not in placed]
+        why = {each.output: f"target: {each.reason}" for each in plan.kept_float}
+        kept = Counter(why.get(e.output, f"{e.rule}: {e.reason}") for e in left)
         slow = plan.target == "tensorrt" and context.provider.native == CPU.native
         return cls(
             name,
             changes,
             len(layers),
-            dict(Counter(f"{e.rule}: {e.reason}" for e in left).most_common()),
+            dict(kept.most_common()),
             float_bytes(quantizer.before, plan),
             _FOR_TENSORRT if changes and slow else None,
         )
@@ -132,7 +134,8 @@ class Int8Outcome:
         # say what the layers are kept float by, the commonest rules first
         found = [f"{self.by} made nothing int8"]
         if self.layers is not None:
-            found.append(f"{self.layers} convolutions and matrix products in the graph")
+            of = "(convolutions, matrix products) in the graph"
+            found.append(f"{counted(self.layers, 'layer')} {of}")
         most = list(self.kept.items())[:2]
         found += [f"{count} by rule {why}" for why, count in most]
         return "; ".join(found)

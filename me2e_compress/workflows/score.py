@@ -4,7 +4,7 @@ import dataclasses
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
-from me2e_compress.display import Table, not_measured, number, table
+from me2e_compress.display import Table, not_measured, number, some_of, table
 from me2e_compress.errors import EvaluationError
 from me2e_compress.evaluators.bench2drive.real_results import (
     Bench2DriveResults,
@@ -142,12 +142,6 @@ def score_real_run(
         metrics.score(episodes, set_size),
         leaderboard_scores(episodes, set_size),
     )
-
-
-def some_of(names: Sequence[str]) -> str:
-    """Return the first few of many names."""
-    more = f" and {len(names) - _NAMED} more" if len(names) > _NAMED else ""
-    return ", ".join(names[:_NAMED]) + more
 
 
 @dataclasses.dataclass(frozen=True, repr=False)

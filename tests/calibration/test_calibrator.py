@@ -90,8 +90,11 @@ def test_what_is_not_a_number_is_found_wherever_it_hides(
     second["image"].flat[at] = bad
     frames = CalibrationSet(record(tmp_path, [image(0), second]))
 
-    with pytest.raises(FramesError, match=f"frame 1 makes tensor image {word}"):
+    whole = f"frame 1 makes tensor image {word}: no range"
+    with pytest.raises(FramesError, match=whole):
         Calibrator(threads=1).run(conv_attention(), ["image"], frames)
+    with pytest.raises(FramesError, match=f"image {word}, and of 3 a, r: no range"):
+        Calibrator(threads=1).run(conv_attention(), ["image", "a", "r"], frames)
 
 
 def test_dead_tensors_are_named(tmp_path: Path) -> None:
@@ -146,7 +149,7 @@ def test_saved_ranges_come_back(ranges: Ranges, tmp_path: Path) -> None:
         ({"model": "other"}, "r.json: stale: of graph other"),
         ({"source": "other"}, "r.json: stale: of frames other"),
         ({"method": "mse"}, "r.json: of method mse, asked for max-min"),
-        ({"tensors": {}}, "r.json: lacks a and 0 more of 1"),
+        ({"tensors": {}}, "r.json: of 1 tensors lacks a; "),
     ],
 )
 def test_stale_ranges_are_refused(

@@ -66,7 +66,7 @@ def test_a_cache_of_tensorrt_10_becomes_an_explicit_graph(
     how = f"compress m.onnx --scheme full --rules paper --target tensorrt {MAP}"
     how += " --ranges back.json"
     refused = cli.refused(f"{how} -o int8.onnx")
-    assert "back.json: lacks p and 0 more of" in refused
+    assert "back.json: of 5 tensors lacks p;" in refused
     assert "give the overrides that stand beside it" in refused
     cli.done(f"{how} --overrides back.overrides.toml -o int8.onnx")
 

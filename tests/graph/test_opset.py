@@ -162,3 +162,20 @@ def test_an_input_that_holds_a_value_is_a_constant_and_that_is_said(
     other = CalibrationSet(record(tmp_path / "3", [frame | {"a": held.numpy() + 1}]))
     with pytest.raises(FramesError, match="a is not the one that the graph was made"):
         other.check(found)
+
+
+def test_a_state_that_holds_a_value_stays_an_input(tmp_path: Path) -> None:
+    path = written(tmp_path, "y = Mul(x, x)", opset=17, version=8)
+    model = ir.load(path)
+    model.metadata_props["me2e.recurrent"] = '{"x": "y"}'
+    x = model.graph.inputs[0]
+    x.const_value = ir.tensor(np.eye(4, dtype=np.float32), name="x")
+    model.graph.register_initializer(x)
+    ir.save(model, path)
+
+    found = graph.load(path)
+
+    assert [each.name for each in found.graph.inputs] == ["x", "x4", "a", "c", "i"]
+    assert not found.graph.initializers
+    assert found.graph.inputs[0].const_value is None
+    assert read_as(found) == "state x held a value, and begins as zeros"

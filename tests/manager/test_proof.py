@@ -115,12 +115,17 @@ def test_sizes_are_drawn_until_the_graph_runs(
             "^input x is STRING: seeded inputs are numbers$",
         ),
         (
+            """m (seq(float[2]) x) => (float[2] y) <int64 zero = {0}> {
+            ["/backbone/At"] y = SequenceAt(x, zero) }""",
+            r"^input x is Sequence\(.*: seeded inputs are numbers$",
+        ),
+        (
             """m (float[64] x) => (float[64] noise) {
             ["/backbone/Noise"] noise = RandomNormalLike(x) }""",
             "^noise: another at every run$",
         ),
     ],
-    ids=["no size", "no numbers", "drawn"],
+    ids=["no size", "no numbers", "no tensor", "drawn"],
 )
 def test_what_cannot_be_compared_is_not_proven(
     text: str, reason: str, context: Context

@@ -14,7 +14,7 @@ from me2e_compress.graph import static_shape
 from me2e_compress.manager import recipe
 from me2e_compress.passes import PASSES, Context
 from me2e_compress.passes.quantize_int8 import QuantizeInt8
-from me2e_compress.quantization.costs import Border, Costs, CostsOf, Join
+from me2e_compress.quantization.costs import Border, Costs, CostsOf, Join, Loss
 from me2e_compress.quantization.decision import Overrides, QuantPlan
 from me2e_compress.quantization.plan import make_plan
 from me2e_compress.quantization.rules import RULE_SETS, Rule, RuleFacts, RuleSet
@@ -151,6 +151,8 @@ def test_a_layer_that_pays_more_than_it_saves_stays_float() -> None:
         "int8 would save 2.0 µs of arithmetic and take 30.0 µs to quantize and"
         " dequantize on a slow bus"
     )
+    slower = str(Loss(-2e-6, 30e-6, layers=3))
+    assert slower.startswith("int8 would add 2.0 µs to arithmetic and take 30.0 µs")
     assert decisions["MatMul"].dtype == "int8"
     plan = priced(dear, '[[override]]\nop = "Conv"\ndtype = "int8"')  # it beats it
     assert [each.rule for each in plan.chosen if each.op == "Conv"] == ["override"]

@@ -7,6 +7,7 @@ from typing import Literal
 
 import onnx_ir as ir
 
+from me2e_compress.display import some_of
 from me2e_compress.errors import ModuleMapError
 from me2e_compress.graph.modules.module_map import (
     ModuleMap,
@@ -210,8 +211,7 @@ def _check_required(modules: ModuleMap, paths: Collection[str]) -> None:
 
 def _sample(paths: Iterable[str]) -> str:
     tops = list(dict.fromkeys(".".join(path.split(".")[:2]) for path in paths if path))
-    more = f" and {len(tops) - 8} more" if len(tops) > 8 else ""
-    return ", ".join(tops[:8]) + more if tops else "no scopes and no named parameters"
+    return some_of(tops, 8) or "no scopes and no named parameters"
 
 
 def _parameters(model: ir.Model) -> list[str]:
