@@ -161,7 +161,8 @@ def load_routes(path: Path = SHIPPED) -> tuple[Route, ...]:
     if routes and records[0].get(DIGEST) != digest_of(routes):
         raise EvaluationError(
             f"{path}: changed after its routes were admitted (its {DIGEST} does not fit"
-            " them); in the repository python -m benchmarks.tools.admit_routes makes a set"
+            " them); python -m benchmarks.tools.admit_routes of the repository makes"
+            " a set"
         )
     # ids are unique
     seen: dict[str, int] = {}
