@@ -26,6 +26,7 @@ from me2e_compress.operators.replace import (
     expand,
     fused_nodes,
     import_domains,
+    raise_for_bodies,
     set_output,
     translate,
 )
@@ -52,6 +53,7 @@ __all__ = [
     "op_types",
     "operators",
     "position_inputs",
+    "raise_for_bodies",
     "score_inputs",
     "set_output",
     "translate",

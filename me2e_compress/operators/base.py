@@ -40,6 +40,7 @@ class Operator(abc.ABC):
         output: the dimensions of the output in the own form: letters of the operands,
             integer attributes by name, and numbers.
         work: what to multiply for the multiply-accumulates of a call, likewise.
+        opset: the first of ONNX's that its body is written in, 13 or later.
     """
 
     name: ClassVar[str]
@@ -48,6 +49,7 @@ class Operator(abc.ABC):
     int8_inputs: ClassVar[tuple[int, ...]] = ()
     output: ClassVar[str] = ""
     work: ClassVar[str] = ""
+    opset: ClassVar[int] = 13  # ReduceSum and Unsqueeze take their axes as inputs
 
     @abc.abstractmethod
     def body(self, call: FusedCall, inputs: Values, attributes: Attributes) -> ir.Value:

@@ -7,9 +7,8 @@ from typing import ClassVar
 import numpy as np
 import onnx_ir as ir
 
-from me2e_compress.errors import PreconditionError
 from me2e_compress.operators.base import Operator
-from me2e_compress.operators.bilinear import sample_levels, sample_levels_array
+from me2e_compress.operators.bilinear import sample_levels_array
 from me2e_compress.operators.call import Attributes, FusedCall
 from me2e_compress.operators.dialect import (
     FLOAT32,
@@ -26,9 +25,6 @@ from me2e_compress.operators.dialect import (
     numbers,
     present,
 )
-
-DEFORM_CONV_OPSET = 19
-"""The first opset of ONNX's DeformConv."""
 
 _NAMES = ("stride", "padding", "dilation")
 
@@ -78,6 +74,7 @@ class DeformableConvolution(Operator):
     name: ClassVar[str] = "deformable-convolution"
     output: ClassVar[str] = "N O F G"
     work: ClassVar[str] = "N O F G I R S"
+    opset: ClassVar[int] = 19
     own: ClassVar[Dialect] = Dialect(
         "me2e", _CONV, OWN_DOMAIN, _operands(FLOATS), "me2e", _OWN
     )
@@ -91,23 +88,18 @@ class DeformableConvolution(Operator):
     )
 
     def body(self, call: FusedCall, inputs: Values, attributes: Attributes) -> ir.Value:
-        """Write ONNX's DeformConv, or below opset 19 samples and a product."""
+        """Write ONNX's DeformConv."""
         image, offset, mask, weight = present(inputs[:4])
         bias = inputs[4] if len(inputs) > 4 else None
-        if call.opset >= DEFORM_CONV_OPSET:
-            down, across = numbers(attributes, "padding")
-            options: dict[str, int | tuple[int, ...]] = {
-                "strides": numbers(attributes, "stride"),
-                "dilations": numbers(attributes, "dilation"),
-                "pads": (down, across, down, across),
-                "group": number(attributes, "groups"),
-                "offset_group": number(attributes, "deform_groups"),
-            }
-            return call.add("DeformConv", [image, weight, offset, bias, mask], options)
-        result = _by_samples(call, image, offset, mask, weight, attributes)
-        if bias is None:
-            return result
-        return call.add("Add", [result, call.unsqueeze(bias, (0, 2, 3))])
+        down, across = numbers(attributes, "padding")
+        options: dict[str, int | tuple[int, ...]] = {
+            "strides": numbers(attributes, "stride"),
+            "dilations": numbers(attributes, "dilation"),
+            "pads": (down, across, down, across),
+            "group": number(attributes, "groups"),
+            "offset_group": number(attributes, "deform_groups"),
+        }
+        return call.add("DeformConv", [image, weight, offset, bias, mask], options)
 
     def reference(self, inputs: Arrays, attributes: Attributes) -> NdArray:
         """Compute it in numpy, [N, O, F, G] float64."""
@@ -154,71 +146,3 @@ def kernel_positions(
     grid[..., 0] = axes[0][:, None, :, None]
     grid[..., 1] = axes[1][None, :, None, :]
     return grid.reshape(out[0] * out[1], kernel[0] * kernel[1], 1, 2)
-
-
-def _by_samples(
-    call: FusedCall,
-    image: ir.Value,
-    offset: ir.Value,
-    mask: ir.Value,
-    weight: ir.Value,
-    attributes: Attributes,
-) -> ir.Value:
-    # All sizes but that of the batch must be known
-    batch = call.size(image, 0)
-    asked = [(image, (1, 2, 3)), (offset, (2, 3)), (weight, (0, 1, 2, 3))]
-    found = [call.known_size(value, axis) for value, axes in asked for axis in axes]
-    known = [size for size in found if size is not None]
-    if len(known) < len(found):
-        raise PreconditionError(
-            f"node {call.node.name}: below opset {DEFORM_CONV_OPSET} the shapes of"
-            f" {image.name}, {offset.name} and {weight.name} must be known"
-        )
-    deep, high, wide, down, across, out, part, *kernel = known
-    count, places = math.prod(kernel), down * across
-    parts, groups = number(attributes, "deform_groups"), deep // part
-    # The image as one level, with deform groups as heads
-    value = call.reshape(image, (batch, parts, deep // parts, high * wide))
-    value = call.transpose(value, (0, 3, 1, 2))  # [N, H*W, parts, C / parts]
-    grid = kernel_positions((down, across), (kernel[0], kernel[1]), attributes)
-    moved = call.reshape(offset, (batch, parts, count, 2, places))
-    locations = _locations(call, moved, grid, (high, wide))
-    shape = (batch, places * count, parts, 1, 1)
-    shares = call.reshape(mask, (batch, parts, count, places))
-    shares = call.reshape(call.transpose(shares, (0, 3, 2, 1)), shape)
-    # Sample with the mask as weight
-    taken = sample_levels(
-        call,
-        value,
-        call.sizes((high, wide), (1, 2)),
-        call.integers([0]),
-        call.reshape(locations, (*shape, 2)),
-        shares,
-    )
-    # One product per group
-    taken = call.reshape(taken, (batch, places, count, groups, part))
-    taken = call.transpose(taken, (0, 3, 4, 2, 1))
-    taken = call.reshape(taken, (batch, groups, part * count, places))
-    matrix = call.reshape(weight, (groups, out // groups, part * count))
-    result = call.add("MatMul", [matrix, taken])
-    return call.reshape(result, (batch, out, down, across))
-
-
-def _locations(
-    call: FusedCall, offsets: ir.Value, grid: NdArray, image: tuple[int, int]
-) -> ir.Value:
-    """Write x and y of each kernel element in 0..1 of the image.
-
-    ``offsets`` is [N, deform_groups, elements, 2, F * G], ``grid`` what
-    :func:`kernel_positions` gives; the result [N, F * G, elements, deform_groups, 2].
-    """
-    moved = call.transpose(offsets, (0, 4, 2, 1, 3))
-    at = call.add("Add", [moved, call.numbers(grid, moved)])
-    y, x = call.split_last(at, 2)
-    half = call.numbers(0.5, at)
-    edges = []
-    for axis, size in ((x, image[1]), (y, image[0])):
-        centre = call.add("Add", [axis, half])
-        share = call.add("Div", [centre, call.numbers(float(size), axis)])
-        edges.append(call.unsqueeze(share, (-1,)))
-    return call.concat(edges, -1)

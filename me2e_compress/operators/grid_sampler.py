@@ -8,10 +8,9 @@ from typing import ClassVar
 import numpy as np
 import onnx_ir as ir
 
-from me2e_compress.errors import PreconditionError
 from me2e_compress.graph.shapes import Dims
 from me2e_compress.operators.base import Operator
-from me2e_compress.operators.call import Attributes, FusedCall, Size
+from me2e_compress.operators.call import Attributes, FusedCall
 from me2e_compress.operators.dialect import (
     FLOAT32,
     FLOATS,
@@ -27,7 +26,7 @@ from me2e_compress.operators.dialect import (
     present,
 )
 
-# ``grid_sample`` in any number of dimensions, by Gather and in numpy.
+# ``grid_sample`` in any number of dimensions, in numpy.
 
 
 _BILINEAR, _NEAREST, _BICUBIC = range(3)
@@ -37,122 +36,6 @@ BILINEAR = {"interpolation_mode": _BILINEAR, "padding_mode": _ZEROS, "align_corn
 
 _CUBIC = -0.75
 """The parameter of torch's and ONNX's cubic convolution (Keys 1981 has -0.5)."""
-
-
-def grid_by_gather(
-    call: FusedCall, image: ir.Value, grid: ir.Value, attributes: Attributes
-) -> ir.Value:
-    """Write the neighbours of each position and their weighted sum; not bicubic."""
-    mode = number(attributes, "interpolation_mode")
-    if mode == _BICUBIC:
-        raise PreconditionError(
-            f"node {call.node.name}: bicubic sampling needs GridSample, of opset 16"
-        )
-    # One row of channels per pixel
-    rank = len(image.shape) if image.shape is not None else 4
-    sizes = [call.size(image, axis) for axis in range(2, rank)]
-    batch, channels = call.size(image, 0), call.size(image, 1)
-    rows = call.reshape(image, (batch, channels, -1))
-    rows = call.reshape(call.transpose(rows, (0, 2, 1)), (-1, channels))
-    # Neighbours along each axis
-    axes = [
-        _neighbours(call, at, size, attributes)
-        for at, size in zip(
-            call.split_last(grid, len(sizes)), reversed(sizes), strict=True
-        )
-    ]  # x first
-    # Add all combinations of neighbours
-    step = call.value_of(call.product(*sizes))
-    first = call.add("Mul", [call.counting(batch), step])
-    first = call.unsqueeze(first, range(1, rank - 1))
-    total: ir.Value | None = None
-    for near in itertools.product(*axes):
-        index, share = _one(call, near, sizes)
-        taken = call.add("Gather", [rows, call.add("Add", [first, index])], {"axis": 0})
-        taken = call.add("Mul", [taken, call.unsqueeze(share, (-1,))])
-        total = taken if total is None else call.add("Add", [total, taken])
-    if total is None:
-        raise PreconditionError(f"node {call.node.name}: {image.name} has no dimension")
-    return call.transpose(total, (0, rank - 1, *range(1, rank - 1)))
-
-
-def _one(
-    call: FusedCall, near: Sequence[tuple[ir.Value, ir.Value]], sizes: Sequence[Size]
-) -> tuple[ir.Value, ir.Value]:
-    """Write index and share of one neighbour from those along x, y, ..."""
-    (index, share), *others = near
-    step = call.value_of(sizes[-1])
-    for (along, part), size in zip(others, reversed(sizes[:-1]), strict=True):
-        index = call.add("Add", [index, call.add("Mul", [along, step])])
-        share = call.add("Mul", [share, part])
-        known = step.const_value
-        step_size = step if known is None else int(known.numpy().item())
-        step = call.value_of(call.product(step_size, size))
-    return index, share
-
-
-def _neighbours(
-    call: FusedCall, at: ir.Value, size: Size, attributes: Attributes
-) -> list[tuple[ir.Value, ir.Value]]:
-    """Write index and share of the pixels around a position on one axis."""
-    kind = at.dtype or ir.DataType.FLOAT
-    count = call.cast(call.value_of(size), kind)
-    one = call.numbers(1.0, at)
-    last = call.add("Sub", [count, one])
-    # The pixel position, after padding
-    pixel = _padded(call, _pixel(call, at, count, last, attributes), last, attributes)
-    # The neighbours and their shares
-    if attributes["interpolation_mode"] == _NEAREST:
-        edges: list[tuple[ir.Value, ir.Value | None]]
-        edges = [(call.add("Round", [pixel]), None)]
-    else:
-        low = call.add("Floor", [pixel])
-        part = call.add("Sub", [pixel, low])
-        rest = call.add("Sub", [one, part])
-        edges = [(low, rest), (call.add("Add", [low, one]), part)]
-    # Neighbours outside of the image have no share
-    zero, found = call.numbers(0.0, at), []
-    for edge, share in edges:
-        kept = call.add("Max", [call.add("Min", [edge, last]), zero])
-        inside = call.cast(call.add("Equal", [kept, edge]), kind)
-        share = inside if share is None else call.add("Mul", [share, inside])
-        found.append((call.cast(kept, ir.DataType.INT64), share))
-    return found
-
-
-def _pixel(
-    call: FusedCall,
-    at: ir.Value,
-    count: ir.Value,
-    last: ir.Value,
-    attributes: Attributes,
-) -> ir.Value:
-    moved = call.add("Add", [at, call.numbers(1.0, at)])
-    half = call.numbers(0.5, at)
-    if attributes["align_corners"]:
-        return call.add("Mul", [call.add("Mul", [moved, half]), last])
-    scaled = call.add("Mul", [call.add("Mul", [moved, half]), count])
-    return call.add("Sub", [scaled, half])
-
-
-def _padded(
-    call: FusedCall, pixel: ir.Value, last: ir.Value, attributes: Attributes
-) -> ir.Value:
-    padding = number(attributes, "padding_mode")
-    if padding == _ZEROS:
-        return pixel
-    zero, one = call.numbers(0.0, pixel), call.numbers(1.0, pixel)
-    if padding == _REFLECTION:
-        aligned = bool(attributes["align_corners"])
-        low = call.numbers(0.0 if aligned else -0.5, pixel)
-        span = last if aligned else call.add("Add", [last, one])
-        span = call.add("Max", [span, one])  # one pixel alone has nothing to reflect
-        period = call.add("Add", [span, span])
-        off = call.add("Abs", [call.add("Sub", [pixel, low])])
-        off = call.add("Mod", [off, period], {"fmod": 1})
-        off = call.add("Min", [off, call.add("Sub", [period, off])])
-        pixel = call.add("Add", [off, low])
-    return call.add("Max", [call.add("Min", [pixel, last]), zero])
 
 
 def grid_sample_array(inputs: Arrays, attributes: Attributes) -> NdArray:
@@ -324,25 +207,21 @@ class GridSampler2D(Operator):
             _OWN,
         ),
     )
-    native_opset: ClassVar[int] = 16
+    opset: ClassVar[int] = 16
 
     def body(self, call: FusedCall, inputs: Values, attributes: Attributes) -> ir.Value:
-        """Write GridSample, or below its opset a Gather, which cannot be bicubic."""
+        """Write GridSample, which onnxruntime's CPU has for float32 in every opset."""
         image, grid = present(inputs)
         kind = image.dtype or ir.DataType.FLOAT
-        if kind == ir.DataType.FLOAT16:  # onnxruntime's CPU has no kernel for it
+        if kind != ir.DataType.FLOAT:
             image, grid = (call.cast(each, ir.DataType.FLOAT) for each in (image, grid))
-        if call.opset < self.native_opset:
-            result = grid_by_gather(call, image, grid, attributes)
-        else:
-            modes = _NEW_MODES if call.opset >= _RENAMED else _MODES
-            options: dict[str, str | int] = {
-                "mode": modes[number(attributes, "interpolation_mode")],
-                "padding_mode": _PADDING[number(attributes, "padding_mode")],
-                "align_corners": number(attributes, "align_corners"),
-            }
-            result = call.add("GridSample", [image, grid], options)
-        return call.cast(result, kind)
+        modes = _NEW_MODES if call.opset >= _RENAMED else _MODES
+        options: dict[str, str | int] = {
+            "mode": modes[number(attributes, "interpolation_mode")],
+            "padding_mode": _PADDING[number(attributes, "padding_mode")],
+            "align_corners": number(attributes, "align_corners"),
+        }
+        return call.cast(call.add("GridSample", [image, grid], options), kind)
 
     def reference(self, inputs: Arrays, attributes: Attributes) -> NdArray:
         """Compute it in numpy, [N, C, ...] float64."""
@@ -379,4 +258,4 @@ class GridSampler3D(GridSampler2D):
     work: ClassVar[str] = "N C E F G"
     own: ClassVar[Dialect] = _own(3)
     dialects: ClassVar[tuple[Dialect, ...]] = _scaled(3)
-    native_opset: ClassVar[int] = _RENAMED
+    opset: ClassVar[int] = _RENAMED

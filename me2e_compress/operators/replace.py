@@ -1,6 +1,7 @@
 """Replace a fused node by its body, or by the same call in another dialect."""
 
 import dataclasses
+from collections.abc import Iterable
 
 import onnx_ir as ir
 
@@ -8,6 +9,7 @@ from me2e_compress.errors import GraphError, PreconditionError
 from me2e_compress.graph import opset_of
 from me2e_compress.graph.nodes import STANDARD, is_read, nodes_in
 from me2e_compress.graph.rewrite import replace_value, value_names
+from me2e_compress.graph.rewrite.raise_opset import raise_opset
 from me2e_compress.graph.shapes import open_shape
 from me2e_compress.graph.validity import ORIGINAL_DOMAIN, PLUGIN_DOMAIN
 from me2e_compress.operators.base import Operator, find
@@ -18,9 +20,6 @@ from me2e_compress.operators.dialect import (
     Dialect,
     Values,
 )
-
-_LEAST_OPSET = 13
-"""ReduceSum and Unsqueeze take their axes as inputs from here on."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -47,6 +46,28 @@ def fused_nodes(model: ir.Model) -> list[FusedNode]:
         for node in nodes_in(body)
         if (row := find(node)) is not None
     ]
+
+
+def raise_for_bodies(
+    model: ir.Model, nodes: Iterable[ir.Node], by: str
+) -> tuple[str, ...]:
+    """Write a graph in the opset that the bodies of fused nodes need; say so if it is.
+
+    Raises:
+        PreconditionError: the graph cannot be written in it; nothing changed.
+    """
+    wanted = 0
+    for node in nodes:
+        row, where = find(node), node.graph
+        least = 0 if row is None else row[0].opset
+        opset = 0 if where is None else where.opset_imports.get("", opset_of(model))
+        wanted = max(wanted, least if opset < least else 0)
+    if not wanted:
+        return ()
+    _, reason = raise_opset(model, wanted, by)
+    if reason:
+        raise PreconditionError(f"{by} needs opset {wanted} or later: {reason}")
+    return (f"the graph is of opset {wanted} now: bodies need it",)
 
 
 def import_domains(model: ir.Model) -> None:
@@ -77,7 +98,7 @@ def expand(
 
     Args:
         node: recognised by :func:`~me2e_compress.operators.find`; it is removed.
-        opset: of the standard operators, 13 or later.
+        opset: of the standard operators; see :func:`raise_for_bodies`.
         by: the name of the pass, for the provenance.
         names: of all values of the model, where many nodes are expanded.
         compiled: whether the body may call compiled kernels; a session must then
@@ -90,9 +111,9 @@ def expand(
         GraphError: the node is not a fused operator.
     """
     operator, dialect = _found(node, known)
-    if opset < _LEAST_OPSET:
+    if opset < operator.opset:
         raise PreconditionError(
-            f"{by} needs opset {_LEAST_OPSET} or later; the graph is of {opset}"
+            f"{by} needs opset {operator.opset} or later; the graph is of {opset}"
         )
     # Own form, body, and back to the layout of the dialect
     call = FusedCall(node, opset=opset, by=by, names=names, compiled=compiled)

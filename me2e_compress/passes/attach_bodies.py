@@ -44,16 +44,18 @@ class AttachBodies(Pass):
 
     def run(self, model: ir.Model, context: Context) -> PassResult:
         """Add a function for each kind of fused node that has none."""
+        fused = [each.node for each in operators.fused_nodes(model)]
+        bare = [node for node in fused if node.op_identifier() not in model.functions]
+        named = [node for node in bare if _has_domain(node)]
+        notes = list(operators.raise_for_bodies(model, named, self.name))
         kinds: dict[ir.OperatorIdentifier, list[FusedNode]] = {}
-        for fused in operators.fused_nodes(model):
-            kinds.setdefault(fused.node.op_identifier(), []).append(fused)
-        made, notes = 0, []
-        for identifier, calls in kinds.items():
-            if identifier in model.functions:
-                continue
-            node = calls[0].node
-            op_type = node.op_type
-            if not node.domain or ORIGINAL_DOMAIN in node.metadata_props:
+        for call in operators.fused_nodes(model):
+            if call.node in bare:
+                kinds.setdefault(call.node.op_identifier(), []).append(call)
+        made = 0
+        for calls in kinds.values():
+            op_type = calls[0].node.op_type
+            if calls[0].node not in named:
                 notes.append(
                     f"no body for {len(calls)} {op_type}: it has no domain of its own"
                 )
@@ -91,6 +93,10 @@ class AttachBodies(Pass):
         operators.expand(node, opset=first.opset, by=self.name)
         hold_constants(function)
         return function
+
+
+def _has_domain(node: ir.Node) -> bool:
+    return bool(node.domain) and ORIGINAL_DOMAIN not in node.metadata_props
 
 
 def _alike(calls: Sequence[FusedNode]) -> list[list[FusedNode]]:

@@ -77,21 +77,29 @@ class ExpandOperators(Pass):
     Result:  y = Transpose(... ReduceSum(Mul(GridSample(value, 2 * at - 1), weights)))
 
     The graph's opset decides which operators are used: GridSample from opset 16 on
-    where the sizes of the maps are constants, else Gather. A plugin that no dialect
-    names is left alone.
+    where the sizes of the maps are constants, else Gather. Samplers and deformable
+    convolutions need opset 16, 19 or 20: an older graph is written in that first. A
+    plugin that no dialect names is left alone.
     """
 
     name: ClassVar[str] = "expand-operators"
     exact: ClassVar[bool] = True
 
     def run(self, model: ir.Model, context: Context) -> PassResult:
-        """Expand the nodes of the graph, of its bodies and of its functions."""
+        """Expand the nodes of the graph, of its bodies and of its functions.
+
+        Raises:
+            PreconditionError: the graph cannot be written in the opset of a body.
+        """
         counts: Counter[str] = Counter()
+        nodes = [each.node for each in operators.fused_nodes(model)]
+        raised = operators.raise_for_bodies(model, nodes, self.name)
         for fused in operators.fused_nodes(model):
             opset, names = fused.opset, fused.names
             operators.expand(fused.node, opset=opset, by=self.name, names=names)
             counts[fused.operator.name] += 1
-        return _finished(model, counts, "expanded")
+        result = _finished(model, counts, "expanded")
+        return dataclasses.replace(result, notes=(*raised, *result.notes))
 
 
 def _finished(model: ir.Model, counts: Counter[str], done: str) -> PassResult:

@@ -168,16 +168,18 @@ def compiled_or_expanded(
     ):
         graph.infer_shapes(copy)
     # Expand the fused nodes, unless the file has bodies that may run.
-    taken = value_names(copy.graph)
+    fused = [
+        node
+        for node in unknown_nodes(copy)
+        if node.op_type in ours and operators.find(node) is not None
+        if compiled or node.op_identifier() not in copy.functions
+    ]
     try:
-        for node in list(unknown_nodes(copy)):
-            if node.op_type not in ours or operators.find(node) is None:
-                continue
-            if compiled or node.op_identifier() not in copy.functions:
-                opset, used = _surroundings(node, copy, taken)
-                operators.expand(
-                    node, opset=opset, by=_BY, names=used, compiled=compiled
-                )
+        operators.raise_for_bodies(copy, fused, _BY)
+        taken = value_names(copy.graph)
+        for node in fused:
+            opset, used = _surroundings(node, copy, taken)
+            operators.expand(node, opset=opset, by=_BY, names=used, compiled=compiled)
     except PreconditionError as error:
         raise GraphError(str(error)) from error
     # Kernels that can read int8 do.

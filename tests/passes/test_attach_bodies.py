@@ -10,8 +10,10 @@ from me2e_compress.graph.validity import ORIGINAL_DOMAIN, PLUGIN_DOMAIN
 from me2e_compress.operators.deformable_attention import DeformableAttention
 from me2e_compress.operators.multi_head_attention import FusedMultiHeadAttention
 from me2e_compress.passes.attach_bodies import AttachBodies
+from me2e_compress.passes.base import Pass
 from me2e_compress.passes.fused_nodes import ExpandOperators, TranslatePlugins
 from me2e_compress.passes.import_normalize import with_own_domains
+from me2e_compress.runtime.session import Session
 from tests.passes.small import NO_MODULES, apply, compute, ops, read
 
 HEAD = """<ir_version: 9, opset_import: ["" : 17, "me2e" : 1, "mmdeploy" : 1]>
@@ -208,17 +210,48 @@ def test_a_graph_in_other_dialects_gives_what_it_gave(
     np.testing.assert_allclose(got, want, rtol=0, atol=1e-5)
 
 
+OLD = """<ir_version: 9, opset_import: ["" : 13, "custom_op" : 1]>
+net (float[1,2,4,4] x, float[1,2,3,3] at) => (float[1,2] y) {
+    ["norm"] a = LeakyRelu<alpha = 0.5>(x)
+    ["taken"] b = custom_op.GridSamplePlugin<mode = 0, padding_mode = 1>(a, at)
+    ["most"] y = ReduceMax<axes = [2, 3], keepdims = 0>(b)
+}"""
+
+
+@pytest.mark.parametrize("current", [ExpandOperators(), AttachBodies()])
+def test_an_old_graph_is_written_in_the_opset_that_a_body_needs(
+    current: Pass,
+) -> None:
+    model = read(OLD)
+    want = Session(model).run(feeds(model))["y"]  # which does the same
+    result = apply(current, model)
+    assert result.notes[0] == "the graph is of opset 16 now: bodies need it"
+    assert model.graph.opset_imports[""] == 16
+    np.testing.assert_array_equal(compute(model, feeds(model))[0], want)
+
+
+def test_a_graph_that_cannot_be_written_in_that_opset_is_refused() -> None:
+    text = OLD.replace("(a, at)", "(c, at)").replace('["taken"]', "c = own.Part(a)\n")
+    text = text.replace('"custom_op" : 1]', '"custom_op" : 1, "own" : 1]')
+    part = "y = RoiAlign<output_height = 4, output_width = 4>(x, box, which)"
+    text += f"""<domain: "own", opset_import: ["" : 13]> Part (x) => (y) {{
+        box = Constant<value = float[1,4] {{0.0, 0.0, 4.0, 4.0}}>()
+        which = Constant<value = int64[1] {{0}}>()
+        {part}
+    }}"""
+    with pytest.raises(PreconditionError, match="needs opset 16 or later: RoiAlign"):
+        ExpandOperators().run(read(text), NO_MODULES)
+
+
 TURN = 'net (float[1,6,4,4] x) => (float[1,6,4,4] y) { ["turn"] y = InverseTRT(x) }'
 
 
-def test_what_a_library_or_an_opset_lacks_is_named() -> None:
+def test_what_a_library_lacks_is_named() -> None:
     named = r"node turn: the dialect tensorrt has no inverse \(InverseTRT\)"
     with pytest.raises(PreconditionError, match=named):
         TranslatePlugins("tensorrt").run(read(OPSET + TURN), NO_MODULES)
     with pytest.raises(RecipeError, match="no dialect 'trt'; there are me2e, tensorrt"):
         TranslatePlugins("trt")
-    with pytest.raises(PreconditionError, match="needs opset 13"):
-        ExpandOperators().run(read(RAW.replace('"" : 17', '"" : 12')), NO_MODULES)
 
 
 def test_plugins_nobody_knows_stay() -> None:
