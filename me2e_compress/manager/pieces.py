@@ -96,12 +96,12 @@ def piece_errors(
     worst, allowed = [Errors() for _ in others], Errors()
     sessions = [
         Session(
-            _continued(model, steps), optimize="none", release=True, provider=provider
+            _continued(model, steps), optimize=False, release=True, provider=provider
         )
         for model, _ in others
     ]
     state: Mapping[str, Array] = {}
-    for index, left in enumerate(inputs.run(_observed(before, steps), "none")):
+    for index, left in enumerate(inputs.run(_observed(before, steps), optimize=False)):
         for session, errors, (_, own) in zip(sessions, worst, others, strict=True):
             # A frame, and state and answers of the first graph
             frame = own.frames[index]

@@ -19,7 +19,7 @@ from me2e_compress.graph.shapes import static_shape
 from me2e_compress.passes.fix_shapes import open_dimensions, sized_inputs
 from me2e_compress.runtime.frames import Frame
 from me2e_compress.runtime.providers import CPU, Provider
-from me2e_compress.runtime.session import Level, Session, detached, replay
+from me2e_compress.runtime.session import Session, detached, replay
 
 TOLERANCES = {"float64": 1e-9, "float32": 1e-4, "float16": 1e-2, "bfloat16": 5e-2}
 """Allowed max|a-b|/max|a| by output dtype: what reordered sums of that dtype cost in
@@ -106,12 +106,8 @@ class VerificationInputs:
             list(synthetic(model, seed=seed, count=count)), "synthetic", provider
         )
 
-    def run(self, model: ir.Model, level: Level = "all") -> Iterator[Outputs]:
+    def run(self, model: ir.Model, *, optimize: bool = True) -> Iterator[Outputs]:
         """Run a graph over the frames, recurrent state fed forward.
-
-        Args:
-            model: the graph.
-            level: how far onnxruntime optimizes it.
 
         Yields:
             The outputs of every frame, which are the caller's to keep.
@@ -119,7 +115,7 @@ class VerificationInputs:
         Raises:
             GraphError: onnxruntime cannot run it, or an output is no tensor.
         """
-        session = Session(model, optimize=level, provider=self.provider)
+        session = Session(model, optimize=optimize, provider=self.provider)
         for outputs in replay(session, self.frames):
             for name, value in outputs.items():
                 if not isinstance(value, np.ndarray):

@@ -8,7 +8,7 @@ although a protobuf message ends at 2 GiB.
 import tempfile
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Literal, TypeAlias, cast
+from typing import TypeAlias, cast
 
 import numpy as np
 import onnx_ir as ir
@@ -196,10 +196,8 @@ def _build(
     except RuntimeError:  # it is not set yet
         options.add_session_config_entry(_INT8_STAYS, "1")
     level = options.graph_optimization_level
-    # Who asks for one level, or for the rewritten graph, gets that
-    fixed = level != _LEVELS["all"] or options.optimized_model_filepath
-    plain = level if fixed else _LEVELS["none"]
-    for tried in (level, plain):
+    # Who asks for the rewritten graph gets that
+    for tried in (level, level if options.optimized_model_filepath else _PLAIN):
         options.graph_optimization_level = tried
         try:
             return _opened(source, options, provider, left_out)
@@ -230,7 +228,7 @@ def _opened(
 # Sessions that run one graph, and the replay of recordings.
 
 
-__all__ = ["Level", "Session", "SessionPort", "detached", "replay", "run_once"]
+__all__ = ["Session", "SessionPort", "detached", "replay", "run_once"]
 
 DTYPES: Mapping[str, np.dtype[np.generic]] = {
     f"tensor({kind.name.lower()})": kind.numpy() for kind in NATIVE
@@ -242,17 +240,8 @@ _SHRINK = "memory.enable_memory_arena_shrinkage"
 _WEIGHTS_FILE = "session.optimized_model_external_initializers_file_name"
 
 
-Level: TypeAlias = Literal["none", "basic", "extended", "layout", "all"]
-"""How far onnxruntime optimizes a graph; each level includes those before it."""
-
-_LEVELS: Mapping[Level, ort.GraphOptimizationLevel] = {
-    "none": ort.GraphOptimizationLevel.ORT_DISABLE_ALL,
-    "basic": ort.GraphOptimizationLevel.ORT_ENABLE_BASIC,
-    "extended": ort.GraphOptimizationLevel.ORT_ENABLE_EXTENDED,
-    "layout": ort.GraphOptimizationLevel.ORT_ENABLE_LAYOUT,
-    "all": ort.GraphOptimizationLevel.ORT_ENABLE_ALL,
-}
-_DEFAULT: Mapping[bool, Level] = {False: "none", True: "all"}
+_PLAIN = ort.GraphOptimizationLevel.ORT_DISABLE_ALL
+_FULL = ort.GraphOptimizationLevel.ORT_ENABLE_ALL
 
 
 class Session:
@@ -261,8 +250,7 @@ class Session:
     Args:
         model: the graph, or the file that holds it.
         threads: threads within an operator; 0 takes every core.
-        optimize: False runs the nodes exactly as written (``ORT_DISABLE_ALL``), like
-            the level ``none``; True is the level ``all``.
+        optimize: False runs the nodes exactly as written (``ORT_DISABLE_ALL``).
         stock: all that onnxruntime does by itself: also the optimizations that the
             provider leaves out, and int8 kernels.
         int8_kernels: runs pairs of quantization nodes by onnxruntime's int8 kernels,
@@ -288,7 +276,7 @@ class Session:
         model: ir.Model | Path,
         *,
         threads: int = 0,
-        optimize: bool | Level = True,
+        optimize: bool = True,
         stock: bool = False,
         int8_kernels: bool = False,
         frugal: bool = False,
@@ -306,8 +294,7 @@ class Session:
         # Idle threads that spin slow down whatever else runs on the machine.
         options.add_session_config_entry("session.intra_op.allow_spinning", "0")
         # The optimizations: level, memory and order of nodes.
-        level: Level = optimize if isinstance(optimize, str) else _DEFAULT[optimize]
-        options.graph_optimization_level = _LEVELS[level]
+        options.graph_optimization_level = _FULL if optimize else _PLAIN
         # One block for all tensors of a run: twice the memory on VAD-tiny, no gain.
         options.enable_mem_pattern = False
         if not stock and provider.target == CPU.target:

@@ -105,15 +105,17 @@ def _remove_dead(model: ir.Model) -> int:
     return len(dead)
 
 
-def _divide(model: ir.Model) -> int:
-    factor, products = model.graph.initializers["factor"], 0
-    for node in model.graph:
-        if node.op_type == "Mul" and node.inputs[1] is factor:
-            node.op_type, products = "Div", products + 1
-            provenance.inherit(node, [node], by="divides")
-            inverse = np.array(1e-10, np.float32)
-            factor.const_value = ir.tensor(inverse, name="factor")
-    return products
+def _invert(model: ir.Model) -> int:
+    factor = model.graph.initializers["factor"]
+    (node,) = (use.node for use in factor.uses())
+    assert factor.const_value is not None
+    if "inverts" in node.metadata_props.get(provenance.PASSES, ""):
+        return 0
+    node.op_type = {"Mul": "Div", "Div": "Mul"}[node.op_type]
+    provenance.inherit(node, [node], by="inverts")
+    inverse = np.float32(1) / factor.const_value.numpy()
+    factor.const_value = ir.tensor(inverse, name="factor")
+    return 1
 
 
 def _of_weights(
@@ -136,8 +138,8 @@ DROPS_RELU = Sample("drops-relu-of-sigmoid", _drop_relu)
 """Right: a sigmoid is never negative."""
 ROUNDS = Sample("rounds", _of_weights(lambda w: np.nextafter(w, np.float32(9e9))))
 """Right, but for the last place of every weight."""
-DIVIDES = Sample("divides", _divide)
-"""Right: by the inverse of a factor."""
+INVERTS = Sample("inverts", _invert)
+"""Right: divides by the inverse of a factor, or multiplies."""
 REMOVES_DEAD = Sample("remove-dead", _remove_dead)
 HALVES = Lossy("halves", _of_weights(lambda w: w / np.float32(2)))
 BREAKS = Sample("breaks", _break)

@@ -149,7 +149,7 @@ def test_what_only_the_optimizer_refuses_is_run_as_it_stands_and_told(
     x = np.ones((4, 32), np.float16)
     assert np.all(Session(path, int8_kernels=True).run({"x": x})["y"] == 12)
     with pytest.raises(GraphError, match="MatMulNBits"):
-        Session(path, int8_kernels=True, optimize="extended")
+        Session(path, int8_kernels=True, rewritten=tmp_path / "written.onnx")
 
 
 def test_layers_in_functions_are_counted_as_often_as_they_are_called() -> None:
