@@ -9,7 +9,12 @@ import onnx_ir as ir
 from me2e_compress.errors import GraphError
 from me2e_compress.graph import array_of, provenance
 from me2e_compress.graph.nodes import Array
-from me2e_compress.graph.rewrite import add_constant, fresh_name, value_names
+from me2e_compress.graph.rewrite import (
+    add_constant,
+    fresh_name,
+    replace_value,
+    value_names,
+)
 from me2e_compress.graph.shapes import REFUSALS, infer_node
 
 AttributeValue: TypeAlias = int | float | str | Sequence[int]
@@ -64,6 +69,23 @@ class FusedCall:
         self._where.insert_before(self.node, made)
         _infer(made, self.opset)
         return made.outputs[0]
+
+    def put(self, result: ir.Value) -> None:
+        """Let a value take the place and the name of the node's, which is removed."""
+        node, old = self.node, self.node.outputs[0]
+        if result.producer() is None or result in node.inputs:
+            result = self.add("Identity", [result])  # an output needs a node of its own
+        # Keep the better type and shape, and the name
+        if result.shape is None or not result.shape.is_static():
+            result.shape = old.shape if old.shape is not None else result.shape
+        result.type = result.type if result.type is not None else old.type
+        name = old.name
+        if isinstance(self._where, ir.Graph):
+            replace_value(old, result)
+        else:
+            old.replace_all_uses_with(result, replace_graph_outputs=True)
+        self._where.remove(node, safe=True)
+        result.name = name
 
     def constant(self, array: Array, name: str = "constant") -> ir.Value:
         """Add a constant: an initializer, or a Constant node within a function."""

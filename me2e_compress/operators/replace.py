@@ -8,7 +8,7 @@ import onnx_ir as ir
 from me2e_compress.errors import GraphError, PreconditionError
 from me2e_compress.graph import opset_of
 from me2e_compress.graph.nodes import STANDARD, is_read, nodes_in
-from me2e_compress.graph.rewrite import replace_value, value_names
+from me2e_compress.graph.rewrite import value_names
 from me2e_compress.graph.rewrite.raise_opset import raise_opset
 from me2e_compress.graph.shapes import open_shape
 from me2e_compress.graph.validity import ORIGINAL_DOMAIN, PLUGIN_DOMAIN
@@ -121,11 +121,11 @@ def expand(
         dialect.check(node)
         made = dialect.by_kernel(call, tuple(node.inputs))
         if made is not None:
-            _take_place(call, made)
+            call.put(made)
             return
     inputs, attributes = _own_call(call, dialect)
     result = operator.body(call, inputs, attributes)
-    _take_place(call, dialect.result_from_own(call, result, inputs))
+    call.put(dialect.result_from_own(call, result, inputs))
 
 
 def translate(
@@ -161,7 +161,7 @@ def translate(
     set_output(made, operator, to)
     # Convert the output back to the old layout
     result = to.result_to_own(call, result, own)
-    _take_place(call, dialect.result_from_own(call, result, own))
+    call.put(dialect.result_from_own(call, result, own))
 
 
 def set_output(node: ir.Node, operator: Operator, dialect: Dialect) -> bool:
@@ -214,26 +214,6 @@ def _own_call(call: FusedCall, dialect: Dialect) -> tuple[Values, Attributes]:
     attributes = dialect.attributes_of(call.node)
     inputs = dialect.inputs_to_own(call, tuple(call.node.inputs), attributes)
     return inputs, dialect.options_to_own(attributes)
-
-
-def _take_place(call: FusedCall, result: ir.Value) -> None:
-    node, old = call.node, call.node.outputs[0]
-    made, body = result.producer(), node.graph
-    assert body is not None
-    # Each output needs a node of its own
-    if made is None or result in node.inputs:  # an output needs a node that makes it
-        result = call.add("Identity", [result])
-    # Keep the better type and shape, and the name
-    if result.shape is None or not result.shape.is_static():
-        result.shape = old.shape if old.shape is not None else result.shape
-    result.type = result.type if result.type is not None else old.type
-    name = old.name
-    if isinstance(body, ir.Graph):
-        replace_value(old, result)
-    else:
-        old.replace_all_uses_with(result, replace_graph_outputs=True)
-    body.remove(node, safe=True)
-    result.name = name
 
 
 class DialectKnowledge:

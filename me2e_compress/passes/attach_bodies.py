@@ -8,6 +8,7 @@ import numpy as np
 import onnx_ir as ir
 
 from me2e_compress import graph, operators
+from me2e_compress.graph import rewrite
 from me2e_compress.graph.nodes import Array
 from me2e_compress.graph.shapes import Dims, open_shape
 from me2e_compress.graph.validity import ORIGINAL_DOMAIN
@@ -89,7 +90,9 @@ class AttachBodies(Pass):
         # Store shared constants, then expand the operator
         for value, known in inputs:
             if known is not None:
-                _hold(function, node, value, known)
+                name = f"{value.name}_known"
+                constant = rewrite.add_constant(function.graph, known, name)
+                value.replace_all_uses_with(constant)
         operators.expand(node, opset=first.opset, by=self.name)
         hold_constants(function)
         return function
@@ -154,11 +157,3 @@ def _agreed(shapes: Sequence[Dims | None]) -> ir.Shape | None:
             for sizes in zip(*known, strict=True)
         ]
     )
-
-
-def _hold(function: ir.Function, node: ir.Node, value: ir.Value, known: Array) -> None:
-    constant = ir.node("Constant", [], {"value": ir.tensor(known)}, num_outputs=1)
-    constant.name = constant.outputs[0].name = f"{value.name}_known"
-    constant.outputs[0].type, constant.outputs[0].shape = value.type, value.shape
-    function.insert_before(node, constant)
-    value.replace_all_uses_with(constant.outputs[0])

@@ -3,14 +3,13 @@
 import dataclasses
 import math
 import re
-from collections.abc import Sequence
 
-import numpy as np
 import onnx_ir as ir
 
-from me2e_compress.graph import array_of, is_standard, provenance, static_shape
+from me2e_compress.graph import array_of, is_standard, opset_of, static_shape
 from me2e_compress.graph.nodes import FLOATS, graphs_of
-from me2e_compress.graph.rewrite import add_constant, fresh_name, put, value_names
+from me2e_compress.graph.rewrite import add_constant, put, value_names
+from me2e_compress.operators import FusedCall
 
 _TWO_OPERANDS = re.compile(r"([A-Za-z]+),([A-Za-z]+)->([A-Za-z]+)")
 
@@ -22,14 +21,14 @@ def write_products(model: ir.Model, by: str) -> int:
 
     Result:  y = MatMul(x, Transpose(w))      ;  z = Conv(x, w [m, k, 1])
     """
-    count = 0
+    count, opset = 0, opset_of(model)
     names = value_names(model.graph)
     for body in graphs_of(model.graph):
         for node in list(body):
             if not is_standard(node) or node.outputs[0].dtype not in FLOATS:
                 continue
             if node.op_type == "Einsum":
-                count += _write_einsum(node, names, by)
+                count += _write_einsum(node, opset, names, by)
             elif node.op_type == "MatMul":
                 count += _write_convolution(node, body, names, by)
     return count
@@ -66,7 +65,7 @@ class _Product:
         return cls(left, right, out, batch, rows, columns, summed)
 
 
-def _write_einsum(node: ir.Node, names: set[str], by: str) -> int:
+def _write_einsum(node: ir.Node, opset: int, names: set[str], by: str) -> int:
     product = _Product.of(node.attributes.get_string("equation", ""))
     if product is None or None in node.inputs:
         return 0
@@ -77,23 +76,34 @@ def _write_einsum(node: ir.Node, names: set[str], by: str) -> int:
     flat = any(len(labels) > 1 for labels in groups)
     if flat and sizes is None:
         return 0
-    write = _Writer(node, names, by)
+    call = FusedCall(node, opset=opset, by=by, names=names)
     batch, rows, columns = product.batch, product.rows, product.columns
-    left = write.turned(node.inputs[0], product.left, batch + rows + product.summed)
-    right = write.turned(
-        node.inputs[1], product.right, batch + product.summed + columns
+    ends = (
+        (product.left, batch + rows + product.summed),
+        (product.right, batch + product.summed + columns),
+    )
+    left, right = (
+        _turned(call, value, *labels)
+        for value, labels in zip(filter(None, node.inputs), ends, strict=True)
     )
     if flat and sizes is not None:
         size = {labels: math.prod(sizes[x] for x in labels) for labels in groups}
         size[rows] = math.prod(sizes[x] for x in rows)
         lead = [sizes[x] for x in batch]
-        left = write.shaped(left, [*lead, size[rows], size[product.summed]])
-        right = write.shaped(right, [*lead, size[product.summed], size[columns]])
-    result = write.node("MatMul", [left, right])
+        left = call.reshape(left, [*lead, size[rows], size[product.summed]])
+        right = call.reshape(right, [*lead, size[product.summed], size[columns]])
+    result = call.add("MatMul", [left, right])
     if flat and sizes is not None:
-        result = write.shaped(result, [sizes[x] for x in batch + rows + columns])
-    write.finish(result, batch + rows + columns, product.out)
+        result = call.reshape(result, [sizes[x] for x in batch + rows + columns])
+    call.put(_turned(call, result, batch + rows + columns, product.out))
     return 1
+
+
+def _turned(call: FusedCall, value: ir.Value, have: str, want: str) -> ir.Value:
+    """Transpose a value whose axes have labels, where their order is another."""
+    if have == want:
+        return value
+    return call.transpose(value, [have.index(label) for label in want])
 
 
 def _sizes(node: ir.Node, product: _Product) -> dict[str, int] | None:
@@ -102,57 +112,6 @@ def _sizes(node: ir.Node, product: _Product) -> dict[str, int] | None:
     if shapes[0] is None or shapes[1] is None:
         return None
     return dict(zip(product.left + product.right, shapes[0] + shapes[1], strict=True))
-
-
-class _Writer:
-    """Writes nodes in front of one that goes."""
-
-    def __init__(self, old: ir.Node, names: set[str], by: str) -> None:
-        self.old, self.names, self.by = old, names, by
-
-    def node(
-        self, op: str, inputs: Sequence[ir.Value | None], perm: list[int] | None = None
-    ) -> ir.Value:
-        """Add a node of a standard operator, and return its output."""
-        name = fresh_name(f"{self.old.name}_{op}", self.names)
-        attributes = {} if perm is None else {"perm": perm}
-        new = ir.node(op, inputs, attributes, name=name)
-        new.outputs[0].name, new.outputs[0].type = name, self.old.outputs[0].type
-        provenance.inherit(new, [self.old], by=self.by)
-        graph = self.old.graph
-        assert isinstance(graph, ir.Graph)
-        graph.insert_before(self.old, new)
-        return new.outputs[0]
-
-    def turned(self, value: ir.Value | None, have: str, want: str) -> ir.Value | None:
-        """Transpose a value whose axes have labels, where their order is another."""
-        if have == want:
-            return value
-        return self.node("Transpose", [value], [have.index(label) for label in want])
-
-    def shaped(self, value: ir.Value | None, sizes: Sequence[int]) -> ir.Value:
-        """Reshape a value."""
-        graph = self.old.graph
-        assert isinstance(graph, ir.Graph)
-        shape = np.array(sizes, np.int64)
-        name = f"{self.old.name}_shape"
-        return self.node(
-            "Reshape", [value, add_constant(graph, shape, name, self.names)]
-        )
-
-    def finish(self, result: ir.Value, have: str, want: str) -> None:
-        """Let the last node take the place of the old one."""
-        last = result.producer()
-        assert last is not None
-        if have == want:
-            inputs, op, attributes = list(last.inputs), last.op_type, {}
-            graph = self.old.graph
-            assert isinstance(graph, ir.Graph)
-            graph.remove(last, safe=True)
-        else:
-            inputs, op = [result], "Transpose"
-            attributes = {"perm": [have.index(label) for label in want]}
-        put(self.old, op, inputs, by=self.by, attributes=attributes)
 
 
 def _write_convolution(node: ir.Node, graph: ir.Graph, names: set[str], by: str) -> int:

@@ -65,34 +65,24 @@ def write_float_products(where: ir.Graph) -> int:
     """
     found = [each for node in where if (each := _product(node)) is not None]
     names = rewrite.value_names(where)
+    opset = where.opset_imports[""]
     for each in found:
-        _write(where, each, names)
+        _write(each, FusedCall(each.gemm, opset=opset, by="session", names=names))
     if found:
         where.opset_imports.setdefault(DOMAIN, 1)
         rewrite.remove_dead(where)
     return len(found)
 
 
-def _write(where: ir.Graph, product: _Product, names: set[str]) -> None:
-    gemm, (integers, step, middle) = product.gemm, product.left
-    old = gemm.outputs[0]
-    # The Reshape moves to the integers.
+def _write(product: _Product, call: FusedCall) -> None:
+    integers, step, middle = product.left
+    # The Reshape moves to the integers
     if product.reshape is not None:
-        rows = ir.node("Reshape", [integers, product.reshape.inputs[1]])
-        rows.name = rewrite.fresh_name(f"{old.name}_integers", names)
-        rows.outputs[0].name = rows.name
-        where.insert_before(gemm, rows)
-        integers = rows.outputs[0]
+        integers = call.add("Reshape", [integers, product.reshape.inputs[1]])
     weight, scales, zeros = product.weight
-    bias = rewrite.add_constant(where, product.bias, f"{old.name}_bias", names)
-    inputs = [integers, weight, step, scales, middle, zeros, bias]
-    node = ir.node("MatMulIntegerToFloat", inputs, domain=DOMAIN, name=gemm.name)
-    made = node.outputs[0]
-    made.name = rewrite.fresh_name(f"{old.name}_product", names)
-    made.type, made.shape = old.type, old.shape
-    where.insert_before(gemm, node)
-    rewrite.replace_value(old, made)
-    where.remove(gemm, safe=True)
+    inputs = [integers, weight, step, scales, middle, zeros]
+    inputs.append(call.constant(product.bias, "bias"))
+    call.put(call.add("MatMulIntegerToFloat", inputs, domain=DOMAIN))
 
 
 def _product(node: ir.Node) -> _Product | None:

@@ -1,6 +1,8 @@
 """What is written in front of a fused node has types and shapes at once."""
 
+import numpy as np
 import onnx_ir as ir
+import pytest
 
 from me2e_compress import graph
 from me2e_compress.operators.call import FusedCall
@@ -26,3 +28,16 @@ def test_what_reads_a_constant_node_is_typed() -> None:
 
     assert flat.dtype == ir.DataType.FLOAT
     assert graph.static_shape(flat) == (2, 8)
+
+
+@pytest.mark.parametrize("of_node", [True, False])
+def test_no_value_of_another_node_loses_its_name_to_an_output(of_node: bool) -> None:
+    text = TEXT.replace("y = Relu(x)", "a = Exp(x) y = Relu(a)")
+    model = ir.from_onnx_text(text)
+    exp, relu = model.graph[1], model.graph[2]
+    call = FusedCall(relu, opset=17, by="test")
+    call.put(exp.outputs[0] if of_node else call.constant(np.zeros(8, np.float32)))
+    output = model.graph.outputs[0]
+    assert output.name == "y"
+    assert exp.outputs[0].name == "a"
+    assert model.graph[-1].op_type == "Identity"

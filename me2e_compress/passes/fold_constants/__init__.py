@@ -35,6 +35,7 @@ from me2e_compress.graph.rewrite import (
     value_names,
 )
 from me2e_compress.graph.summary import value_bytes
+from me2e_compress.operators import FusedCall
 from me2e_compress.passes.base import Context, Pass, PassResult
 from me2e_compress.passes.fold_constants import knowledge
 from me2e_compress.passes.fold_constants.branches import inline_branches
@@ -419,15 +420,9 @@ def _reshape_bounds(graph: ir.Graph, opset: int, by: str) -> int:
             if use.node.op_type == "Range" and use.node.graph is graph
         ]
         for node, index, value in bounds:
-            shape = add_constant(graph, np.zeros(0, np.int64), f"{value.name}_shape")
-            name = f"{node.name}_bound_{index}"
-            scalar = ir.node("Reshape", [value, shape], name=name)
-            scalar.outputs[0].name = f"{value.name}_scalar_{node.name}_{index}"
-            scalar.outputs[0].type = value.type
-            scalar.outputs[0].shape = ir.Shape([])
-            provenance.inherit(scalar, [node], by=by)
-            graph.insert_before(node, scalar)
-            node.replace_input_with(index, scalar.outputs[0])
+            scalar = FusedCall(node, opset=opset, by=by).reshape(value, ())
+            scalar.type = value.type
+            node.replace_input_with(index, scalar)
             provenance.inherit(node, [node], by=by)
         count += len(bounds)
     return count
