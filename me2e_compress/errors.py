@@ -33,6 +33,7 @@ _FORMER = {
         for name in ("keep_ops", "keep_modules", "keep_nodes")
     },
     "ablate-modules means": f"means {_NOW} frames (--frames)",
+    "fuse-basic swish": "swish is gone since 0.3.0: onnxruntime has no kernel",
     "fold-constants growth": f"growth {_NOW} bytes_per_node",
     "command build": f"build {_NOW} trtexec --onnx=M.onnx --saveEngine=M.engine",
     "command ranges": f"ranges {_NOW} calibrate, which says what deserves a look",

@@ -217,7 +217,7 @@ def compress(
 ) -> None:
     """Apply passes to a graph, check each, and write the smaller graph and a report.
 
-    A pipeline names passes in order: fold-constants,fuse-basic{swish=true}
+    A pipeline names passes in order: fuse-basic,fold-constants{bytes_per_node=0}
 
     Args:
         model: the ONNX file, or highway; not changed

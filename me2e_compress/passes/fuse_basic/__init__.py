@@ -24,15 +24,10 @@ class FuseBasic(Pass):
 
     Outputs are equal up to rounding. A residual Conv + Add stays, in the form that
     TensorRT and onnxruntime fuse with the next activation.
-
-    Attributes:
-        swish: write x * Sigmoid(x) as Swish where the opset has it (24); off, since
-            onnxruntime (1.31) has no kernel for it.
     """
 
     name: ClassVar[str] = "fuse-basic"
     exact: ClassVar[bool] = True
-    swish: bool = False
 
     def run(self, model: ir.Model, context: Context) -> PassResult:
         """Try every fusion on every node until none applies."""
@@ -56,6 +51,6 @@ class FuseBasic(Pass):
             *weights.FUSIONS,
             constants.GEMM,
             activations.LAYER_NORM,
-            *activations.fusions(swish=self.swish),
+            *activations.GELUS,
             *constants.FUSIONS,
         )

@@ -5,11 +5,11 @@ Given:   x * 0.5 * (1 + Erf(x / sqrt 2));
 Result:  Gelu(x);  LayerNormalization(x, scale, bias)
 
 Gelu: Hendrycks, Gimpel 2016 (erf and tanh forms). LayerNormalization: Ba, Kiros, Hinton
-2016. Swish: Ramachandran et al. 2017.
+2016.
 """
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 
 import numpy as np
 import onnx_ir as ir
@@ -33,9 +33,8 @@ from me2e_compress.graph.rewrite import (
     product,
     var,
 )
-from me2e_compress.graph.runtime_operators import has_operator
 
-SINCE = {"Gelu": 20, "LayerNormalization": 17, "Swish": 24}
+SINCE = {"Gelu": 20, "LayerNormalization": 17}
 """The opset that brought each operator."""
 
 TANH_CUBE = 0.044715
@@ -59,41 +58,11 @@ TANH = op(
 )
 
 
-def fusions(*, swish: bool) -> tuple[Fusion, ...]:
-    """Build the fusions; Swish is refused unless allowed."""
-    swish_opset = needs_opset("Swish", SINCE["Swish"])
-
-    def swish_check(match: Match, facts: Facts) -> str | None:
-        if reason := swish_opset(match, facts):
-            return reason
-        if not swish:
-            return "Swish, for which onnxruntime has no kernel"
-        if not has_operator("Swish", facts.opset):
-            return f"onnxruntime has no Swish in opset {facts.opset}"
-        return None
-
-    tanh = {"approximate": "tanh"}
-    return (
-        _fusion("Gelu", product(X, op("Add", ERF, ONE), scale=0.5)),
-        _fusion("Gelu", product(X, op("Add", TANH, ONE), scale=0.5), tanh),
-        _fusion("Swish", product(X, op("Sigmoid", X)), check=swish_check),
-    )
-
-
-def _fusion(
-    op_type: str,
-    pattern: Pattern,
-    attributes: Mapping[str, float | str] | None = None,
-    *,
-    check: Callable[[Match, Facts], str | None] | None = None,
-) -> Fusion:
-    """Build the fusion of an expression of x into an operator that the opset has."""
-    if check is None:
-        check = needs_opset(op_type, SINCE[op_type])
-
+def _gelu(pattern: Pattern, attributes: Mapping[str, str] | None = None) -> Fusion:
     def put(match: Match, kit: Kit) -> None:
-        kit.put(op_type, [match[X]], attributes)
+        kit.put("Gelu", [match[X]], attributes)
 
+    check = needs_opset("Gelu", SINCE["Gelu"])
     return Fusion("activations", pattern, put, check, _is_float)
 
 
@@ -105,6 +74,12 @@ def _keeps_rank(match: Match) -> bool:
     """Return whether no constant has more axes than x."""
     rank = rank_of(match[X])
     return rank is not None and rank == rank_of(match.root.outputs[0])
+
+
+GELUS = (
+    _gelu(product(X, op("Add", ERF, ONE), scale=0.5)),
+    _gelu(product(X, op("Add", TANH, ONE), scale=0.5), {"approximate": "tanh"}),
+)
 
 
 # Layer normalization.
