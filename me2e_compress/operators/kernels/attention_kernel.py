@@ -40,20 +40,7 @@ from me2e_compress.operators.kernels.intrinsics import (
 )
 from me2e_compress.operators.kernels.kernel import WIDEST_HEAD
 from me2e_compress.operators.kernels.matrix_tile import host_tile, matrix_product
-from me2e_compress.operators.kernels.vectors import Vectors, vector_intrinsic
-
-POWERS = (
-    1.535336188319500e-4, 1.339887440266574e-3, 9.618437357674640e-3,
-    5.550332471162809e-2, 2.402264791363012e-1, 6.931472028550421e-1, 1.0,
-)  # fmt: skip
-"""Polynomial of 2^r for r in -0.5..0.5, highest power first, of the Cephes library (S.
-L. Moshier, single/exp2f.c, netlib.org/cephes): relative error below 2e-7 in float32."""
-
-LEAST = -125.0
-"""Smaller powers count as 2^-125, so that results are normal float32 numbers."""
-
-ROUNDING = 1.5 * 2.0**23
-"""Added to a float32, it leaves the nearest whole number in the lowest bits."""
+from me2e_compress.operators.kernels.vectors import LOG2_E, Vectors, vector_intrinsic
 
 MOST, SUM = range(2)
 """Rows of a step's state."""
@@ -101,7 +88,7 @@ class _Step:
         self._set_row(self.state, WORD(MOST), most)
         # Correct what was summed before
         corrections = [
-            self._power(builder.fsub(old, new))
+            self.simd.power_of_2(builder.fsub(old, new))
             for old, new in zip(before, most, strict=True)
         ]
         totals = [
@@ -117,29 +104,13 @@ class _Step:
         # Powers, and their sums
         with cgutils.for_range(builder, self.count) as loop:
             row = zip(self._row(self.scores, loop.index), most, strict=True)
-            powers = [self._power(builder.fsub(score, each)) for score, each in row]
+            powers = [
+                self.simd.power_of_2(builder.fsub(score, each)) for score, each in row
+            ]
             self._set_row(self.scores, loop.index, powers)
             for total, power in zip(totals, powers, strict=True):
                 builder.store(builder.fadd(builder.load(total), power), total)
         self._set_row(self.state, WORD(SUM), [builder.load(each) for each in totals])
-
-    def _power(self, x: Any) -> Any:
-        """Write 2^x for x <= 0: a polynomial of its fraction, whose exponent grows."""
-        builder = self.builder
-        least, rounding = self.simd.spread(LEAST), self.simd.spread(ROUNDING)
-        x = builder.select(builder.fcmp_ordered("<", x, least), least, x)
-        rounded = builder.fadd(x, rounding)
-        fraction = builder.fsub(x, builder.fsub(rounded, rounding))
-        power = self.simd.spread(POWERS[0])
-        for each in POWERS[1:]:
-            power = builder.fmul(power, fraction, flags=("contract",))
-            power = builder.fadd(power, self.simd.spread(each), flags=("contract",))
-        exponent = builder.shl(
-            builder.bitcast(rounded, self.simd.whole),
-            self.simd.whole([23] * self.simd.lanes),
-        )
-        bits = builder.add(builder.bitcast(power, self.simd.whole), exponent)
-        return builder.bitcast(bits, self.simd.kind)
 
     def _variable(self, vector: Any) -> Any:
         return cgutils.alloca_once_value(self.builder, vector)
@@ -159,7 +130,6 @@ class _Step:
 
 
 F = np.float32
-LOG2_E = 1.4426950408889634
 
 VECTORS = 3
 _LARGEST = host_tile(VECTORS)

@@ -306,6 +306,7 @@ def _block(kind: Any) -> Callable[[int, int], Word]:
         # Tables are the same for all queries
         w, o = corner_weights(), corner_offsets()
         tables(a, w, o, at_once, a[L])
+        offsets, weights = address_of(o), address_of(w)
         for q in range(from_query, to_query):
             m = 0
             while m < a[M]:
@@ -320,7 +321,7 @@ def _block(kind: Any) -> Callable[[int, int], Word]:
                 out = a[OUT] + first * a[D] * 4
                 for k in range(heads):
                     begin, end, to = k * points, (k + 1) * points, out + k * a[D] * 4
-                    sum_rows(rows, o, w, begin, end, to, a[D])
+                    sum_rows((rows, offsets, weights, begin, end, to, a[D]))
                     if quantized:
                         to_real(a, to, m + k, share_of(w, begin, end))
                 m += at_once

@@ -9,16 +9,13 @@ instructions, since Numba's loops over arrays do not keep tiles in registers.
 
 import dataclasses
 import functools
-from collections.abc import Iterator
-from contextlib import contextmanager
 from typing import Any
 
 from llvmlite import binding as llvm
-from llvmlite import ir
 from numba.core import cgutils
 
-from me2e_compress.operators.kernels.intrinsics import INT, WORD
-from me2e_compress.operators.kernels.vectors import Vectors, vector_intrinsic
+from me2e_compress.operators.kernels.intrinsics import WORD
+from me2e_compress.operators.kernels.vectors import Vectors, vector_intrinsic, while_fit
 
 
 @dataclasses.dataclass(frozen=True)
@@ -89,41 +86,21 @@ class _Product:
         self.m, self.n, self.k, self.add = m, n, k, add
 
     def write(self) -> None:
-        done = cgutils.alloca_once(self.builder, WORD)
-        self.builder.store(WORD(0), done)
-        with self._while_fit(done, self.tile.width, self.n) as column:
+        done = cgutils.alloca_once_value(self.builder, WORD(0))
+        with while_fit(self.builder, done, self.tile.width, self.n) as column:
             self._rows(column, self.tile.vectors, None)
         # The columns left, one vector at a time, the last one masked
-        with self._while_fit(done, self.tile.lanes, self.n, part=True) as column:
+        with while_fit(
+            self.builder, done, self.tile.lanes, self.n, part=True
+        ) as column:
             left = self.builder.sub(self.n, column)
-            self._rows(column, 1, self._mask(left))
-
-    @contextmanager
-    def _while_fit(
-        self, done: Any, step: int, end: Any, *, part: bool = False
-    ) -> Iterator[Any]:
-        """Repeat what is written inside while ``step`` more, or a part, fit."""
-        builder = self.builder
-        head, body, after = (
-            builder.append_basic_block(name) for name in ("head", "body", "after")
-        )
-        builder.branch(head)
-        builder.position_at_end(head)
-        at = builder.load(done)
-        needed = builder.add(at, WORD(1 if part else step))
-        builder.cbranch(builder.icmp_signed("<=", needed, end), body, after)
-        builder.position_at_end(body)
-        yield at
-        builder.store(builder.add(at, WORD(step)), done)
-        builder.branch(head)
-        builder.position_at_end(after)
+            self._rows(column, 1, self.simd.within(WORD(0), left))
 
     def _rows(self, column: Any, vectors: int, mask: Any) -> None:
-        done = cgutils.alloca_once(self.builder, WORD)
-        self.builder.store(WORD(0), done)
+        done = cgutils.alloca_once_value(self.builder, WORD(0))
         rows = self.tile.rows
         while rows:
-            with self._while_fit(done, rows, self.m) as row:
+            with while_fit(self.builder, done, rows, self.m) as row:
                 self._tile(row, column, rows, vectors, mask)
             rows //= 2
 
@@ -186,12 +163,3 @@ class _Product:
                 across = builder.add(column, WORD(each * self.tile.lanes))
                 places.append(builder.gep(self.c, [builder.add(at, across)]))
         return places
-
-    def _mask(self, left: Any) -> Any:
-        """Write which lanes lie within the columns left."""
-        builder, lanes = self.builder, self.tile.lanes
-        kind = ir.VectorType(WORD, lanes)
-        blank = builder.insert_element(kind(ir.Undefined), left, INT(0))
-        same = ir.VectorType(INT, lanes)([0] * lanes)
-        spread = builder.shuffle_vector(blank, blank, same)
-        return builder.icmp_signed("<", kind(list(range(lanes))), spread)

@@ -3,7 +3,8 @@
 LLVM splits them where the processor's are shorter.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from typing import Any
 
 from llvmlite import ir
@@ -11,10 +12,24 @@ from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
-from me2e_compress.operators.kernels.intrinsics import FLOAT, INT
+from me2e_compress.operators.kernels.intrinsics import FLOAT, INT, WORD
 
 LANES = 16
 """Numbers of a vector of :func:`vector_intrinsic`."""
+
+LOG2_E = 1.4426950408889634
+POWERS = (
+    1.535336188319500e-4, 1.339887440266574e-3, 9.618437357674640e-3,
+    5.550332471162809e-2, 2.402264791363012e-1, 6.931472028550421e-1, 1.0,
+)  # fmt: skip
+"""Polynomial of 2^r for r in -0.5..0.5, highest power first, of the Cephes library (S.
+L. Moshier, single/exp2f.c, netlib.org/cephes): relative error below 2e-7 in float32."""
+
+LEAST = -125.0
+"""Smaller powers count as 2^-125, so that results are normal float32 numbers."""
+
+ROUNDING = 1.5 * 2.0**23
+"""Added to a float32, it leaves the nearest whole number in the lowest bits."""
 
 _FAST = ("contract",)
 
@@ -105,6 +120,23 @@ class Vectors:
         below = self.builder.fcmp_ordered("<", one, least)
         return self.builder.select(below, least, one)
 
+    def power_of_2(self, x: Any) -> Any:
+        """Return 2^x for x <= 0: a polynomial of its fraction, whose exponent grows."""
+        builder = self.builder
+        rounding = self.spread(ROUNDING)
+        x = self.at_least(x, self.spread(LEAST))
+        rounded = builder.fadd(x, rounding)
+        fraction = builder.fsub(x, builder.fsub(rounded, rounding))
+        power = self.spread(POWERS[0])
+        for each in POWERS[1:]:
+            power = builder.fmul(power, fraction, flags=_FAST)
+            power = builder.fadd(power, self.spread(each), flags=_FAST)
+        exponent = builder.shl(
+            builder.bitcast(rounded, self.whole), self.whole([23] * self.lanes)
+        )
+        bits = builder.add(builder.bitcast(power, self.whole), exponent)
+        return builder.bitcast(bits, self.kind)
+
     def choose(self, one: Any, two: Any, lanes: Sequence[int]) -> Any:
         """Return lanes of two vectors, those of the second counted from 16."""
         return self.builder.shuffle_vector(one, two, self.whole(list(lanes)))
@@ -135,6 +167,26 @@ def _between(half: int) -> list[int]:
     """Return the lanes that put one half of two vectors between each other."""
     first = half * LANES // 2
     return [lane for k in range(LANES // 2) for lane in (first + k, LANES + first + k)]
+
+
+@contextmanager
+def while_fit(
+    builder: Any, done: Any, step: int, end: Any, *, part: bool = False
+) -> Iterator[Any]:
+    """Repeat what is written inside while ``step`` more, or a part, fit."""
+    head, body, after = (
+        builder.append_basic_block(name) for name in ("head", "body", "after")
+    )
+    builder.branch(head)
+    builder.position_at_end(head)
+    at = builder.load(done)
+    needed = builder.add(at, WORD(1 if part else step))
+    builder.cbranch(builder.icmp_signed("<=", needed, end), body, after)
+    builder.position_at_end(body)
+    yield at
+    builder.store(builder.add(at, WORD(step)), done)
+    builder.branch(head)
+    builder.position_at_end(after)
 
 
 def vector_intrinsic(write: Callable[..., None], lanes: int = LANES) -> Any:

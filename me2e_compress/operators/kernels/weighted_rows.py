@@ -4,16 +4,17 @@ It is written as LLVM instructions so that the sums stay in registers for every 
 size, which Numba's loops over arrays do not guarantee.
 """
 
-from collections.abc import Callable
 from typing import Any
 
 from llvmlite import ir
-from numba import types
 from numba.core import cgutils
-from numba.extending import intrinsic
 
 from me2e_compress.operators.kernels.intrinsics import ELEMENTS, FLOAT, INT, WORD
-from me2e_compress.operators.kernels.vectors import Vectors
+from me2e_compress.operators.kernels.vectors import (
+    Vectors,
+    vector_intrinsic,
+    while_fit,
+)
 
 CAPACITY = 1024
 """Points at a time, and the distance of the four arrays of offsets and weights."""
@@ -24,33 +25,16 @@ WIDTHS = (32, 16, 8, 4, 1)
 
 
 def weighted_rows(kind: Any, *, onto: bool = False) -> Any:
-    """Return the intrinsic ``(rows, offsets, weights, first, last, out, size)``.
+    """Return the intrinsic ``((rows, offsets, weights, first, last, out, size))``.
 
     It writes ``size`` float32 numbers to the address ``out``: the sum over the points
     ``first`` to ``last`` of four rows each, times their weights, ``onto`` what is there
     or not. A point whose first offset is negative is skipped. Rows of ``kind`` are
     float32, int8 or uint8.
     """
-
-    def typed(
-        context: Any,
-        rows: Any,
-        offsets: Any,
-        weights: Any,
-        first: Any,
-        last: Any,
-        out: Any,
-        size: Any,
-    ) -> tuple[Any, Callable[..., Any]]:
-        # Numba calls this with LLVM values
-        def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-            _Loops(builder, kind, onto, *arguments).write()
-            return context.get_dummy_value()
-
-        word = types.intp
-        return types.void(word, offsets, weights, word, word, word, word), generate
-
-    return intrinsic(typed)
+    return vector_intrinsic(
+        lambda simd, *words: _Loops(simd.builder, kind, onto, *words).write()
+    )
 
 
 class _Loops:
@@ -58,47 +42,28 @@ class _Loops:
 
     def __init__(
         self,
-        builder: Any,
-        kind: Any,
-        onto: bool,
-        rows: Any,
-        offsets: Any,
-        weights: Any,
-        first: Any,
-        last: Any,
-        out: Any,
-        size: Any,
-    ) -> None:
+        builder: Any, kind: Any, onto: bool,
+        rows: Any, offsets: Any, weights: Any,
+        first: Any, last: Any, out: Any, size: Any,
+    ) -> None:  # fmt: skip
         self.builder, self.kind, self.onto = builder, kind, onto
         self.rows = builder.inttoptr(rows, ELEMENTS[kind].as_pointer())
-        self.out = builder.inttoptr(out, FLOAT.as_pointer())
-        self.offsets, self.weights = offsets, weights
+        self.offsets = builder.inttoptr(offsets, INT.as_pointer())
+        self.weights, self.out = (
+            builder.inttoptr(each, FLOAT.as_pointer()) for each in (weights, out)
+        )
         self.first, self.last, self.size = first, last, size
 
     def write(self) -> None:
         builder = self.builder
-        done = cgutils.alloca_once(builder, WORD)
-        builder.store(WORD(0), done)
+        done = cgutils.alloca_once_value(builder, WORD(0))
         for width in WIDTHS:
-            head, body, after = (
-                builder.append_basic_block(f"{part}{width}")
-                for part in ("head", "body", "after")
-            )
-            # Loop while this width fits into the rest
-            builder.branch(head)
-            builder.position_at_end(head)
-            at = builder.load(done)
-            end = builder.add(at, WORD(width))
-            builder.cbranch(builder.icmp_signed("<=", end, self.size), body, after)
-            builder.position_at_end(body)
-            place = self._vector_at(builder.gep(self.out, [at]), FLOAT, width)
-            zeros = ir.VectorType(FLOAT, width)([0.0] * width)
-            begin = builder.load(place, align=4) if self.onto else zeros
-            total = self._sum(builder.gep(self.rows, [at]), begin, width)
-            builder.store(total, place, align=4)
-            builder.store(end, done)
-            builder.branch(head)
-            builder.position_at_end(after)
+            with while_fit(builder, done, width, self.size) as at:
+                place = self._vector_at(builder.gep(self.out, [at]), FLOAT, width)
+                zeros = ir.VectorType(FLOAT, width)([0.0] * width)
+                begin = builder.load(place, align=4) if self.onto else zeros
+                total = self._sum(builder.gep(self.rows, [at]), begin, width)
+                builder.store(total, place, align=4)
 
     def _sum(self, rows: Any, begin: Any, width: int) -> Any:
         """Write the loop over points for ``width`` channels and return the sums."""

@@ -112,7 +112,7 @@ def test_what_has_no_weight_is_not_read() -> None:
     assert np.array_equal(one, two)
 
 
-def raw_call() -> dict[str, Any]:
+def raw_call(scores: int = 16, spread: float = 9) -> dict[str, Any]:
     """Draw 3 cameras of 2 levels, and more heads than the kernel's tables hold."""
     random = np.random.default_rng(6)
     shown = random.uniform(size=(1, 90, 1, 3, 1)) < 0.4
@@ -122,14 +122,17 @@ def raw_call() -> dict[str, Any]:
         "level_start_index": np.arange(6) * 6,
         "reference_points": random.uniform(-0.1, 1.1, (1, 90, 1, 3, 4, 2)),
         "sampling_offsets": random.normal(size=(1, 90, 23, 2, 8, 2)) * 0.2,
-        "attention_scores": random.normal(300, 9, (1, 90, 23, 1, 16)),
+        "attention_scores": random.normal(300, spread, (1, 90, 23, 1, scores)),
         "mask": np.where(shown, random.uniform(size=shown.shape), 0),
     }
     return in_float32(drawn)
 
 
-def test_levels_share_offsets_and_a_camera_without_weight_is_not_read() -> None:
-    arrays = raw_call()
+@pytest.mark.parametrize(("scores", "spread"), [(16, 9), (8, 9), (4, 90), (6, 90)])
+def test_levels_share_offsets_and_a_camera_without_weight_is_not_read(
+    scores: int, spread: float
+) -> None:
+    arrays = raw_call(scores, spread)
     arrays["mask"][:, :, :, 1] = 0
     expected = dialect_reference(OPERATOR, RAW, DrawnCall(arrays))
     arrays["value"][:, 12:24] = np.nan
