@@ -25,14 +25,8 @@ def attempt(
 ) -> tuple[PassResult, str]:
     """Run a pass on a clone, check its contract, and infer the shapes behind it.
 
-    Args:
-        current: the pass.
-        model: the graph, shapes inferred; it stays as it is.
-        context: what the pass may ask for.
-        digest: of the graph, if that is known.
-
-    Returns:
-        What the pass returned, shapes inferred, and the digest of its graph.
+    Returns what the pass returned and the digest of its graph. Shapes are inferred in
+    both graphs; ``digest`` is that of the first, if known.
 
     Raises:
         VerificationError: the pass lied about having changed something, changed the
@@ -88,10 +82,7 @@ def check_valid(
 ) -> None:
     """Check that a graph is valid ONNX: SSA form, topological order, known operators.
 
-    Args:
-        name: of who made it.
-        model: the graph.
-        written: the graph without its large weights; None writes it.
+    ``written`` is the graph without its large weights; None writes it.
 
     Raises:
         VerificationError: it is not; the message names who left it so.
@@ -157,11 +148,7 @@ def check_shapes(name: str, before: ir.Model, after: ir.Model) -> None:
 
     Where the maker of the same value contradicted itself before the pass, nothing is
     said, nor of nodes with bodies, of plugins, and of nodes whose inputs have no type.
-
-    Args:
-        name: of the pass.
-        before: the graph that it was given, shapes inferred.
-        after: the graph that it returned, shapes inferred.
+    Shapes are inferred in both graphs.
 
     Raises:
         VerificationError: a node refuses what it reads, or gives another shape or type
@@ -200,12 +187,7 @@ def _reads_alike(one: ir.Node, other: ir.Node) -> bool:
 
 
 def contradiction(node: ir.Node, opset: int) -> str | None:
-    """Return why a node of ONNX's own cannot give what the graph says it gives.
-
-    Args:
-        node: whose inputs and outputs say what types and shapes they have.
-        opset: the version of ONNX's own operators.
-    """
+    """Return why a node of ONNX's own cannot give what the graph says it gives."""
     typed = all(isinstance(v.type, ir.TensorType) for v in filter(None, node.inputs))
     if not is_standard(node) or has_subgraph(node) or not typed:
         return None

@@ -122,13 +122,8 @@ def unsteadiness(
 ) -> dict[str, float]:
     """Measure how far each output moves when inputs change in their last places.
 
-    Args:
-        model: the graph.
-        answers: what it gave on them.
-        inputs: what it was run on.
-
-    Returns:
-        Output name -> the largest max|a-b|/max|a| of ``NUDGES`` trials.
+    ``answers`` are what it gave on the inputs as they are. Returns the largest
+    max|a-b|/max|a| of ``NUDGES`` trials, by output.
     """
     session = Session(model, provider=inputs.provider)
     worst = dict.fromkeys(answers[0], 0.0)
@@ -215,16 +210,9 @@ def _body_errors(
     """Run the bodies that passes added, each on what its first call reads.
 
     Sessions run a fused node by its compiled kernel: the body, which a file carries for
-    other runtimes, is opened alone.
-
-    Args:
-        before: the graph before the passes.
-        after: the graph after them, shapes inferred.
-        inputs: the first frame is run.
-
-    Yields:
-        An operator, max|a-b|/max|a| of what kernel and body give, which is infinite for
-        a body that does not run, and how large that may be, by the dtype.
+    other runtimes, is opened alone. Yields an operator, max|a-b|/max|a| of what kernel
+    and body give, which is infinite for a body that does not run, and how large that
+    may be, by the dtype.
 
     Raises:
         GraphError: onnxruntime cannot run the graph.

@@ -79,15 +79,9 @@ def piece_errors(
 ) -> tuple[list[Errors], Errors]:
     """Run a graph once, and others on what its steps gave; nodes run as they stand.
 
-    Args:
-        before: the first graph; recurrent state, too, is its own.
-        others: graphs that have its steps, and what each is run on.
-        steps: those that both have.
-        inputs: what the first is run on.
-
-    Returns:
-        The largest errors of each over all frames, and how large those of operands may
-        be, by their dtypes.
+    Recurrent state, too, is that of the first, which ``inputs`` are of. Returns the
+    largest errors of each over all frames, and how large those of operands may be, by
+    their dtypes.
 
     Raises:
         GraphError: onnxruntime cannot run one.

@@ -159,12 +159,7 @@ class Report:
         return _steps_table(self.steps), _verification_table(self.verifications)
 
     def record(self, source: Path, output: Path) -> dict[str, object]:
-        """Give everything but the weights, ready for JSON.
-
-        Args:
-            source: the file that was compressed.
-            output: the file that was written; both are hashed as they are on disk.
-        """
+        """Give everything but the weights, ready for JSON; both files are hashed."""
         files = [
             {"file": file.name, "sha256": graph.sha256_of(file)}
             for file in (source, output)

@@ -20,11 +20,8 @@ def shrink(model: ir.Model, fails: Failing) -> ir.Model:
     """Halve a graph as long as one of its parts still fails.
 
     Parts are stretches of nodes in topological order: the first half, the second
-    half, the middle; so at most three trials a halving.
-
-    Args:
-        model: a graph on which the failure shows.
-        fails: whether it shows on a part; called with graphs it may change.
+    half, the middle; so at most three trials a halving. ``fails`` may change what it is
+    given.
     """
     shrinking = True
     while shrinking and len(model.graph) > 1:

@@ -80,14 +80,8 @@ class VerificationInputs:
     ) -> "VerificationInputs":
         """Take the first recorded frames, or make seeded inputs where none are given.
 
-        Open dimensions are given two sizes that the graph runs at, one after the other.
-
-        Args:
-            model: the graph.
-            frames: the recording; None makes inputs up.
-            seed: of those.
-            count: how many frames; of drawn sizes that many each.
-            provider: what runs the graphs.
+        Open dimensions are given two sizes that the graph runs at, one after the other:
+        ``count`` frames of each.
 
         Raises:
             PreconditionError: none are given, and the inputs are of unknown rank or no

@@ -1,11 +1,11 @@
 """Pictures of recorded moments, and their PNG and GIF files."""
 
-import os
-import tempfile
+import io
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -13,6 +13,7 @@ import numpy.typing as npt
 from PIL import Image
 
 from me2e_compress.errors import EvaluationError
+from me2e_compress.runtime.atomic import write_bytes
 from me2e_compress.simulator.camera_rig import CAMERA_NAMES
 from me2e_compress.simulator.cameras.ground import GroundTexture
 from me2e_compress.simulator.pictures.top_view import (
@@ -207,13 +208,11 @@ def write_gif(path: Path, pictures: Iterable[Bytes], frame_us: int) -> None:
     _replace(path, save)
 
 
-def _replace(path: Path, save: Callable[[Path], None]) -> None:
+def _replace(path: Path, save: Callable[[io.BytesIO], Any]) -> None:
+    content = io.BytesIO()
+    save(content)
     try:
-        # write beside the file, so that it is replaced in one step
-        with tempfile.TemporaryDirectory(dir=path.parent, prefix=".saving-") as near:
-            draft = Path(near) / path.name
-            save(draft)
-            os.replace(draft, path)
+        write_bytes(path, content.getvalue())
     except OSError as error:
         raise EvaluationError(
             f"{path}: the picture cannot be written: {error.strerror or error}"

@@ -298,6 +298,10 @@ LIMIT_MPS = 14.0
 RAMP_RADIUS_M = 80.0
 RAMP_APART_M = 7.0
 """Sideways distance between the ramp's straight and the lane it becomes."""
+RAMP_RAD = math.acos(1 - RAMP_APART_M / (2 * RAMP_RADIUS_M))
+"""How far each of its two arcs turns."""
+RAMP = Section(limit_mps=LIMIT_MPS)
+BESIDE = replace(RAMP, left=LaneMarking.DASHED)
 CHANGE_M = 25.0
 """Length of a lane change."""
 
@@ -315,24 +319,24 @@ class Ramp:
     merge_s: float
 
 
+def _main_road(stage: Stage, start: Pose) -> Street:
+    section = Section(2, limit_mps=LIMIT_MPS)
+    road = lay_road(stage.network, "m", start, straight(stage), section)
+    return replace(road, lane=1)
+
+
 def on_ramp(stage: Stage, ego_on_ramp: bool = True) -> Ramp:
     """Lay a ramp that joins from the right and runs beside the main road."""
-    start, section = origin(stage), Section(2, limit_mps=LIMIT_MPS)
-    # main road
-    main = replace(
-        lay_road(stage.network, "m", start, straight(stage), section), lane=1
-    )
-    single = replace(section, lanes=1)
-    beside = replace(single, left=LaneMarking.DASHED)
+    start = origin(stage)
+    main = _main_road(stage, start)
     # ramp: straight, an S-bend, then the acceleration lane
-    angle = math.acos(1 - RAMP_APART_M / (2 * RAMP_RADIUS_M))
     apart = -2 * LANE_WIDTH_M - RAMP_APART_M
     net, length = stage.network, BEFORE_M + stage.place("ramp_m", 15.0, 25.0)
-    pose = net.straight("p0", "p1", start.moved(0.0, apart), length, single)
-    pose = net.arc("p1", "p2", pose, RAMP_RADIUS_M, angle, single)
-    pose = net.arc("p2", "p3", pose, RAMP_RADIUS_M, -angle, single)
+    pose = net.straight("p0", "p1", start.moved(0.0, apart), length, RAMP)
+    pose = net.arc("p1", "p2", pose, RAMP_RADIUS_M, RAMP_RAD, RAMP)
+    pose = net.arc("p2", "p3", pose, RAMP_RADIUS_M, -RAMP_RAD, RAMP)
     lane_m = stage.uniform("acceleration_lane_m", 65.0, 80.0)
-    pose = net.straight("p3", "p4", pose, lane_m, beside)
+    pose = net.straight("p3", "p4", pose, lane_m, BESIDE)
     net.closed.append(("p3", "p4", 0))
     block_end(stage, pose)
     ramp: list[LaneIndex] = [(f"p{k}", f"p{k + 1}", 0) for k in range(4)]
@@ -341,7 +345,7 @@ def on_ramp(stage: Stage, ego_on_ramp: bool = True) -> Ramp:
         legs = [Leg(main.ahead()[0], enter_m=BEFORE_M)]
         stage.drive(legs, start_speed(stage))
         return Ramp(main, ramp, 0.0)
-    begun = length + 2 * RAMP_RADIUS_M * math.sin(angle)
+    begun = length + 2 * RAMP_RADIUS_M * math.sin(RAMP_RAD)
     leave = stage.uniform("leave_m", 15.0, 25.0)
     legs = [
         Leg(ramp[0], enter_m=BEFORE_M),
@@ -358,31 +362,24 @@ def on_ramp(stage: Stage, ego_on_ramp: bool = True) -> Ramp:
 
 def off_ramp(stage: Stage) -> Ramp:
     """Lay an exit on the right; the ego starts in the left lane of the main road."""
-    start, section = origin(stage), Section(2, limit_mps=LIMIT_MPS)
-    # main road
-    main = replace(
-        lay_road(stage.network, "m", start, straight(stage), section), lane=1
-    )
-    single = replace(section, lanes=1)
-    beside = replace(single, left=LaneMarking.DASHED)
+    start = origin(stage)
+    main = _main_road(stage, start)
     # ramp: a lane beside the main road, then an S-bend away from it
-    angle = math.acos(1 - RAMP_APART_M / (2 * RAMP_RADIUS_M))
     first = stage.place("change_m", 40.0, 55.0)
     opens = BEFORE_M + first + CHANGE_M
     net = stage.network
     pose = start.moved(opens, -2 * LANE_WIDTH_M)
-    pose = net.straight("q0", "q1", pose, 55.0, beside)
+    pose = net.straight("q0", "q1", pose, 55.0, BESIDE)
     net.closed.append(("q0", "q1", 0))
-    pose = net.arc("q1", "q2", pose, RAMP_RADIUS_M, -angle, single)
-    pose = net.arc("q2", "q3", pose, RAMP_RADIUS_M, angle, single)
-    net.straight("q3", "q4", pose, 150.0 + stage.more_m, single)
+    pose = net.arc("q1", "q2", pose, RAMP_RADIUS_M, -RAMP_RAD, RAMP)
+    pose = net.arc("q2", "q3", pose, RAMP_RADIUS_M, RAMP_RAD, RAMP)
+    net.straight("q3", "q4", pose, 150.0 + stage.more_m, RAMP)
     ramp: list[LaneIndex] = [(f"q{k}", f"q{k + 1}", 0) for k in range(4)]
     # the ego changes lanes twice, into the ramp
     left, right = main.ahead(0)[0], main.ahead()[0]
-    changed = BEFORE_M + first + CHANGE_M
     legs = [
         Leg(left, enter_m=BEFORE_M, leave_m=BEFORE_M + first),
-        Leg(right, Command.CHANGE_RIGHT, changed, changed + 10.0),
+        Leg(right, Command.CHANGE_RIGHT, opens, opens + 10.0),
         Leg(ramp[0], Command.CHANGE_RIGHT, 10.0 + CHANGE_M),
         *(Leg(index) for index in ramp[1:]),
     ]

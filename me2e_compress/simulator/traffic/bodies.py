@@ -26,7 +26,29 @@ STEERING_LAG_S = 0.1
 once, which makes jerk, and so every comfort score, meaningless."""
 
 
-class EgoVehicle(Vehicle):  # type: ignore[misc]  # highway-env is untyped
+class _Body:
+    """What bodies have of their own beside highway-env's."""
+
+    position: Floats
+    heading: float
+    braking, indicator = False, 0
+
+    @property
+    def pose(self) -> Pose:
+        """Right-handed pose."""
+        x, y = self.position
+        return Pose(float(x), -float(y), -float(self.heading))
+
+    def become(
+        self, id: int, kind: ActorKind, size: tuple[float, float, float] | None = None
+    ) -> None:
+        """Set identity and size: length, width and height."""
+        self.id, self.kind = id, kind
+        self.LENGTH, self.WIDTH, self.height = size or DIMENSIONS[kind]
+        self.diagonal = math.hypot(self.LENGTH, self.WIDTH)
+
+
+class EgoVehicle(_Body, Vehicle):  # type: ignore[misc]  # highway-env is untyped
     """The ego: highway-env's kinematic bicycle with lag, grip and no reverse gear.
 
     The dynamics are exact for held actuators, so a finer time step changes the
@@ -36,21 +58,13 @@ class EgoVehicle(Vehicle):  # type: ignore[misc]  # highway-env is untyped
     def __init__(self, pose: Pose, speed_mps: float) -> None:
         super().__init__(None, flip(pose.x, pose.y), -pose.heading, speed_mps)
         self.speed: float = speed_mps
-        self.position: Floats
-        self.id = 0
-        self.kind = ActorKind.CAR
+        self.id, self.kind = 0, ActorKind.CAR
         self.grip_mps2 = DRY_GRIP_MPS2
         self.wanted = Control(0.0, 0.0)
         self.acceleration_mps2 = 0.0
         self.yaw_rate_radps = 0.0
         self.steering_rad = 0.0
         self._thrust_mps2 = 0.0
-
-    @property
-    def pose(self) -> Pose:
-        """Right-handed pose."""
-        x, y = self.position
-        return Pose(float(x), -float(y), -float(self.heading))
 
     def act(self, action: object = None) -> None:
         """Do nothing: the ego is driven from outside through `wanted`."""
@@ -106,7 +120,7 @@ class EgoVehicle(Vehicle):  # type: ignore[misc]  # highway-env is untyped
         )
 
 
-class Walker(Vehicle):  # type: ignore[misc]  # highway-env is untyped
+class Walker(_Body, Vehicle):  # type: ignore[misc]  # highway-env is untyped
     """A pedestrian or cyclist who follows a polyline once started and never yields.
 
     ``line`` is [N, 2] right-handed metres.
@@ -119,14 +133,11 @@ class Walker(Vehicle):  # type: ignore[misc]  # highway-env is untyped
         heading = math.atan2(step[1], step[0])
         super().__init__(None, flip(*line[0]), -heading, 0.0)
         self.speed: float = 0.0
-        self.position: Floats
-        self.LENGTH, self.WIDTH, self.height = DIMENSIONS[kind]
-        self.diagonal = math.hypot(self.LENGTH, self.WIDTH)
-        self.id, self.kind, self.line = id, kind, line
+        self.become(id, kind)
+        self.line = line
         self.top_speed_mps = speed_mps
         self.going = self.crosses = False
         self.walked_m = 0.0
-        self.braking, self.indicator = False, 0
         legs = np.hypot(*np.diff(line, axis=0).T)
         self._arc = np.concatenate([[0.0], np.cumsum(legs)])
         self._ends = self._arc.tolist()
@@ -169,7 +180,7 @@ class Walker(Vehicle):  # type: ignore[misc]  # highway-env is untyped
         return np.concatenate([flip(*self.position)[None], ahead])
 
 
-class StaticObject(Obstacle):  # type: ignore[misc]  # highway-env is untyped
+class StaticObject(_Body, Obstacle):  # type: ignore[misc]  # highway-env is untyped
     """A static object: parked car, door, cone, barrier."""
 
     def __init__(
@@ -180,10 +191,7 @@ class StaticObject(Obstacle):  # type: ignore[misc]  # highway-env is untyped
         size: tuple[float, float, float] | None = None,
     ) -> None:
         super().__init__(None, flip(pose.x, pose.y), -pose.heading, 0.0)
-        self.LENGTH, self.WIDTH, self.height = size or DIMENSIONS[kind]
-        self.diagonal = math.hypot(self.LENGTH, self.WIDTH)
-        self.id, self.kind = id, kind
-        self.braking, self.indicator = False, 0
+        self.become(id, kind, size)
 
 
 # Cars that follow lanes by highway-env's IDM, each with its own behaviour. What stock
@@ -227,7 +235,7 @@ class Behaviour:
     """MOBIL's weight of what a lane change costs others; highway-env has 0."""
 
 
-class Car(IDMVehicle):  # type: ignore[misc]  # highway-env is untyped
+class Car(_Body, IDMVehicle):  # type: ignore[misc]  # highway-env is untyped
     """An actor on a chain of lanes, each the successor of the one before.
 
     It starts at an arc length on the first of them; it wants to go on at its initial
@@ -254,11 +262,9 @@ class Car(IDMVehicle):  # type: ignore[misc]  # highway-env is untyped
             enable_lane_change=False,
             timer=0.5,
         )
-        self.id, self.kind, self.network = id, kind, network
-        self.LENGTH, self.WIDTH, self.height = DIMENSIONS[kind]
-        self.diagonal = math.hypot(self.LENGTH, self.WIDTH)
+        self.become(id, kind)
+        self.network = network
         self.speed: float = speed_mps
-        self.position: Floats
         # highway-env's IDM reads these names
         self.behaviour = behaviour or Behaviour()
         self.COMFORT_ACC_MAX = self.behaviour.acceleration_mps2
@@ -274,17 +280,10 @@ class Car(IDMVehicle):  # type: ignore[misc]  # highway-env is untyped
         """An acceleration that a script imposes instead of IDM's."""
         self.offset_m = 0.0
         """How far left of the lane's centre it drives."""
-        self.braking, self.indicator = False, 0
         self.until_change = id % 10
         """Decisions until it looks for a better lane."""
         self.joins: list[LaneIndex] | None = None
         """The chain that it joins where its own ends."""
-
-    @property
-    def pose(self) -> Pose:
-        """Right-handed pose."""
-        x, y = self.position
-        return Pose(float(x), -float(y), -float(self.heading))
 
     @property
     def lane_s(self) -> float:
