@@ -34,6 +34,14 @@ _FORMER = {
     },
     "ablate-modules means": f"means {_NOW} frames (--frames)",
     "fuse-basic swish": "swish is gone since 0.3.0: onnxruntime has no kernel",
+    **{
+        f"{name} {option}": f"{option} is gone since 0.3.0: its default is what is best"
+        for name, option in (
+            ("eliminate-redundant", "across_modules"),
+            ("fuse-operators", "merge_images"),
+            ("fuse-operators", "tolerance"),
+        )
+    },
     "fold-constants growth": f"growth {_NOW} bytes_per_node",
     "command build": f"build {_NOW} trtexec --onnx=M.onnx --saveEngine=M.engine",
     "command ranges": f"ranges {_NOW} calibrate, which says what deserves a look",

@@ -94,21 +94,20 @@ DRAWN = TWINS.replace("Add(x, z)", "RandomNormalLike(x)").replace(
 
 
 @pytest.mark.parametrize(
-    ("text", "modules", "across", "left"),
+    ("text", "modules", "left"),
     [
-        (TWINS, ("det", "det"), False, 2),
-        (TWINS, ("det", "map"), False, 3),
-        (TWINS, ("det", "map"), True, 2),
-        (DRAWN, ("det", "det"), False, 3),
+        (TWINS, ("det", "det"), 2),
+        (TWINS, ("det", "map"), 3),
+        (DRAWN, ("det", "det"), 3),
     ],
 )
 def test_equal_nodes_become_one_within_their_module(
-    text: str, modules: tuple[str, str], across: bool, left: int
+    text: str, modules: tuple[str, str], left: int
 ) -> None:
     model = read(text)
     for node, module in zip(model.graph, (*modules, modules[1]), strict=True):
         provenance.stamp(node, provenance.Provenance(module, (node.name or "",)))
-    apply(EliminateRedundant(across_modules=across), model)
+    apply(EliminateRedundant(), model)
     assert len(model.graph) == left
     if modules == ("det", "det") and left == 2:
         past = provenance.read(model.graph.node(0))

@@ -10,7 +10,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from me2e_compress.errors import RecipeError
 from me2e_compress.graph import digest, infer_shapes, opset_of, provenance, static_shape
 from me2e_compress.manager import PassManager, recipe
 from me2e_compress.operators import expand
@@ -106,13 +105,6 @@ def test_images_that_are_added_up_are_levels(merge: str, masked: bool) -> None:
     assert shapes[0] == (1, sizes.n * sizes.pixels, sizes.m, sizes.d)
     assert shapes[1] == (levels, 2)
     assert shapes[3] == (1, sizes.q, sizes.m, levels, sizes.p, 2)
-
-
-def test_images_are_kept_apart_if_asked() -> None:
-    model = decomposed(Sizes(n=3), merge="ReduceSum")
-    result = FuseOperators(merge_images=False).run(inferred(model), NO_MODULES)
-    assert result.changes == 1
-    assert "ReduceSum" in ops(model)
 
 
 SUM_OF_HEADS = """g (float[6,4,5,7] image, float[6,9,3,2] grid, float[3] weights)
@@ -309,12 +301,6 @@ def test_the_way_to_a_plugin_of_tensorrt_is_checked() -> None:
     assert found.passes == ("fuse-operators", "translate-plugins")
     assert found.errors["y"] < 1e-4
     assert "MultiscaleDeformableAttnPlugin_TRT" in ops(report.model)
-
-
-@pytest.mark.parametrize("tolerance", [0.0, 1.0, -1e-4, float("nan")])
-def test_a_tolerance_that_is_none_is_refused(tolerance: float) -> None:
-    with pytest.raises(RecipeError, match="tolerance"):
-        FuseOperators(tolerance=tolerance)
 
 
 def test_a_proof_is_no_zero_against_a_zero() -> None:

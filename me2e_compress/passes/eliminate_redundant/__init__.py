@@ -29,10 +29,10 @@ EDGE_BYTES = 64
 """How much of each end of a weight is compared before all of it is hashed."""
 
 
-def share_nodes(graph: ir.Graph, by: str, *, across_modules: bool) -> int:
+def share_nodes(graph: ir.Graph, by: str) -> int:
     """Merge equal nodes into the first of them and count the removed ones.
 
-    Nodes of different modules stay apart unless ``across_modules``.
+    Nodes of different modules stay apart, so that a module can be taken out later.
     """
     # Find equal nodes and bypass all but the first
     first: dict[object, ir.Node] = {}
@@ -40,7 +40,7 @@ def share_nodes(graph: ir.Graph, by: str, *, across_modules: bool) -> int:
     for node in graph:
         if not is_standard(node) or node.op_type in RANDOM or has_subgraph(node):
             continue
-        module = "" if across_modules else provenance.module_of(node)
+        module = provenance.module_of(node)
         inputs = [id(value) for value in node.inputs]
         if node.op_type in COMMUTATIVE:
             inputs.sort()
@@ -109,16 +109,10 @@ class EliminateRedundant(Pass):
     Result:  x -> y;  one Add
 
     Exact to the bit: x + 0.0 stays, since it turns -0.0 into +0.0.
-
-    Attributes:
-        across_modules: share equal nodes of different modules too; by default they
-            stay apart, so that a module can be taken out of the graph later. Equal
-            initializers are shared in any case.
     """
 
     name: ClassVar[str] = "eliminate-redundant"
     exact: ClassVar[bool] = True
-    across_modules: bool = False
 
     def run(self, model: ir.Model, context: Context) -> PassResult:
         """Apply the rules until none applies, then drop unread nodes."""
@@ -154,9 +148,7 @@ class EliminateRedundant(Pass):
             node, _ = work.popitem()
             if node.graph is body:
                 work.update(dict.fromkeys(self._visit(node, site, tally)))
-        tally["equal nodes"] += share_nodes(
-            body, self.name, across_modules=self.across_modules
-        )
+        tally["equal nodes"] += share_nodes(body, self.name)
 
     def _visit(
         self, node: ir.Node, site: MergeSite, tally: Counter[str]

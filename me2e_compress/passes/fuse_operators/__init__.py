@@ -8,7 +8,7 @@ from typing import ClassVar
 
 import onnx_ir as ir
 
-from me2e_compress.errors import GraphError, PreconditionError, RecipeError
+from me2e_compress.errors import GraphError, PreconditionError
 from me2e_compress.graph import array_of, graphs_of, is_standard, opset_of
 from me2e_compress.graph.nodes import is_read, nodes_in
 from me2e_compress.graph.provenance import inherit
@@ -32,6 +32,10 @@ from me2e_compress.passes.fuse_operators.numeric_check import (
 )
 
 __all__ = ["FuseOperators"]
+
+TOLERANCE = 1e-4
+"""Largest difference, relative to the largest result: the cost of summing float32 in
+another order, and of rounding positions on the way to -1..1 and back."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -58,26 +62,13 @@ class FuseOperators(Pass):
     same random numbers, including positions outside the feature maps; if they differ
     the nodes stay. The notes name every GridSample that stays, and why.
 
-    Attributes:
-        tolerance: largest allowed difference, relative to the largest result (1e-4: the
-            cost of summing float32 in another order, and of rounding positions on the
-            way to -1..1 and back).
-        merge_images: include the sum, or mean, over cameras or frames that follows, and
-            the mask before it: each image is then one more level, and the results of
-            single images are never stored (BEVFormer's and VAD's encoders).
+    The sum, or mean, over cameras or frames that follows is included, and the mask
+    before it: each image is then one more level, and the results of single images are
+    never stored (BEVFormer's and VAD's encoders).
     """
 
     name: ClassVar[str] = "fuse-operators"
     exact: ClassVar[bool] = True
-    tolerance: float = 1e-4
-    merge_images: bool = True
-
-    def __post_init__(self) -> None:
-        """Check the tolerance."""
-        if not 0 < self.tolerance < 1:
-            raise RecipeError(
-                f"{self.name}: tolerance={self.tolerance} is not between 0 and 1"
-            )
 
     def run(self, model: ir.Model, context: Context) -> PassResult:
         """Try every GridSample that is read, in the graph and its bodies."""
@@ -85,7 +76,8 @@ class FuseOperators(Pass):
         if not any(_is_sampler(node) or gathered.is_sampler(node) for node in nodes):
             return PassResult(model, 0)
         opset, unread = opset_of(model), remove_dead(model.graph)
-        run = _Run(self, opset, value_names(model.graph), Proofs(opset, context.seed))
+        names, proofs = value_names(model.graph), Proofs(opset, context.seed)
+        run = _Run(self.name, opset, names, proofs)
         left: list[str] = []
         for body in graphs_of(model.graph):
             left += run.tried(body, gathered.is_sampler, run.sample)
@@ -111,11 +103,8 @@ def _is_sampler(node: ir.Node) -> bool:
 class _Run:
     """Writes one match after another, counts them, and keeps the worst error."""
 
-    def __init__(
-        self, current: FuseOperators, opset: int, names: set[str], proofs: Proofs
-    ) -> None:
-        self.current, self.opset, self.names = current, opset, names
-        self.proofs = proofs
+    def __init__(self, by: str, opset: int, names: set[str], proofs: Proofs) -> None:
+        self.by, self.opset, self.names, self.proofs = by, opset, names, proofs
         self.fused = self.samplers = self.sampled = 0
         self.worst = 0.0
         self._failed: set[tuple[ir.Value, ...]] = set()
@@ -139,9 +128,8 @@ class _Run:
         """Fuse the attention of a GridSample."""
         match, plan = decomposed.find(node), None
         # With the following sum over images, if that can be included
-        if self.current.merge_images:
-            with contextlib.suppress(PreconditionError):
-                plan = fused_form.plan(decomposed.with_images(match))
+        with contextlib.suppress(PreconditionError):
+            plan = fused_form.plan(decomposed.with_images(match))
         plan = fused_form.plan(match) if plan is None else plan
         inputs = [view.value for view in plan.inputs]
         write = functools.partial(fused_form.write, plan)
@@ -190,22 +178,21 @@ class _Run:
             raise PreconditionError(f"nothing makes {old.name}")
         matched = nodes_between(old, inputs)
         # Write the new nodes next to the old ones
-        call = FusedCall(root, opset=self.opset, by=self.current.name, names=self.names)
+        call = FusedCall(root, opset=self.opset, by=self.by, names=self.names)
         new = write(call)
         made = nodes_between(new, inputs)
         # Keep them only if both compute the same
         try:
             error = self.proofs.error(old, new, draw, least)
-            if not error <= self.current.tolerance:
+            if not error <= TOLERANCE:
                 raise PreconditionError(
-                    f"as one node it differs by {error:.1e} (allowed"
-                    f" {self.current.tolerance:.0e})"
+                    f"as one node it differs by {error:.1e} (allowed {TOLERANCE:.0e})"
                 )
         except (PreconditionError, GraphError):
             take_back(body, made, known)
             raise
         for each in made:
-            inherit(each, [root, *matched], by=self.current.name)
+            inherit(each, [root, *matched], by=self.by)
         replace_value(old, new)
         # Remove what is unread now, readers first
         for each in reversed(matched):
