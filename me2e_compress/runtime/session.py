@@ -23,7 +23,7 @@ from me2e_compress.graph.recurrence import SessionPort, not_fed_back, recurrence
 from me2e_compress.runtime.frames import Array, Frame
 from me2e_compress.runtime.kernel_types import remedy, without_kernel
 from me2e_compress.runtime.providers import CPU, Provider, holds
-from me2e_compress.runtime.runnable import NO_OVERFLOW, QDQ_OFF, runnable, unsupported
+from me2e_compress.runtime.runnable import QDQ_OFF, int8_entry, runnable, unsupported
 
 # The compiled module has no stubs.
 
@@ -298,8 +298,8 @@ class Session:
         # One block for all tensors of a run: twice the memory on VAD-tiny, no gain.
         options.enable_mem_pattern = False
         if not stock and provider.target == CPU.target:
-            entry = NO_OVERFLOW if int8_kernels else QDQ_OFF
-            options.add_session_config_entry(entry, "1")
+            entry = int8_entry() if int8_kernels else (QDQ_OFF, "1")
+            options.add_session_config_entry(*entry)
         if frugal:
             options.execution_order = ort.ExecutionOrder.PRIORITY_BASED
         if rewritten is not None:

@@ -1,16 +1,15 @@
 """What onnxruntime's own int8 kernels answer otherwise than an int8 graph says."""
 
 import dataclasses
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from functools import partial
+from collections.abc import Iterable, Iterator, Mapping
 
-import numpy as np
 import onnx_ir as ir
 
 from me2e_compress import graph
 from me2e_compress.fidelity.compare import Fidelity, SetFidelity, SetTally, Tally
 from me2e_compress.runtime.frames import Array, Frame
 from me2e_compress.runtime.providers import CPU, Provider
+from me2e_compress.runtime.runnable import int8_entry
 from me2e_compress.runtime.session import Session, replay
 from me2e_compress.targets.onnxruntime import int8_rewrites
 from me2e_compress.targets.quantized import describe_quantized
@@ -73,16 +72,15 @@ class RuntimeTally:
     def __init__(
         self, session: Session, frames: Iterable[Frame], sets: SetTally | None = None
     ) -> None:
-        self._answers, self._provider = replay(session, frames), session.provider
+        self._answers = replay(session, frames)
         self._sets = None if sets is None else SetTally(sets.outputs)
         self._tallies: dict[str, Tally] = {}
-        self._frame: Frame | None = None
 
     def add(
         self, reference: dict[str, Array], nodes: dict[str, Array], frame: Frame
     ) -> None:
         """Add a frame: what the reference and the nodes of the graph answered."""
-        answers, self._frame = next(self._answers), self._frame or frame
+        answers = next(self._answers)
         for name in (each for each in nodes if each in reference):
             tally = self._tallies.setdefault(name, Tally(name))
             tally.add(reference[name], answers[name], frame.index)
@@ -103,33 +101,18 @@ class RuntimeTally:
             for name, sqnr in runs.items()
             if sqnr < QUIET_DB and sqnr < nodes[name] and sqnr <= nodes[name] - APART_DB
         ]
-        if not apart or self._frame is None:
+        if not apart:
             return RuntimeLoss({}, {})
         shaped = model.clone()
         graph.infer_shapes(shaped)
         causes = [f"{each.node}: {each.message}" for each in int8_rewrites(shaped)]
-        if not causes and _overflows(model, apart, self._frame, self._provider):
+        if not causes and int8_entry()[1] == "1":
             causes = [_OVERFLOW]
         return RuntimeLoss(
             {name: runs[name] for name in apart},
             {name: nodes[name] for name in apart},
             tuple(causes),
         )
-
-
-def _overflows(
-    model: ir.Model, outputs: Sequence[str], frame: Frame, provider: Provider
-) -> bool:
-    """Return whether an output is 6 dB nearer its nodes with sums of 32 bits."""
-    run = partial(Session, model, provider=provider)
-    sessions = run(), run(stock=True), run(int8_kernels=True)
-    (nodes,), (stock,), (wide,) = (replay(each, [frame], outputs) for each in sessions)
-
-    def noise(name: str, answers: Mapping[str, Array]) -> float:
-        apart = nodes[name].astype(np.float64) - answers[name].astype(np.float64)
-        return float(np.square(apart).sum())
-
-    return any(4 * noise(name, wide) < noise(name, stock) for name in outputs)
 
 
 def has_int8_kernels(model: ir.Model, provider: Provider) -> bool:

@@ -23,7 +23,7 @@ from me2e_compress.runtime.int8_values import write_float_products
 from me2e_compress.runtime.optimized import optimized
 from me2e_compress.runtime.profile import TimedSession
 from me2e_compress.runtime.providers import CPU
-from me2e_compress.runtime.runnable import runnable
+from me2e_compress.runtime.runnable import int8_entry, runnable
 from me2e_compress.runtime.session import Session
 from tests.frames import record
 from tests.manager.transformer import transformer
@@ -209,6 +209,30 @@ def test_sums_of_int8_do_not_overflow_on_any_processor(tmp_path: Path) -> None:
         by_nodes = Session(source, threads=1, optimize=False).run({"x": x})["y"]
         np.testing.assert_array_equal(by_kernels, by_nodes)
     assert (x @ large).min() > 32767  # where 16 bits end
+
+
+@pytest.mark.parametrize("wrong", [0, 1])
+def test_sums_are_asked_for_in_32_bits_where_they_overflow_alone(
+    monkeypatch: pytest.MonkeyPatch, wrong: int
+) -> None:
+    """On a Xeon with AMX that takes convolutions 3 to 5 times as long."""
+    shown = list[dict[str, Any]]()
+
+    class Processor:
+        def __init__(self, *_: object, **__: object) -> None: ...
+
+        def run(
+            self, _: None, inputs: dict[str, npt.NDArray[np.uint8]]
+        ) -> list[object]:
+            shown.append(inputs)
+            return [np.full((1, 16), 64 * 255 * 127 - wrong)]
+
+    monkeypatch.setattr(onnxruntime, "InferenceSession", Processor)
+    entry = int8_entry.__wrapped__()
+    monkeypatch.undo()
+
+    assert entry == ("session.x64quantprecision", str(wrong))
+    assert shown[0]["x"].tolist() == [[255] * 64]
 
 
 def test_a_written_file_opens_in_plain_onnxruntime_where_sums_must_not_overflow(
