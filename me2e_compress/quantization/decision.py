@@ -106,7 +106,8 @@ class QuantPlan:
         groups: what Concats join.
         kept_float: int8 nodes that stay float on the target; empty before the plan was
             carried out for one.
-        balanced: whether weights are rounded so that their errors cancel.
+        balanced: whether weights are rounded so that their errors cancel, and lopsided
+            activations span uint8.
         target: who is to run the graph; empty where the plan was made for nobody.
     """
 

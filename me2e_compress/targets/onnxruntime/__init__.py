@@ -23,7 +23,7 @@ from me2e_compress.targets.onnxruntime.convert import (
 )
 from me2e_compress.targets.onnxruntime.costs import costs_of
 from me2e_compress.targets.onnxruntime.lint_rules import RULES, int8_rewrites
-from me2e_compress.targets.onnxruntime.lower import Draft, lower
+from me2e_compress.targets.onnxruntime.lower import Draft, lower, symmetric
 from me2e_compress.targets.onnxruntime.region import find_region, objection
 from me2e_compress.targets.weights import weights_of
 
@@ -58,8 +58,8 @@ class OnnxRuntime(Target):
         self.check_types(plan, model)
         layers, sampling = _int8_of(plan)
         weights = weights_of(model, layers.values(), balanced=plan.balanced)
-        reach = {name: max(-low, high) for name, (low, high) in ranges.tensors.items()}
-        return lower(Draft(model.clone(), weights, reach, list(sampling)))
+        bounds = ranges.tensors if plan.balanced else symmetric(ranges.tensors)
+        return lower(Draft(model.clone(), weights, bounds, list(sampling)))
 
     def kept_float(self, plan: QuantPlan, model: ir.Model) -> tuple[KeptFloat, ...]:
         """List the plan's nodes that :meth:`place` leaves in float, and why."""

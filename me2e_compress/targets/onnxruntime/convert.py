@@ -26,7 +26,7 @@ from me2e_compress.graph.nodes import LAYOUT_OPERATORS, maker
 from me2e_compress.runtime.int8_values import stored_bias
 from me2e_compress.runtime.providers import CPU, Provider
 from me2e_compress.targets.onnxruntime.lint_rules import PASSED
-from me2e_compress.targets.onnxruntime.lower import Draft, lower
+from me2e_compress.targets.onnxruntime.lower import Draft, lower, symmetric
 from me2e_compress.targets.onnxruntime.region import (
     LAYERS,
     find_region,
@@ -57,16 +57,15 @@ def convert(model: ir.Model, ranges: Ranges | None = None) -> ir.Model:
         FramesError: the range of a tensor is missing.
     """
     draft = _draft_of_qdq(model)
-    measured = {} if ranges is None else ranges.tensors
-    more = {name: max(-low, high) for name, (low, high) in measured.items()}
-    return lower(dataclasses.replace(draft, reach={**more, **draft.reach}))
+    more = {} if ranges is None else symmetric(ranges.tensors)
+    return lower(dataclasses.replace(draft, ranges={**more, **draft.ranges}))
 
 
 def unranged(model: ir.Model) -> tuple[str, ...]:
     """Return the outputs of convolutions without a pair, whose range is needed."""
     draft = _draft_of_qdq(model)
     region = find_region(draft.model.graph, draft.weights)
-    return tuple(name for name in region.ranged if name not in draft.reach)
+    return tuple(name for name in region.ranged if name not in draft.ranges)
 
 
 def int8_layers(
@@ -146,7 +145,7 @@ def _draft_of_qdq(model: ir.Model) -> Draft:
     return Draft(
         copy,
         {str(n.outputs[0].name): w for n, w in weights.items() if w is not None},
-        {str(value.name): largest for value, largest in reach.items()},
+        {str(value.name): (-most, most) for value, most in reach.items()},
     )
 
 

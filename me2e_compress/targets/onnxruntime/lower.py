@@ -15,6 +15,7 @@ runs at a quarter of the processor's int8 rate; so at two thirds
 
 import dataclasses
 from collections.abc import Collection, Mapping
+from typing import TypeAlias
 
 import numpy as np
 import onnx_ir as ir
@@ -139,18 +140,28 @@ def read_blocks(writer: Writer, node: ir.Node, cut: Blocks) -> ir.Value:
     return blocks
 
 
+Bounds: TypeAlias = Mapping[str, tuple[float, float]]
+"""The low and the high bound of tensors by name."""
+
+
 @dataclasses.dataclass(frozen=True)
 class Draft:
     """A float graph, and what of it becomes int8; lowering changes the graph in place.
 
     ``weights`` and ``sampled`` name layers and sampling operators by their first
-    output; ``reach`` is max(|low|, |high|) of the activations whose range is known.
+    output; ``ranges`` has low and high of the activations whose range is known.
     """
 
     model: ir.Model
     weights: Mapping[str, QuantizedWeight]
-    reach: Mapping[str, float]
+    ranges: Bounds
     sampled: Collection[str] = ()
+
+
+def symmetric(ranges: Bounds) -> Bounds:
+    """Widen ranges to plus and minus their largest magnitude."""
+    reach = {name: max(-low, high) for name, (low, high) in ranges.items()}
+    return {name: (-largest, largest) for name, largest in reach.items()}
 
 
 def lower(draft: Draft) -> ir.Model:
@@ -158,7 +169,7 @@ def lower(draft: Draft) -> ir.Model:
     draft = _with_image_blocks(draft)
     main = draft.model.graph
     region = find_region(main, {*draft.weights, *draft.sampled})
-    if missing := [name for name in region.ranged if name not in draft.reach]:
+    if missing := [name for name in region.ranged if name not in draft.ranges]:
         raise FramesError(
             f"{len(missing)} tensors have no range, the first is {missing[0]}:"
             " onnxruntime's convolutions write uint8, so their outputs are calibrated"
@@ -166,7 +177,7 @@ def lower(draft: Draft) -> ir.Model:
         )
     # Choose the grids before the graph changes.
     grids = {
-        value: Grid.of(origin, draft.reach[str(origin.name)])
+        value: Grid.of(origin, *draft.ranges[str(origin.name)])
         for value, origin in region.grids.items()
     }
     jobs = [
@@ -187,7 +198,7 @@ def lower(draft: Draft) -> ir.Model:
 def _with_image_blocks(draft: Draft) -> Draft:
     """Let strided convolutions of images read blocks of pixels as channels."""
     main = draft.model.graph
-    weights, reach = dict(draft.weights), dict(draft.reach)
+    weights, ranges = dict(draft.weights), dict(draft.ranges)
     region = find_region(main, weights)
     writer = Writer(main)
     for layer, image in region.layers.items():
@@ -197,9 +208,9 @@ def _with_image_blocks(draft: Draft) -> Draft:
             weights[name] = filter_of_blocks(weights[name], cut)
             blocks = read_blocks(writer, layer, cut)
             # Blocks have the range of their pixels.
-            if str(image.name) in reach:
-                reach[str(blocks.name)] = reach[str(image.name)]
-    return dataclasses.replace(draft, weights=weights, reach=reach)
+            if str(image.name) in ranges:
+                ranges[str(blocks.name)] = ranges[str(image.name)]
+    return dataclasses.replace(draft, weights=weights, ranges=ranges)
 
 
 def _write_pairs(

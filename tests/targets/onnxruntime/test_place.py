@@ -10,7 +10,7 @@ from me2e_compress.graph import provenance
 from me2e_compress.quantization.plan import make_plan
 from me2e_compress.runtime.optimized import optimized
 from me2e_compress.targets.onnxruntime import OnnxRuntime, int8_layers
-from tests.nets import FULL, PAPER, conv_attention, drawn
+from tests.nets import FULL, PAPER, conv_attention, drawn, placed
 from tests.targets.onnxruntime.lowered import (
     IMAGE,
     TOKENS,
@@ -72,21 +72,40 @@ def test_sums_around_linear_layers_stay_float_and_read_what_is_unrounded() -> No
     assert kernels(small)["QLinearAdd"] == 0
 
 
-def test_tensors_without_sign_use_the_whole_grid() -> None:
-    scales, zeros = {}, {}
-    for node in lowered(block(), reach=2.55).graph:
+def grids(model: ir.Model) -> dict[str, tuple[float, int]]:
+    """Return step and zero point of every tensor that is quantized."""
+    found = {}
+    for node in model.graph:
         if node.op_type == "QuantizeLinear" and node.inputs[0] is not None:
-            name = str(node.inputs[0].name)
-            _, scale, zeros[name] = (graph.array_of(value) for value in node.inputs)
+            _, scale, zero = (graph.array_of(value) for value in node.inputs)
             assert scale is not None
-            scales[name] = float(scale.item())
+            assert zero is not None
+            found[str(node.inputs[0].name)] = float(scale.item()), int(zero.item())
+    return found
+
+
+@pytest.mark.parametrize(
+    ("rules", "ends", "signed"),
+    [
+        ("paper{balance=true}", (-2.55, 2.55), (2.55 / 127, 128)),
+        ("paper{balance=true}", (-1.28, 2.55), (2.55 / 127, 128)),
+        # one side is twice the other or more: only rules `paper` stay symmetric
+        ("paper{balance=true}", (-0.5, 2.05), (0.01, 50)),
+        ("paper{balance=true}", (-2.55, -1.0), (0.01, 255)),
+        ("paper", (-0.5, 2.55), (2.55 / 127, 128)),
+    ],
+)
+def test_a_grid_spans_the_range(
+    rules: str, ends: tuple[float, float], signed: tuple[float, int]
+) -> None:
+    made = grids(placed(block(), "onnxruntime", rules, ends=ends))
 
     # an output keeps its name on what is dequantized
-    signed, unsigned = {"x", "z3", "y_replaced"}, {"a1", "p1", "a2", "a3"}
-    assert {name for name, zero in zeros.items() if zero == 128} == signed
-    assert {name for name, zero in zeros.items() if zero == 0} >= unsigned
-    assert {scales[name] for name in signed} == {np.float32(2.55 / 127)}
-    assert {scales[name] for name in unsigned} == {np.float32(2.55 / 255)}
+    for name in ("x", "z3", "y_replaced"):
+        assert made[name] == (float(np.float32(signed[0])), signed[1])
+    most = max(0.0, ends[1] if "balance" in rules else 2.55)
+    for name in ("a1", "p1", "a2", "a3"):  # never negative
+        assert made[name] == (float(np.float32(most / 255)) or 1.0, 0)
 
 
 def test_what_only_moves_elements_shares_the_grid_of_what_it_moves() -> None:
