@@ -2,7 +2,7 @@
 
     python -m benchmarks.tools.fit_cpu_costs
 
-Layers of 90 sizes, and chains of them, are timed in float and in int8, in turn, on one
+Layers of 120 sizes, and chains of them, are timed in float and in int8, in turn, on one
 thread; the constants are the non-negative least squares of relative errors. Prints
 them, the median error, and the layers that they miss most. About two CPU minutes.
 """
@@ -25,6 +25,8 @@ from me2e_compress.targets.onnxruntime.costs import (
 FEATURES = ((16, 56), (32, 112), (64, 28), (64, 56), (128, 28), (256, 14), (256, 56))
 """Channels and side of square feature maps."""
 ROWS = (4, 16, 64, 300, 1000, 2500, 10000)
+LINES = ((16, 96), (32, 200), (8, 24))
+"""Channels outside and within the blocks of a network that reads lines of text."""
 PRODUCTS = ((32, 16), (64, 64), (256, 32), (256, 256), (256, 512), (512, 256))
 Numbers = npt.NDArray[np.float64]
 
@@ -45,6 +47,21 @@ def layers() -> Iterator[Layer]:
             weight = (channels, 1, kernel, kernel)
             for length in (1, 4):
                 yield Layer("Conv", read, weight, text, relu=True, length=length)
+    # lines of text, and channels that are no multiple of four
+    for high in (2, 12):
+        for inner, outer in LINES:
+            for weight in ((outer, inner, 1, 1), (inner, outer, 1, 1)):
+                read = (1, weight[1], high, 96)
+                yield Layer("Conv", read, weight, relu=True)
+            read, text = (1, outer, high, 96), f"group={outer}, pads=[2,2,2,2]"
+            yield Layer("Conv", read, (outer, 1, 5, 5), text, relu=True)
+    for channels, side in ((30, 56), (63, 28), (66, 56), (130, 28)):
+        for kernel in (1, 3):
+            weight, edge = (channels, channels, kernel, kernel), kernel // 2
+            pads = f"pads=[{edge},{edge},{edge},{edge}]"
+            for length in (1, 4):
+                read = (1, channels, side, side)
+                yield Layer("Conv", read, weight, pads, relu=True, length=length)
     yield Layer("Conv", (1, 3, 224, 224), (64, 3, 7, 7), "strides=[2,2]", relu=True)
     yield Layer("Conv", (1, 3, 224, 224), (16, 3, 3, 3), "strides=[2,2]")
     yield Layer("Conv", (6, 3, 96, 160), (32, 3, 3, 3), "strides=[2,2]")

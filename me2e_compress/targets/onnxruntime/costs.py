@@ -12,6 +12,7 @@ from me2e_compress.graph import static_shape
 from me2e_compress.graph.nodes import constant_values, sole_reader
 from me2e_compress.operators import find, int8_inputs
 from me2e_compress.quantization.costs import Border, Costs, Join, Layers
+from me2e_compress.targets.onnxruntime.lower import PACKED, blocks_of
 from me2e_compress.targets.onnxruntime.region import JOINS, Region, end_of, find_region
 
 CACHE_BYTES = 2**21
@@ -31,6 +32,8 @@ class CpuSeconds:
         float_element: an element that a layer reads or writes.
         float_reorder: an element passed between a convolution, which works on channels
             in blocks, and anything else.
+        int8_uneven_mac: one of a convolution over channels that are no multiple of
+            four, which its kernel reads at once.
         int8_patch: a pixel copied into place for a kernel larger than 1.
         int8_answer: an element that a convolution rounds to uint8.
         int8_product: a float32 output element of a matrix product.
@@ -48,6 +51,7 @@ class CpuSeconds:
     float_weight: float
     int8_mac: float
     int8_grouped_mac: float
+    int8_uneven_mac: float
     int8_patch: float
     int8_answer: float
     int8_product: float
@@ -63,34 +67,36 @@ class CpuSeconds:
         return 1e-9 * sum(float(getattr(self, each)) * n for each, n in counts.items())
 
 
-ZEN5 = CpuSeconds(
+XEON = CpuSeconds(
     machine="onnxruntime (one core with VNNI)",
-    kernel=300,
-    float_mac=0.009,
-    float_grouped_mac=0.012,
-    float_element=0.04,
-    float_reorder=0.05,
+    kernel=400,
+    float_mac=0.0137,
+    float_grouped_mac=0.02,
+    float_element=0.075,
+    float_reorder=0.16,
     float_weight=0.015,
-    int8_mac=0.0023,
-    int8_grouped_mac=0.023,
-    int8_patch=1.1,
-    int8_answer=0.06,
-    int8_product=0.3,
+    int8_mac=0.0031,
+    int8_grouped_mac=0.043,
+    int8_uneven_mac=0.0046,
+    int8_patch=1.5,
+    int8_answer=0.22,
+    int8_product=0.6,
     int8_weight=0.008,
-    float_sampled_mac=0.1,
-    int8_sampled_mac=0.075,
-    int8_cached_mac=0.003,
-    quantize=0.1,
-    dequantize=0.17,
+    float_sampled_mac=0.15,
+    int8_sampled_mac=0.113,
+    int8_cached_mac=0.0045,
+    quantize=0.35,
+    dequantize=0.38,
 )
-"""Fitted to single layers and chains on an AMD EPYC (Zen 5), onnxruntime 1.31, by
-``python -m benchmarks.tools.fit_cpu_costs``; sampling by hand, to the results of
-``python -m benchmarks.measure.int8_sampling``. Ratios carry over to other
-processors with VNNI better than the seconds do."""
+"""Fitted to single layers and chains on a Xeon (Sapphire Rapids), onnxruntime 1.31, by
+``python -m benchmarks.tools.fit_cpu_costs``, the median of three. On an AMD EPYC (Zen 5) what
+int8 writes, quantizes and dequantizes is half as dear beside a multiplication: what
+pays here pays there. Weights, and sampling beside multiplications, are that one's, by
+``python -m benchmarks.measure.int8_sampling``."""
 
 
 def costs_of(
-    model: ir.Model, chosen: Collection[ir.Node], machine: CpuSeconds = ZEN5
+    model: ir.Model, chosen: Collection[ir.Node], machine: CpuSeconds = XEON
 ) -> Costs:
     """Estimate the savings and costs of int8 for some layers.
 
@@ -143,7 +149,9 @@ def work_of(layer: ir.Node) -> tuple[Counts, Counts] | None:
         reordered += math.prod(static_shape(end) or ())
     grouped = "grouped_" if layer.attributes.get_int("group", 1) > 1 else ""
     float_ |= {f"float_{grouped}mac": macs, "float_reorder": reordered}
-    int8 |= {f"int8_{grouped}mac": macs, "int8_answer": outputs}
+    uneven = weight[1] % PACKED and not grouped and blocks_of(layer) is None
+    kind = "uneven_" if uneven else grouped
+    int8 |= {f"int8_{kind}mac": macs, "int8_answer": outputs}
     # Kernels larger than 1 copy patches first.
     taps = math.prod(weight[2:])
     if taps > 1 and not grouped:
