@@ -24,28 +24,33 @@ def draw(whole: CalibrationSet, count: int, seed: int) -> CalibrationSet:
     return whole.part(sorted(drawn[:count]))
 
 
-def hold_out(
-    whole: CalibrationSet, most: int, run: int = 1
-) -> tuple[CalibrationSet, CalibrationSet]:
-    """Split a recording: frames to calibrate on, and frames to measure on.
+def spread(whole: CalibrationSet, count: int, run: int = 1) -> CalibrationSet:
+    """Pick frames at equal distances, so that every part of a recording is seen.
 
-    A third of the frames is for measuring, at least one and at most ``most``. They
-    stand at equal distances, so that every part of the recording is measured; in runs
-    of so many frames of one scene where a state grows along them. A recording of one
-    frame is both.
+    In runs of so many frames of one scene where a state grows along them.
     """
-    frames = len(whole)
-    if frames == 1:
-        return whole, whole
-    count = max(1, min(most, -(-frames // 3)))
-    ends = [*whole.scenes, frames]
-    measured = set[int]()
+    frames, picked = len(whole), set[int]()
+    ends, count = [*whole.scenes, frames], min(count, frames)
     for part in range(parts := max(1, count // run)):
         # a run in the middle of its part, and within a scene that is long enough
         length = count // parts + (part < count % parts)
         start = ((2 * part + 1) * frames // parts - length + 1) // 2
         at = bisect.bisect_right(ends, start)
         start = max(ends[at - 1], min(start, ends[at] - length))
-        measured.update(range(start, start + length))
-    others = [place for place in range(frames) if place not in measured]
-    return whole.part(others), whole.part(sorted(measured))
+        picked.update(range(start, start + length))
+    return whole.part(sorted(whole.places[each] for each in picked))
+
+
+def hold_out(
+    whole: CalibrationSet, most: int, run: int = 1
+) -> tuple[CalibrationSet, CalibrationSet]:
+    """Split a recording: frames to calibrate on, and frames to measure on.
+
+    A third of the frames is for measuring, at least one and at most ``most``, see
+    :func:`spread`. A recording of one frame is both.
+    """
+    if len(whole) == 1:
+        return whole, whole
+    measured = spread(whole, max(1, min(most, -(-len(whole) // 3))), run)
+    others = sorted(set(whole.places) - set(measured.places))
+    return whole.part(others), measured

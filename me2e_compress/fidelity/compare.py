@@ -31,8 +31,10 @@ class OutputFidelity:
         error: largest difference over largest magnitude; infinite where a is zero and
             b is not.
         discrete: whole numbers or booleans; their SQNR says little.
-        least_db: SQNR of the worst frame; None like `most_db`, if that is the only one.
-        most_db: SQNR of the best frame.
+        least_db: that of the noisiest frame, its noise against the mean signal of all:
+            a frame to come is as likely to be noisier as any of those measured, one in
+            n + 1, however they spread; sums over few frames are mostly those of one.
+        most_db: that of the quietest frame.
         stray: share of the values that are a number in one model alone; above 0 the
             SQNR is -infinity. What is NaN in both, or the same infinity, is left out.
         small: channels far smaller than the largest, as ``[:, 4:84]``; else empty.
@@ -43,18 +45,17 @@ class OutputFidelity:
     sqnr_db: float
     error: float
     discrete: bool = False
-    least_db: float | None = None
-    most_db: float | None = None
+    least_db: float = math.inf
+    most_db: float = math.inf
     stray: float = 0.0
     small: str = ""
     small_db: float | None = None
 
     @property
     def by_frame(self) -> str:
-        """The SQNR from the worst frame to the best, dB; empty for one frame."""
-        if self.least_db is None or self.most_db is None:
-            return ""
-        return f"{self.least_db:z.1f} to {self.most_db:z.1f}"
+        """The SQNR from the noisiest frame to the quietest, dB; empty for one."""
+        least, most = self.least_db, self.most_db
+        return "" if least == most else f"{least:z.1f} to {most:z.1f}"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -77,6 +78,8 @@ class Fidelity:
         plan_output: the output that holds the plan; empty if it was not measured.
         same_choice: share of frames with the same candidate; None if no scores choose
             the plan.
+        seen: more frames, which ranges were measured on: they count for `least_db` and
+            `most_db` alone.
     """
 
     outputs: tuple[OutputFidelity, ...]
@@ -86,6 +89,19 @@ class Fidelity:
     frames: int
     plan_output: str = ""
     same_choice: float | None = None
+    seen: int = 0
+
+    def beside(self, seen: "Fidelity") -> "Fidelity":
+        """Widen what frames reach by others, on which ranges were measured.
+
+        They can only be quieter than those to come, so the noisiest of both is no
+        worse a promise, and of more frames.
+        """
+        outputs = list[OutputFidelity]()
+        for a, b in zip(self.outputs, seen.outputs, strict=True):
+            least, most = min(a.least_db, b.least_db), max(a.most_db, b.most_db)
+            outputs.append(dataclasses.replace(a, least_db=least, most_db=most))
+        return dataclasses.replace(self, outputs=tuple(outputs), seen=seen.frames)
 
     @property
     def strays(self) -> tuple[str, ...]:
@@ -222,7 +238,7 @@ class Tally:
     def __init__(self, name: str) -> None:
         self.name = name
         self.signal = self.noise = self.gap = self.reach = 0.0
-        self.frames_db = list[float]()
+        self.noises = list[float]()
         self.discrete = False
         self.count = self.strays = 0
         # by axis: signal, noise and largest value of each channel
@@ -250,7 +266,7 @@ class Tally:
         gap = np.abs(x - y)
         signal = float(np.vdot(x, x))
         noise = math.inf if strays else float(np.vdot(gap, gap))
-        self.frames_db.append(decibels(signal, noise))
+        self.noises.append(noise)
         self.signal += signal
         self.noise += noise
         self.reach = max(self.reach, float(np.abs(x).max()))
@@ -276,11 +292,12 @@ class Tally:
     def result(self) -> OutputFidelity:
         """Return the output's fidelity over the frames so far."""
         error = self.gap / self.reach if self.reach else math.inf if self.gap else 0.0
-        sqnr, by_frame = self.sqnr_db, self.frames_db
-        spread = (min(by_frame), max(by_frame)) if len(by_frame) > 1 else (None, None)
+        noises = self.noises or [0.0]
+        ends = max(noises), min(noises)
+        least, most = (decibels(self.signal / len(noises), noise) for noise in ends)
+        sqnr = self.sqnr_db
         stray = self.strays / self.count if self.count else 0.0
         small, small_db = self._small()
-        least, most = spread
         return OutputFidelity(
             self.name, sqnr, error, self.discrete, least, most, stray, small, small_db
         )

@@ -19,7 +19,7 @@ class Shortfall:
     Attributes:
         value: in dB; of the plan the mean displacement in metres.
         excess: noise amplitude over the largest allowed, above 1.
-        part: its channels, as ``[:, 4:84]``; empty if it is of all.
+        part: its channels, as ``[:, 4:84]``, or its frames; empty if it is of all.
     """
 
     output: str
@@ -37,8 +37,8 @@ class Floor:
     """How true a model must stay.
 
     Attributes:
-        sqnr_db: least SQNR of outputs, dB; not of discrete ones, of the plan
-            only where its displacement was not measured.
+        sqnr_db: least SQNR of outputs, over all frames and in the noisiest, dB; not of
+            discrete ones, of the plan only where its displacement was not measured.
         plan_m: most mean displacement of the waypoints, metres.
     """
 
@@ -63,6 +63,8 @@ class Floor:
                     part = " of matched agents"
                 elif each.small_db is not None and each.small_db < value:
                     value, part = each.small_db, each.small
+                elif each.least_db < self.sqnr_db <= value:
+                    value, part = each.least_db, " in its noisiest frame"
                 excess = min(float(10 ** ((self.sqnr_db - value) / 20)), MOST_EXCESS)
             if excess > 1 and not each.discrete:
                 below.append(Shortfall(each.name, value, unit, excess, part))

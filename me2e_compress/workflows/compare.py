@@ -75,15 +75,15 @@ class CompareResult(Result):
         fidelity, liveness, agents = self.fidelity, self.liveness, self.agents
         matched = {} if agents is None else agents.sqnr_db
         rows = [
-            (o.name, f"{matched[o.name]:.1f}", "matched")
+            (o.name, f"{matched[o.name]:.1f}", "", "matched")
             if o.name in matched
-            else (o.name, f"{o.sqnr_db:.1f}", f"{o.error:.1e}")
+            else (o.name, f"{o.sqnr_db:.1f}", o.by_frame, f"{o.error:.1e}")
             for o in fidelity.outputs
         ]
-        rows += [(name, "removed", "") for name in fidelity.missing]
+        rows += [(name, "removed", "", "") for name in fidelity.missing]
         title = f"Fidelity over {counted(fidelity.frames, 'frame')}"
-        columns, note = ("output", "SQNR dB", "max|a-b|/max|a|"), _agents(agents)
-        outputs = table(title, columns, rows, note)
+        columns = ("output", "SQNR dB", "by frame", "max|a-b|/max|a|")
+        outputs = table(title, columns, rows, _agents(agents))
         faults = () if liveness is None else liveness.faults
         dead = "; ".join(faults)
         return Shown(

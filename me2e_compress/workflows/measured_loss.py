@@ -8,10 +8,10 @@ from pathlib import Path
 import onnx_ir as ir
 
 from me2e_compress.calibration.dataset import CalibrationSet
-from me2e_compress.calibration.sample import hold_out
+from me2e_compress.calibration.sample import hold_out, spread
 from me2e_compress.display import Table, counted, table
 from me2e_compress.errors import EvaluationError, FramesError, GraphError
-from me2e_compress.fidelity.compare import Fidelity, SetFidelity, SetTally
+from me2e_compress.fidelity.compare import Fidelity, SetFidelity, SetTally, compare
 from me2e_compress.fidelity.floor import Floor, Shortfall, shown
 from me2e_compress.fidelity.liveness import Liveness
 from me2e_compress.graph.recurrence import recurrent_inputs
@@ -94,9 +94,10 @@ class MeasuredLoss:
             ]
             if judged:
                 worst = min(judged, key=lambda each: each.sqnr_db)
-                noise, spread = shown(worst.sqnr_db, "dB"), worst.by_frame
-                spread = f" ({spread} by frame)" if spread else ""
-                parts.append(f"the noisiest output is {worst.name}, {noise}{spread}")
+                noise, reach = shown(worst.sqnr_db, "dB"), worst.by_frame
+                every = f" of {found.frames + found.seen}" if found.seen else ""
+                reach = f" ({reach} by frame{every})" if reach else ""
+                parts.append(f"the noisiest output is {worst.name}, {noise}{reach}")
             where = f"on {counted(found.frames, 'frame')} {self.on}"
             yield f"{'; '.join(parts) or 'no output could be judged'} ({where})"
         elif self.on != NOT_ASKED:
@@ -176,6 +177,7 @@ class SplitFrames:
 
     Attributes:
         kind: what kind the measured frames are, or why there are none, in words.
+        seen: as many of those calibrated on at most.
         samples: frames that exact passes are checked on where the user gave none.
     """
 
@@ -183,6 +185,7 @@ class SplitFrames:
     measured: Frames | None
     kind: str
     samples: CalibrationSet | None = None
+    seen: CalibrationSet | None = None
 
 
 def split_frames(
@@ -212,8 +215,10 @@ def split_frames(
     calibration, measured = hold_out(recording, most, run)
     if any(each.reads_ranges and not each.needs_frames for each in passes):
         return SplitFrames(recording, measured, PERHAPS_SHARED)
-    kind = SHARED if len(recording) == 1 else KEPT_OUT
-    return SplitFrames(calibration, measured, kind)
+    if len(recording) == 1:
+        return SplitFrames(calibration, measured, SHARED)
+    seen = spread(calibration, most, run)
+    return SplitFrames(calibration, measured, KEPT_OUT, seen=seen)
 
 
 def measure_loss(
@@ -233,7 +238,7 @@ def measure_loss(
     listener.on_progress("fidelity", 0, 1, "")
     # a graph that does not run or compare is a finding, not a failure
     try:
-        loss = _compared(loss, report, provider, frames.measured)
+        loss = _compared(loss, report, provider, frames.measured, frames.seen)
     except (FramesError, GraphError) as error:
         loss = dataclasses.replace(loss, on=str(error))
     except EvaluationError as error:  # not finite, or of another shape
@@ -242,7 +247,11 @@ def measure_loss(
 
 
 def _compared(
-    loss: MeasuredLoss, report: Report, provider: Provider, frames: Frames
+    loss: MeasuredLoss,
+    report: Report,
+    provider: Provider,
+    frames: Frames,
+    seen: Frames | None,
 ) -> MeasuredLoss:
     """Measure, and name what is below the floor."""
     passes = [each.applied for each in report.lossy]
@@ -260,6 +269,9 @@ def _compared(
         kernels = open_session(after, stock=True)
     sets = SetTally.of(reference, session)
     found = compared(reference, session, frames, after, kernels, sets)
+    if seen is not None:
+        beside = found.fidelity.beside(compare(reference, session, seen))
+        found = dataclasses.replace(found, fidelity=beside)
     loss = dataclasses.replace(loss, **vars(found))
     below = loss.floor.shortfalls(found.fidelity, found.agents)
     if not below:

@@ -84,8 +84,19 @@ def test_signal_to_noise_pools_all_frames_each_model_with_its_own_state() -> Non
     noise, signal = 0.25 + 1.5625 + 0.25, 1 + 4 + 1
     assert found.outputs[0].sqnr_db == pytest.approx(10 * math.log10(signal / noise))
     assert found.outputs[0].error == pytest.approx(1.25 / 2)
-    # frame by frame 1 / 0.25, 4 / 1.5625 and 1 / 0.25
-    assert found.outputs[0].by_frame == "4.1 to 6.0"
+    # against the mean signal of 2, the noises of frames are 0.25, 1.5625 and 0.25
+    assert found.outputs[0].by_frame == "1.1 to 9.0"
+    # frames that ranges were measured on widen that alone
+    seen = compare(scaled(1.0), scaled(0.75), [ones(0, True), ones(1, True)])
+    wide, alone = found.beside(seen), compare(scaled(1.0), scaled(0.5), [ones(0, True)])
+    assert wide.outputs[0].by_frame == "1.1 to 12.0"
+    assert seen.beside(found).outputs[0].by_frame == "1.1 to 12.0"
+    assert (wide.frames, wide.seen, wide.outputs[0].sqnr_db) == (
+        3,
+        2,
+        found.outputs[0].sqnr_db,
+    )
+    assert alone.outputs[0].by_frame == ""
 
 
 @pytest.mark.parametrize(
@@ -271,6 +282,16 @@ def test_what_is_below_the_floor_is_listed_the_worst_first(
     assert bev.excess == pytest.approx(10.0)
 
 
+def test_a_frame_below_the_floor_is_below_it() -> None:
+    outputs = (OutputFidelity("bev", 31.0, 0.0, False, 19.0), found(y=9.0).outputs[0])
+    below = Floor(20.0).shortfalls(Fidelity(outputs, (), None, "", 6))
+
+    assert [str(each) for each in below] == [
+        "y 9.0 dB",
+        "bev in its noisiest frame 19.0 dB",
+    ]
+
+
 def test_sets_are_judged_by_their_matched_agents() -> None:
     agents = SetFidelity(9, 9, {"boxes": 30.0, "scores": 11.0})
     below = Floor().shortfalls(found(boxes=0.1, scores=0.2, bev=1.0), agents)
@@ -382,7 +403,12 @@ def test_compare_matches_what_both_graphs_have(
     if has_scores:
         assert found.agents is not None
         assert found.agents.sqnr_db["boxes"] == math.inf
-        assert [each.text for each in outputs.rows[0]] == ["boxes", "inf", "matched"]
+        assert [each.text for each in outputs.rows[0]] == [
+            "boxes",
+            "inf",
+            "",
+            "matched",
+        ]
     else:
         assert found.agents is None
         assert outputs.rows[0][1].text == f"{found.fidelity.outputs[0].sqnr_db:.1f}"
