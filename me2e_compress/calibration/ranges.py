@@ -9,7 +9,7 @@ from typing import Literal, Self, TypeAlias
 import numpy as np
 import pydantic
 
-from me2e_compress.calibration.observers import OBSERVERS, MaxMin, Observer
+from me2e_compress.calibration.observers import OBSERVERS, Observer
 from me2e_compress.calibration.statistics import ALL_ZERO, NOT_FINITE, Statistics
 from me2e_compress.display import counted, some_of
 from me2e_compress.errors import FramesError
@@ -23,9 +23,6 @@ elements round to 0, 1 or 2 steps."""
 
 LARGEST = float(np.finfo(np.float32).max)
 """The largest bound of a range: elements are float32."""
-
-_ROUNDED = 1e-3
-"""Relative: a root mean square is written with four digits."""
 
 IMPORTED = "imported"
 """Method of ranges measured by another tool, on unknown frames."""
@@ -153,14 +150,6 @@ class Ranges:
                 return f"the root mean square of {name}, which has no range"
             if not 0 <= root <= LARGEST:  # NaN too
                 return f"{name} has a root mean square of {root:g}"
-            # Only a method that clips leaves elements outside of the range.
-            low, high = self.tensors[name]
-            reach = max(abs(low), abs(high))
-            if self.method == MaxMin.name and root > reach * (1 + _ROUNDED):
-                return (
-                    f"{name} has {low:g} to {high:g}, and a root mean square of"
-                    f" {root:g}; both cannot be of the same elements"
-                )
         return ""
 
     def hold_for(self, model: str, tensors: tuple[str, ...], method: str) -> bool:

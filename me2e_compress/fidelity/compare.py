@@ -92,11 +92,7 @@ class Fidelity:
     seen: int = 0
 
     def beside(self, seen: "Fidelity") -> "Fidelity":
-        """Widen what frames reach by others, on which ranges were measured.
-
-        They can only be quieter than those to come, so the noisiest of both is no
-        worse a promise, and of more frames.
-        """
+        """Widen what frames reach by those calibrated on, quieter than any to come."""
         outputs = list[OutputFidelity]()
         for a, b in zip(self.outputs, seen.outputs, strict=True):
             least, most = min(a.least_db, b.least_db), max(a.most_db, b.most_db)

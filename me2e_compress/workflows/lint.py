@@ -179,11 +179,7 @@ def lint(
     if not any(each.severity == "error" for each in findings):
         if judge.opens:
             try_first(loaded, path.name, listener=listener, provider=provider)
-        # a node that a rule has named already is not named again
-        known = {each.node for each in findings if each.rule == "float-answer"}
-        opened = judge.read_back(loaded, provider)
-        new = [each for each in opened if each.node not in known]
-        findings = worst_first((*findings, *new))
+        found = worst_first((*found, *judge.read_back(loaded, provider)))
     build = check(loaded, options.sm) if options.trt_check else None
     return LintResult(path, options, findings, build)
 

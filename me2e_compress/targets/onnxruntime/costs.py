@@ -32,8 +32,7 @@ class CpuSeconds:
         float_element: an element that a layer reads or writes.
         float_reorder: an element passed between a convolution, which works on channels
             in blocks, and anything else.
-        int8_uneven_mac: one of a convolution over channels that are no multiple of
-            four, which its kernel reads at once.
+        int8_uneven_mac: one over channels that are no multiple of four.
         int8_patch: a pixel copied into place for a kernel larger than 1.
         int8_answer: an element that a convolution rounds to uint8.
         int8_product: a float32 output element of a matrix product.
@@ -90,9 +89,9 @@ XEON = CpuSeconds(
 )
 """Fitted to single layers and chains on a Xeon (Sapphire Rapids), onnxruntime 1.31, by
 ``python -m benchmarks.tools.fit_cpu_costs``, the median of three. On an AMD EPYC (Zen 5) what
-int8 writes, quantizes and dequantizes is half as dear beside a multiplication: what
-pays here pays there. Weights, and sampling beside multiplications, are that one's, by
-``python -m benchmarks.measure.int8_sampling``."""
+int8 writes and converts is half as dear beside a multiplication: what pays here pays
+there. Weights and sampling are that one's, ``python -m benchmarks.measure.int8_sampling``
+"""
 
 
 def costs_of(
@@ -149,8 +148,8 @@ def work_of(layer: ir.Node) -> tuple[Counts, Counts] | None:
         reordered += math.prod(static_shape(end) or ())
     grouped = "grouped_" if layer.attributes.get_int("group", 1) > 1 else ""
     float_ |= {f"float_{grouped}mac": macs, "float_reorder": reordered}
-    uneven = weight[1] % PACKED and not grouped and blocks_of(layer) is None
-    kind = "uneven_" if uneven else grouped
+    uneven = weight[1] % PACKED and blocks_of(layer) is None
+    kind = grouped or "uneven_" * bool(uneven)
     int8 |= {f"int8_{kind}mac": macs, "int8_answer": outputs}
     # Kernels larger than 1 copy patches first.
     taps = math.prod(weight[2:])

@@ -12,8 +12,6 @@ import onnx_ir as ir
 import onnxruntime as ort
 
 from me2e_compress.graph import (
-    CONVOLUTIONS,
-    WEIGHTED,
     channel_axis,
     input_at,
     is_standard,
@@ -45,13 +43,11 @@ from me2e_compress.targets import (
     name_of,
     of_opset,
     valid,
-    warning,
 )
 from me2e_compress.targets.onnxruntime.region import never_negative
 from me2e_compress.targets.quantized import (
     DEQUANTIZE,
     QUANTIZE,
-    is_dequantized,
     pairs_of,
 )
 from me2e_compress.targets.weights import evaluate_constants, quantize_weight
@@ -381,38 +377,6 @@ def kernels(model: ir.Model) -> Iterator[LintFinding]:
         yield error("kernel", node, f"{missing}{remedy(model, missing)}")
 
 
-def signed_activations(model: ir.Model) -> Iterator[LintFinding]:
-    """Find layers that read int8: only uint8 by int8 has fast kernels.
-
-    Measured on AVX512-VNNI: int8 by int8 products run at 34 to 91 GOP/s, uint8 by int8
-    at 850 to 1600.
-    """
-    for node in _weighted(model):
-        pair = maker(node.inputs[0], DEQUANTIZE)
-        integers = None if pair is None else pair.inputs[0]
-        if integers is not None and integers.dtype == ir.DataType.INT8:
-            yield warning(
-                "signed-activation", node, "reads int8, the fast kernels read uint8"
-            )
-
-
-def unanswered(model: ir.Model) -> Iterator[LintFinding]:
-    """Find int8 convolutions whose output is not quantized: they run in float."""
-    for node in _weighted(model):
-        quantized = all(map(is_dequantized, node.inputs[:2]))
-        if node.op_type not in CONVOLUTIONS or not quantized:
-            continue
-        value = node.outputs[0]
-        # Look past a fused Relu or Clip.
-        readers = list(value.consumers())
-        if len(readers) == 1 and readers[0].op_type in ("Relu", "Clip"):
-            readers = list(readers[0].outputs[0].consumers())
-        if not any(reader.op_type == QUANTIZE for reader in readers):
-            yield warning(
-                "float-answer", node, "no QuantizeLinear follows: it runs in float"
-            )
-
-
 def fuses_pads_wrongly() -> bool:
     """Return whether the installed onnxruntime is one before 1.32."""
     major, minor = ort.__version__.split(".")[:2]
@@ -455,12 +419,6 @@ def padded_pools(model: ir.Model) -> Iterator[LintFinding]:
             )
 
 
-def _weighted(model: ir.Model) -> Iterator[ir.Node]:
-    for node in nodes_of(model):
-        if is_standard(node) and node.op_type in WEIGHTED:
-            yield node
-
-
 RULES: tuple[LintRule, ...] = (
     valid,
     of_opset,
@@ -469,8 +427,6 @@ RULES: tuple[LintRule, ...] = (
     scale_shapes,
     operators,
     kernels,
-    signed_activations,
-    unanswered,
     padded_pools,
     int8_rewrites,
 )

@@ -303,8 +303,7 @@ def _sampled(node: ir.Node, written: Collection[ir.Value]) -> tuple[ir.Value, ir
 class Grid:
     """The uint8 grid of one tensor: ``value = scale * (uint8 - zero)``.
 
-    ``zero`` is 128 for a signed tensor, 0 for one that is never negative, and between
-    them, or above, for one whose range is lopsided.
+    ``zero`` is 128 for a signed tensor, 0 for one that is never negative.
     """
 
     scale: np.float32
@@ -319,8 +318,7 @@ class Grid:
         ones on processors with VNNI, whatever the zero point. Where one side of the
         range is `LOPSIDED` times the other, as behind a SiLU or GELU, that grid wastes
         up to half of its steps; here the range with zero is divided into 255 of them.
-        For a tensor that can never be negative the kernel's clipping at its zero point
-        of 0 replaces a ReLU before it.
+        Where a tensor is never negative, the kernel's clipping replaces a ReLU.
         """
         low = 0.0 if never_negative(value) else min(low, 0.0)
         high = max(high, 0.0)

@@ -4,40 +4,6 @@ import pytest
 from me2e_compress.targets.onnxruntime import OnnxRuntime
 from tests.nets import net, parsed, placed
 
-LAYER = """
-m (float[1,1,4,4] x, %(kind)s[1,1,4,4] ignored) => (float[1,1,4,4] y)
-<int8[1,1,1,1] w = {3}, float s = {0.5}, int8 n = {0}, %(kind)s z = {%(zero)d}> {
-    q = QuantizeLinear(x, s, z)
-    d = DequantizeLinear(q, s, z)
-    v = DequantizeLinear(w, s, n)
-    c = Conv(d, v)
-    r = Relu(c)
-    %(answer)s
-}
-"""
-ANSWERED = "a = QuantizeLinear(r, s, z) y = DequantizeLinear(a, s, z)"
-PLAIN = "y = Identity(r)"
-
-
-@pytest.mark.parametrize(
-    ("kind", "zero", "answer", "rules"),
-    [
-        ("uint8", 128, ANSWERED, []),
-        ("int8", 0, ANSWERED, ["signed-activation"]),
-        ("uint8", 128, PLAIN, ["float-answer"]),
-        ("int8", 0, PLAIN, ["signed-activation", "float-answer"]),
-    ],
-)
-def test_convolutions_that_run_slowly(
-    kind: str, zero: int, answer: str, rules: list[str]
-) -> None:
-    text = LAYER % {"kind": kind, "zero": zero, "answer": answer}
-
-    found = OnnxRuntime().lint(parsed(text))
-
-    assert [each.rule for each in found] == rules
-    assert {each.severity for each in found} <= {"warning"}
-
 
 @pytest.mark.parametrize(
     ("operator", "remedy"),
