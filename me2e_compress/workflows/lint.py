@@ -179,7 +179,7 @@ def lint(
     if not any(each.severity == "error" for each in findings):
         if judge.opens:
             try_first(loaded, path.name, listener=listener, provider=provider)
-        found = worst_first((*found, *judge.read_back(loaded, provider)))
+        findings = worst_first((*findings, *judge.read_back(loaded, provider)))
     build = check(loaded, options.sm) if options.trt_check else None
     return LintResult(path, options, findings, build)
 

@@ -87,10 +87,10 @@ XEON = CpuSeconds(
     quantize=0.35,
     dequantize=0.38,
 )
-"""Fitted to single layers and chains on a Xeon (Sapphire Rapids), onnxruntime 1.31, by
-``python -m benchmarks.tools.fit_cpu_costs``, the median of three. On an AMD EPYC (Zen 5) what
-int8 writes and converts is half as dear beside a multiplication: what pays here pays
-there. Weights and sampling are that one's, ``python -m benchmarks.measure.int8_sampling``
+"""Fitted to single layers and chains on a Xeon (Sapphire Rapids), onnxruntime 1.31
+(``python -m benchmarks.tools.fit_cpu_costs``, the median of three). On an AMD EPYC (Zen
+5) what int8 writes and converts is half as dear beside a multiplication: what pays here
+pays there. Weights and sampling are its: ``python -m benchmarks.measure.int8_sampling``
 """
 
 
