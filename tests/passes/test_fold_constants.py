@@ -1,16 +1,13 @@
 from typing import Any
 
-import hypothesis.strategies as st
 import ml_dtypes
 import numpy as np
 import onnx_ir as ir
 import pytest
-from hypothesis import given, settings
 
 from me2e_compress import graph
 from me2e_compress.passes.fold_constants import FoldConstants
-from tests.passes.small import apply, compute, file_bytes, ops, preserved, read
-from tests.profiles import scaled
+from tests.passes.small import apply, compute, ops, preserved, read
 
 SHAPE_CHAIN = """
 g (float[2,3,4] x) => (float[2,12] y) {
@@ -197,44 +194,3 @@ def test_what_the_runtime_cannot_evaluate_stays_and_the_rest_folds() -> None:
     result = apply(FoldConstants(), model)
     assert "good" in model.graph.initializers
     assert any("cannot evaluate" in note for note in result.notes)
-
-
-BINARY = ("Add", "Sub", "Mul", "Max", "Min")
-UNARY = ("Neg", "Abs", "Relu", "Identity", "Floor", "Sqrt")
-
-
-@st.composite
-def programs(draw: st.DrawFn) -> tuple[str, dict[str, Any]]:
-    """Random straight-line programs over one input and three weights."""
-    shapes = [(2, 3), (3,), (1, 3), (2, 1)]
-    seed = draw(st.integers(0, 2**16))
-    generator = np.random.default_rng(seed)
-    weights = {
-        f"w{index}": generator.normal(size=draw(st.sampled_from(shapes))).astype("f")
-        for index in range(3)
-    }
-    names, lines = [*weights, "x"], []
-    for index in range(draw(st.integers(1, 12))):
-        if draw(st.booleans()):
-            op, count = draw(st.sampled_from(BINARY)), 2
-        else:
-            op, count = draw(st.sampled_from(UNARY)), 1
-        read_names = [draw(st.sampled_from(names)) for _ in range(count)]
-        lines.append(f"v{index} = {op}({', '.join(read_names)})")
-        names.append(f"v{index}")
-    lines.append(f"z = Add({names[-1]}, x)")
-    body = "\n".join(lines)
-    text = f"g (float[2,3] x) => (float[A,B] z) {{ {body} }}"
-    return text, weights
-
-
-@settings(max_examples=scaled(60))
-@given(programs(), st.sampled_from([0, 40, 512, 10**6]))
-def test_random_programs_keep_their_meaning_and_the_limit(
-    program: tuple[str, dict[str, Any]], bytes_per_node: int
-) -> None:
-    text, weights = program
-    before = read(text, **weights)
-    after, _ = preserved(FoldConstants(bytes_per_node), text, **weights)
-    growth = file_bytes(after) - file_bytes(before)
-    assert growth <= bytes_per_node * (len(before.graph) - len(after.graph))
