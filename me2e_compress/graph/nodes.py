@@ -25,13 +25,10 @@ ELEMENTWISE = (
 )
 """Element-wise operators of two operands, which broadcast."""
 
-DRAWS = frozenset(
-    {
-        *("Bernoulli", "Multinomial", "RandomNormal", "RandomNormalLike"),
-        *("RandomUniform", "RandomUniformLike"),
-    }
+_RANDOM = (
+    *("Bernoulli", "Multinomial", "RandomNormal", "RandomNormalLike"),
+    *("RandomUniform", "RandomUniformLike"),
 )
-"""Operators that draw; those that name a seed draw the same in every session."""
 
 
 def is_standard(node: ir.Node) -> bool:
@@ -130,6 +127,17 @@ def makers_of(values: Iterable[ir.Value | None]) -> dict[ir.Node, None]:
 def input_at(node: ir.Node, index: int) -> ir.Value | None:
     """Return an input of a node; None if it is left out."""
     return node.inputs[index] if index < len(node.inputs) else None
+
+
+def draws(node: ir.Node) -> bool:
+    """Return whether a node draws numbers: one of random, or a Dropout that may train.
+
+    Those that name a seed draw the same in every session.
+    """
+    training = input_at(node, 2) if node.op_type == "Dropout" else None
+    known = array_of(training)
+    trains = training is not None and (known is None or bool(known.any()))
+    return is_standard(node) and (trains or node.op_type in _RANDOM)
 
 
 def grid_of(node: ir.Node) -> ir.Value | None:
@@ -288,7 +296,7 @@ def constant_values(model: ir.Model) -> frozenset[ir.Value]:
     for node in model.graph:
         if (
             is_standard(node)
-            and node.op_type not in DRAWS
+            and not draws(node)
             and not has_subgraph(node)
             and all(each is None or each in constants for each in node.inputs)
         ):

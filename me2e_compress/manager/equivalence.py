@@ -13,8 +13,8 @@ import onnx_ir as ir
 from me2e_compress.display import counted
 from me2e_compress.errors import FramesError, GraphError, Me2eError
 from me2e_compress.fidelity.first_difference import find_first_difference
-from me2e_compress.graph.nodes import DRAWS, bodies_of, reads_of
-from me2e_compress.manager import pieces
+from me2e_compress.graph.nodes import bodies_of, draws, reads_of
+from me2e_compress.manager import pieces, runtime_levels
 from me2e_compress.manager.report import Verification
 from me2e_compress.manager.verification_inputs import (
     TOLERANCES,
@@ -197,7 +197,7 @@ def random_outputs(model: ir.Model) -> tuple[str, ...]:
 
 def _draws(node: ir.Node, model: ir.Model) -> bool:
     """Return whether a node draws, or one in its bodies or its function does."""
-    if node.op_type in DRAWS and node.domain == "":
+    if draws(node):
         return "seed" not in node.attributes
     function = model.functions.get(node.op_identifier())
     bodies = bodies_of(node) if function is None else (function,)

@@ -119,8 +119,13 @@ def test_sizes_are_drawn_until_the_graph_runs(
             ["/backbone/Noise"] noise = RandomNormalLike(x) }""",
             "^noise: another at every run$",
         ),
+        (
+            """m (float[64] x, bool t) => (float[64] y) <float half = {0.5}> {
+            ["/backbone/Dropout"] y = Dropout(x, half, t) }""",
+            "^y: another at every run$",
+        ),
     ],
-    ids=["no size", "no numbers", "no tensor", "drawn"],
+    ids=["no size", "no numbers", "no tensor", "drawn", "trained"],
 )
 def test_what_cannot_be_compared_is_not_proven(
     text: str, reason: str, context: Context

@@ -26,6 +26,7 @@ ONE = {"c": np.float32(1)}
     [
         ("Identity(a)", {}),
         ("Dropout(a)", {}),
+        ("Dropout(a, r, t)", {"r": np.float32(0.5), "t": np.bool_(False)}),
         ("Cast<to = 1>(a)", {}),
         ("Reshape(a, s)", SHAPE),
         ("Expand(a, s)", SHAPE),

@@ -10,8 +10,8 @@ import onnx_ir.passes.common as common
 
 from me2e_compress.graph import infer_shapes, opset_of, provenance, static_shape
 from me2e_compress.graph.nodes import (
-    DRAWS,
     attribute_values,
+    draws,
     graphs_of,
     has_subgraph,
     is_read,
@@ -22,8 +22,6 @@ from me2e_compress.passes.base import Context, Pass, PassResult
 from me2e_compress.passes.eliminate_redundant.rules import MergeSite, identity_of, merge
 
 COMMUTATIVE = frozenset({"Add", "And", "Equal", "Mul", "Or", "Xor"})
-
-RANDOM = DRAWS | {"Dropout"}
 
 EDGE_BYTES = 64
 """How much of each end of a weight is compared before all of it is hashed."""
@@ -38,7 +36,7 @@ def share_nodes(graph: ir.Graph, by: str) -> int:
     first: dict[object, ir.Node] = {}
     merged: dict[ir.Node, list[ir.Node]] = {}
     for node in graph:
-        if not is_standard(node) or node.op_type in RANDOM or has_subgraph(node):
+        if not is_standard(node) or draws(node) or has_subgraph(node):
             continue
         module = provenance.module_of(node)
         inputs = [id(value) for value in node.inputs]

@@ -21,6 +21,7 @@ from me2e_compress.graph.nodes import (
     VIEWS,
     Array,
     attribute_values,
+    draws,
     input_at,
     integers_at,
     integers_of,
@@ -67,10 +68,7 @@ def _if_alone(node: ir.Node, opset: int) -> ir.Value | None:
 
 
 def _dropout(node: ir.Node, opset: int) -> ir.Value | None:
-    given = input_at(node, 2)
-    training = array_of(given)
-    off = given is None or (training is not None and not training.any())
-    return node.inputs[0] if off else None
+    return None if draws(node) else node.inputs[0]
 
 
 def _cast(node: ir.Node, opset: int) -> ir.Value | None:

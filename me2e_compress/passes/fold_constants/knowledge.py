@@ -16,10 +16,10 @@ import onnxruntime
 
 from me2e_compress.graph import array_of, shapes, static_shape
 from me2e_compress.graph.nodes import (
-    DRAWS,
     NATIVE,
     Array,
     attribute_values,
+    draws,
     has_subgraph,
     is_standard,
     unrenamed,
@@ -224,8 +224,8 @@ SMALL = 1024
 LARGEST = 1 << 30
 """Limit in bytes of a computed value: a chain of Concats may claim any size."""
 
-NEVER = DRAWS | {"Constant", "DequantizeLinear", "DynamicQuantizeLinear"}
-"""Random operators, and those that tell the runtime to compute in int8."""
+NEVER = ("Constant", "DequantizeLinear", "DynamicQuantizeLinear")
+"""Operators without an input, and those that tell the runtime to compute in int8."""
 
 COMPUTE = frozenset(
     {"Conv", "ConvTranspose", "Einsum", "Gemm", "GridSample", "MatMul", "Softmax"}
@@ -270,13 +270,12 @@ class Sweep:
     def _is_constant(self, node: ir.Node) -> bool:
         if node in self.refused or node.op_type in NEVER or not is_standard(node):
             return False
+        if draws(node):
+            return False
         shown = self.trust_shapes and node.op_type in ("Shape", "Size")
         if shown and static_shape(node.inputs[0]) is not None:
             return True
         if node.op_type in COMPUTE and not self.through_compute:
-            return False
-        training = len(node.inputs) > 2 and node.inputs[2] is not None
-        if node.op_type == "Dropout" and (training or self.opset < 7):
             return False
         # Bodies may read outer values; a weight that is an output needs its Identity
         if has_subgraph(node) or not node.inputs:
