@@ -267,8 +267,8 @@ def infer_node(
     *,
     known: Callable[[ir.Value], Array | None] = small_array,
     instead: Mapping[ir.Value, ir.Value] = NOTHING,
-) -> Mapping[str, onnx.TypeProto]:
-    """Infer what a node of ONNX's own gives; return the types of outputs by name.
+) -> dict[ir.Value, tuple[ir.TypeProtocol | None, ir.Shape | None]]:
+    """Infer what a node of ONNX's own gives; return types and shapes of its outputs.
 
     That is nothing where an input has no type, or ONNX has no such operator. ``known``
     tells what an input holds; ``instead`` are values to be read in the place of inputs.
@@ -289,13 +289,20 @@ def infer_node(
         array = known(value)
         if array is not None and array.dtype.kind != "S":  # no shape depends on text
             data[value.name] = onnx.numpy_helper.from_array(array, value.name)
-    return onnx.shape_inference.infer_node_outputs(
+    inferred = onnx.shape_inference.infer_node_outputs(
         onnx.defs.get_schema(node.op_type, opset),
         ir.serde.serialize_node(node),
         types,
         data,
         opset_imports=[onnx.helper.make_opsetid("", opset)],
     )
+    kind_of = ir.serde.deserialize_type_proto_for_type
+    shape_of = ir.serde.deserialize_type_proto_for_shape
+    return {
+        value: (kind_of(inferred[value.name]), shape_of(inferred[value.name]))
+        for value in node.outputs
+        if value.name in inferred
+    }
 
 
 CONVOLUTIONS = ("Conv", "ConvTranspose")

@@ -195,12 +195,7 @@ def contradiction(node: ir.Node, opset: int) -> str | None:
         inferred = infer_node(node, opset)
     except REFUSALS as error:
         return " ".join(str(error).split())
-    for value in node.outputs:
-        proto = inferred.get(value.name or "")
-        if proto is None:
-            continue
-        shape = ir.serde.deserialize_type_proto_for_shape(proto)
-        kind = ir.serde.deserialize_type_proto_for_type(proto)
+    for value, (kind, shape) in inferred.items():
         if value.type is not None and kind is not None and value.type != kind:
             return f"{value.name} is {kind}, not {value.type}"
         if value.shape is None or shape is None:

@@ -264,8 +264,5 @@ def _infer(node: ir.Node, opset: int) -> None:
         found = infer_node(node, opset, known=_whole)
     except REFUSALS:
         return
-    for value in node.outputs:
-        kind = found.get(value.name or "")
-        if kind is not None:
-            value.type = ir.serde.deserialize_type_proto_for_type(kind)
-            value.shape = ir.serde.deserialize_type_proto_for_shape(kind)
+    for value, known_of in found.items():
+        value.type, value.shape = known_of

@@ -45,10 +45,8 @@ def carry(model: ir.Model, grown: ir.Value, old: ir.Value, what: str) -> None:
             ) from cause
         for value in node.outputs:
             # A shape may change only where it stays known and internal
-            kind = kinds.get(str(value.name))
-            dims = [] if kind is None else kind.tensor_type.shape.dim
-            static = kind is not None and all(d.HasField("dim_value") for d in dims)
-            after = tuple(dim.dim_value for dim in dims) if static else None
+            _, shape = kinds.get(value, (None, None))
+            after = shape.numpy() if shape is not None and shape.is_static() else None
             before = graph.static_shape(value)
             if before == after or not value.name:
                 continue

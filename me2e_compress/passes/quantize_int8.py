@@ -77,13 +77,14 @@ class QuantizeInt8(Pass):
                 has no int8 for.
             FramesError: neither frames nor ranges, or they are of another graph.
         """
-        _refuse(model, all_decided=METADATA in model.metadata_props)
+        if METADATA in model.metadata_props:
+            refuse_quantized(model)
         # Plan, and stop if there is nothing to do
         target, plan = self._runtime, self.plan(model, context)
         target.check_types(plan, model)
         tensors = target.tensors(plan, model)
         if not tensors:
-            _refuse(model, all_decided=True)
+            refuse_quantized(model)
             return PassResult(model, 0, ("nothing to quantize", plan.headline))
         # Calibrate
         method, saved = self.method_of_ranges, self.ranges
@@ -127,10 +128,9 @@ class QuantizeInt8(Pass):
         return RULE_SETS.parse(named) if isinstance(named, str) else named
 
 
-def _refuse(model: ir.Model, *, all_decided: bool) -> None:
-    """Refuse a quantized graph in which no layer is left to be decided."""
-    already = describe_quantized(model)
-    if already and all_decided:
+def refuse_quantized(model: ir.Model) -> None:
+    """Raise a PreconditionError of a graph that is quantized already."""
+    if already := describe_quantized(model):
         # what is quantized while it runs has no ranges that could be written down
         pairs = any(node.op_type == QUANTIZE for node in pairs_of(model))
         rewrite = ", or let lower-int8 rewrite this one for onnxruntime"

@@ -18,6 +18,8 @@ from typing import Any
 
 from pydantic import ValidationError
 
+from me2e_compress.display import reason
+
 LARGEST_BYTES = 64_000_000
 """The largest document that is read; a plan of 30,000 nodes has 15 MB. Read, it may
 take thirty times as much memory."""
@@ -115,9 +117,9 @@ def from_json(text: bytes | str, *, finite: bool = True) -> Any:
     except RecursionError as error:
         raise MalformedError("nested too deeply") from error
     except ValueError as error:
-        raise MalformedError(_line(error)) from error
-    _check_strings(document)
-    return document
+        raise MalformedError(reason(error)) from error
+    _check_strings(found)
+    return found
 
 
 def from_toml(text: bytes | str) -> dict[str, Any]:
@@ -130,7 +132,7 @@ def from_toml(text: bytes | str) -> dict[str, Any]:
     except RecursionError as error:
         raise MalformedError("nested too deeply") from error
     except ValueError as error:
-        raise MalformedError(_line(error)) from error
+        raise MalformedError(reason(error)) from error
 
 
 def _check_size(size: int, most: int) -> None:
@@ -141,10 +143,6 @@ def _check_size(size: int, most: int) -> None:
 def _decoded(text: bytes | str) -> str:
     # editors of Windows put a byte order mark before it
     return text if isinstance(text, str) else text.decode("utf-8-sig")
-
-
-def _line(error: ValueError) -> str:
-    return " ".join(str(error).split())[:200]
 
 
 def _check_strings(value: object) -> None:

@@ -18,7 +18,7 @@ from me2e_compress.manager import PassManager, recipe
 from me2e_compress.passes import Context, Pass
 from me2e_compress.passes.freeze_inputs import advice
 from me2e_compress.passes.lower_int8 import LowerInt8
-from me2e_compress.passes.quantize_int8 import QuantizeInt8
+from me2e_compress.passes.quantize_int8 import QuantizeInt8, refuse_quantized
 from me2e_compress.quantization.decision import (
     METADATA,
     QuantPlan,
@@ -29,7 +29,6 @@ from me2e_compress.quantization.decision import (
 from me2e_compress.quantization.rules import DEFAULT_RULES, RULE_SETS
 from me2e_compress.shipped.drivers import own_map
 from me2e_compress.targets import DEFAULT_TARGET, TARGETS
-from me2e_compress.targets.quantized import describe_quantized
 from me2e_compress.workflows.checks import load_map, model_path, shortcomings, writing
 from me2e_compress.workflows.options import PlanOptions
 from me2e_compress.workflows.result import Result, Shown
@@ -68,12 +67,9 @@ class PreparedGraph:
         at = next((at for at, each in enumerate(chosen) if each.reads_ranges), None)
         reader = None if at is None else chosen[at]
         # what a plan quantized may only be rewritten, not quantized again
-        quantized = METADATA in loaded.metadata_props and describe_quantized(loaded)
-        if quantized and (reader is None or reader.quantizes):
-            raise PreconditionError(
-                f"{file}: the graph is quantized already: {quantized}; give the float"
-                " graph that it was made of"
-            )
+        quantizes = reader is None or reader.quantizes
+        if quantizes and METADATA in loaded.metadata_props:
+            refuse_quantized(loaded)
         if not isinstance(module_map, ModuleMap):
             module_map = load_map(module_map, loaded)
         # exact passes are verified when the graph is compressed

@@ -67,10 +67,6 @@ def _if_alone(node: ir.Node, opset: int) -> ir.Value | None:
     return node.inputs[0] if len(values) == 1 else None
 
 
-def _dropout(node: ir.Node, opset: int) -> ir.Value | None:
-    return None if draws(node) else node.inputs[0]
-
-
 def _cast(node: ir.Node, opset: int) -> ir.Value | None:
     source, like = node.inputs[0], input_at(node, 1)
     if source is None or source.dtype is None:
@@ -211,7 +207,7 @@ IDENTITIES: dict[str, Identity] = {
     "And": _neutral(lambda array: bool(array.all()), either=True),
     **dict.fromkeys(("Cast", "CastLike"), _cast),
     "Clip": _clip,
-    "Dropout": _dropout,
+    "Dropout": lambda node, opset: None if draws(node) else node.inputs[0],
     "Identity": lambda node, opset: node.inputs[0],
     "Mul": _neutral(_one, either=True),
     "Or": _neutral(lambda array: not array.any(), either=True),

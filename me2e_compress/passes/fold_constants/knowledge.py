@@ -177,18 +177,14 @@ def learn_shapes(
     except shapes.REFUSALS:
         return False
     learnt = False
-    for value in node.outputs:
-        proto = inferred.get(value.name or "")
-        if proto is None:
-            continue
-        shape = ir.serde.deserialize_type_proto_for_shape(proto)
+    for value, (kind, shape) in inferred.items():
         # Shapes of graph outputs are only refined
         if value.is_graph_output():
             if answers and (more := refined(value.shape, shape)) is not value.shape:
                 value.shape, learnt = more, True
             continue
         if value.type is None:
-            value.type = ir.serde.deserialize_type_proto_for_type(proto)
+            value.type = kind
         if shape is None or (value.shape is not None and value.shape.is_static()):
             continue
         if value.shape is None or shape.is_static():

@@ -67,13 +67,9 @@ def _gelu(pattern: Pattern, attributes: Mapping[str, str] | None = None) -> Fusi
 
 
 def _is_float(match: Match, facts: Facts) -> bool:
-    return match.root.outputs[0].dtype in KINDS and _keeps_rank(match)
-
-
-def _keeps_rank(match: Match) -> bool:
-    """Return whether no constant has more axes than x."""
-    rank = rank_of(match[X])
-    return rank is not None and rank == rank_of(match.root.outputs[0])
+    """Return whether it is of floats, and no constant has more axes than x."""
+    rank, made = rank_of(match[X]), match.root.outputs[0]
+    return made.dtype in KINDS and rank is not None and rank == rank_of(made)
 
 
 GELUS = (
