@@ -72,9 +72,9 @@ class QuantizeInt8(Pass):
         """Plan, calibrate, and place quantizers.
 
         Raises:
-            PreconditionError: a plan quantized the graph, or somebody all of its
-                layers; it is of opset below 13, or in float16 that its target or opset
-                has no int8 for.
+            PreconditionError: a plan quantized the graph, or its layers are operators
+                on integers; it is of opset below 13, or in float16 that its target or
+                opset has no int8 for.
             FramesError: neither frames nor ranges, or they are of another graph.
         """
         if METADATA in model.metadata_props:
@@ -84,7 +84,8 @@ class QuantizeInt8(Pass):
         target.check_types(plan, model)
         tensors = target.tensors(plan, model)
         if not tensors:
-            refuse_quantized(model)
+            if not plan.counts():  # there is no layer but in integers
+                refuse_quantized(model)
             return PassResult(model, 0, ("nothing to quantize", plan.headline))
         # Calibrate
         method, saved = self.method_of_ranges, self.ranges

@@ -200,14 +200,6 @@ def test_what_is_quantized_already_stays_and_the_rest_becomes_int8(
     assert found.sqnr_db > 20
 
 
-def test_where_no_layer_is_left_the_graph_is_refused(context: Context) -> None:
-    model = partly("UINT4", "weights", "y = Identity(b)")
-    (_, float_layer) = (node for node in model.graph if node.op_type == "Conv")
-    float_layer.op_type = "Add"
-    with pytest.raises(PreconditionError, match="already: 2 DequantizeLinear, 1 Quan"):
-        QuantizeInt8(rules="paper").run(model, context)
-
-
 def partly(packed: str, form: str, end: str) -> ir.Model:
     """A layer that is quantized by its weight or input, before a float one."""
     generator = np.random.default_rng(0)
