@@ -147,9 +147,7 @@ _FORMER = {
 }
 _NOT_INSTALLED = ("benchmarks", "docs/", "examples/", "models.")
 FORMER = {
-    name: f"{line}, in the repository"
-    if any(each in line for each in _NOT_INSTALLED)
-    else line
+    name: line + ", in the repository" * any(each in line for each in _NOT_INSTALLED)
     for name, line in _FORMER.items()
 }
 """Names of 0.2, by kind, and what replaces them; to be deleted with 0.4.0."""

@@ -20,16 +20,6 @@ from me2e_compress.passes.einsum_products import write_products
 from me2e_compress.passes.sequences import unpack_sequences
 from me2e_compress.targets.quantized import PAIR
 
-__all__ = [
-    "ORIGINAL_DOMAIN",
-    "PLUGIN_DOMAIN",
-    "ImportNormalize",
-    "demote",
-    "needs_import",
-    "with_own_domains",
-]
-
-
 # Remove float64 that leaked into a float32 graph (``torch.linspace`` in exporters).
 
 

@@ -9,10 +9,9 @@ from me2e_compress import graph
 from me2e_compress.errors import ModuleMapError
 from me2e_compress.graph import provenance
 from me2e_compress.graph.modules.module_map import ModuleMap
+from me2e_compress.graph.validity import ORIGINAL_DOMAIN, PLUGIN_DOMAIN
 from me2e_compress.passes import Context
 from me2e_compress.passes.import_normalize import (
-    ORIGINAL_DOMAIN,
-    PLUGIN_DOMAIN,
     ImportNormalize,
     needs_import,
     with_own_domains,
