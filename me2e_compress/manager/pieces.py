@@ -171,18 +171,14 @@ def _is_alike(twin: ir.Node, node: ir.Node, before: ir.Model, after: ir.Model) -
 
 def _reads_others(twin: ir.Node, node: ir.Node) -> bool:
     """Return whether one of two nodes reads another value, or another constant."""
-    for mine, theirs in zip(twin.inputs, node.inputs, strict=True):
-        if mine is None or theirs is None:
-            if mine is not theirs:
-                return True
-            continue
-        kinds = mine.is_initializer(), theirs.is_initializer()
-        same = mine.const_value is theirs.const_value
-        if mine.name != theirs.name or kinds[0] != kinds[1]:
-            return True
-        if not same and not _is_one_constant(mine, theirs):
-            return True
-    return False
+    return not all(map(_is_same_value, twin.inputs, node.inputs))
+
+
+def _is_same_value(mine: ir.Value | None, theirs: ir.Value | None) -> bool:
+    if mine is None or theirs is None:
+        return mine is theirs
+    shared = mine.const_value is theirs.const_value  # None where a node makes them
+    return mine.name == theirs.name and (shared or _is_one_constant(mine, theirs))
 
 
 def _is_one_constant(mine: ir.Value, theirs: ir.Value) -> bool:

@@ -141,6 +141,7 @@ def test_the_largest_error_of_all_frames_counts(guilty: int) -> None:
 
 BRANCHES = """<ir_version: 9, opset_import: ["" : 19, "local" : 1]>
 m (float[1,64] x, bool c) => (float[1,64] y) {
+    b = Relu(x)
     a = CALL
     y = Round(a)
 }
@@ -153,6 +154,7 @@ IF = """If(c) <then_branch = t () => (float[1,64] p) { p = Neg(x) },
     ("was", "now"),
     [
         ("Neg(x)", "Abs(x)"),
+        ("Neg(x)", "Neg(b)"),
         ("Elu<alpha = 0.5>(x)", "Elu<alpha = 0.25>(x)"),
         ("local.f(x)", "local.f(x)"),  # bodies are not looked into
         (IF, IF),

@@ -3,8 +3,6 @@
 Levels that share their offsets are visited one group after the other, and a group that
 the mask leaves out costs nothing: most cells of a bird's-eye view are seen by one or
 two of six cameras. Then as in :mod:`deformable_kernel`.
-
-The softmax of many short rows, in vector instructions.
 """
 
 from collections.abc import Callable, Mapping
