@@ -33,8 +33,28 @@ from me2e_compress.graph.summary import (
 )
 
 __all__ = [
-    "CONVOLUTIONS", "WEIGHTED", "array_of", "bias_of", "channel_axis", "digest",
-    "file_bytes", "graphs_of", "has_subgraph", "infer_shapes", "input_at", "interface",
-    "is_standard", "load", "macs", "node_count", "nodes_of", "opset_of", "producer_of",
-    "rank_of", "save", "sha256_of", "size", "static_shape",
-]  # fmt: skip
+    "CONVOLUTIONS",
+    "WEIGHTED",
+    "array_of",
+    "bias_of",
+    "channel_axis",
+    "digest",
+    "file_bytes",
+    "graphs_of",
+    "has_subgraph",
+    "infer_shapes",
+    "input_at",
+    "interface",
+    "is_standard",
+    "load",
+    "macs",
+    "node_count",
+    "nodes_of",
+    "opset_of",
+    "producer_of",
+    "rank_of",
+    "save",
+    "sha256_of",
+    "size",
+    "static_shape",
+]

@@ -14,7 +14,7 @@ from me2e_compress.display import counted
 from me2e_compress.errors import FramesError, GraphError, Me2eError
 from me2e_compress.fidelity.first_difference import find_first_difference
 from me2e_compress.graph.nodes import bodies_of, draws, reads_of
-from me2e_compress.manager import pieces, runtime_levels
+from me2e_compress.manager import pieces
 from me2e_compress.manager.report import Verification
 from me2e_compress.manager.verification_inputs import (
     TOLERANCES,

@@ -118,8 +118,8 @@ def from_json(text: bytes | str, *, finite: bool = True) -> Any:
         raise MalformedError("nested too deeply") from error
     except ValueError as error:
         raise MalformedError(reason(error)) from error
-    _check_strings(found)
-    return found
+    _check_strings(document)
+    return document
 
 
 def from_toml(text: bytes | str) -> dict[str, Any]:
