@@ -35,13 +35,10 @@ _FORMER = {
     "ablate-modules means": f"means {_NOW} frames (--frames)",
     "fuse-basic swish": "swish is gone since 0.3.0: onnxruntime has no kernel",
     **{
-        f"{name} {option}": f"{option} is gone since 0.3.0: its default is what is best"
-        for name, option in (
-            ("eliminate-redundant", "across_modules"),
-            ("fuse-operators", "merge_images"),
-            ("fuse-operators", "tolerance"),
-        )
+        f"fuse-operators {option}": f"{option} is gone since 0.3.0: it has one value"
+        for option in ("tolerance", "merge_images")
     },
+    "eliminate-redundant across_modules": "across_modules is gone since 0.3.0",
     "fold-constants growth": f"growth {_NOW} bytes_per_node",
     "command build": f"build {_NOW} trtexec --onnx=M.onnx --saveEngine=M.engine",
     "command ranges": f"ranges {_NOW} calibrate, which says what deserves a look",
@@ -113,15 +110,8 @@ _FORMER = {
         for name in ("vad-tiny", "uniad-tiny", "uniad-trt", "tcp")
     },
     **{
-        f"export {option}": f"{option} {_NOW} python -m models.export"
-        for option in (
-            "--opset",
-            "--heads",
-            "--seed",
-            "--dialect",
-            "--weights",
-            "--ema",
-        )
+        f"export {name}": f"{name} {_NOW} python -m models.export"
+        for name in ("--opset", "--heads", "--seed", "--dialect", "--weights", "--ema")
     },
     **{
         f"adapter tcp-{name}": f"tcp-{name} {_NOW} models.tcp.policy"

@@ -88,7 +88,7 @@ def test_a_name_that_is_gone_is_one_line(
         ("fold-constants{growth=0}", "growth is gone since 0.3.0: use bytes_per_node"),
         (
             "fuse-operators{tolerance=0.1}",
-            "tolerance is gone since 0.3.0: its default is what is best",
+            "tolerance is gone since 0.3.0: it has one value",
         ),
         (
             "fuse-basic{swish=true}",
