@@ -21,8 +21,8 @@ from me2e_compress.quantization.plan import make_plan
 from me2e_compress.quantization.rules import DEFAULT_RULES, RULE_SETS, RuleSet
 from me2e_compress.quantization.scheme import QuantScheme
 from me2e_compress.registry.registry import WRITTEN
-from me2e_compress.targets import DEFAULT_TARGET, TARGETS, Target
-from me2e_compress.targets.quantized import QUANTIZE, describe_quantized, pairs_of
+from me2e_compress.targets import DEFAULT_TARGET, TARGETS, Target, onnxruntime
+from me2e_compress.targets.quantized import describe_quantized
 
 
 @dataclasses.dataclass(frozen=True)
@@ -77,8 +77,16 @@ class QuantizeInt8(Pass):
                 opset has no int8 for.
             FramesError: neither frames nor ranges, or they are of another graph.
         """
-        if METADATA in model.metadata_props:
-            refuse_quantized(model)
+        if found := describe_quantized(model):
+            rewrite = ", or let lower-int8 rewrite this one for onnxruntime"
+            try:  # only symmetric pairs of int8 have ranges that it could write down
+                onnxruntime.unranged(model)
+            except PreconditionError:
+                rewrite = ""
+            raise PreconditionError(
+                f"the graph is quantized already: {found}; int8 is not put on int8,"
+                f" give the float graph that it was made of{rewrite}"
+            )
         # Plan, and stop if there is nothing to do
         target, plan = self._runtime, self.plan(model, context)
         target.check_types(plan, model)

@@ -17,6 +17,7 @@ from me2e_compress.calibration.ranges import Ranges
 from me2e_compress.errors import PreconditionError, RecipeError
 from me2e_compress.graph import is_standard, opset_of
 from me2e_compress.graph.nodes import LAYOUT_OPERATORS, grid_of
+from me2e_compress.graph.rewrite.raise_opset import raise_opset
 from me2e_compress.graph.validity import refusal
 from me2e_compress.quantization.costs import Costs
 from me2e_compress.quantization.decision import KeptFloat, QuantPlan
@@ -37,6 +38,8 @@ __all__ = [
     "warning",
 ]
 
+MIN_OPSET = 13
+"""The first opset whose DequantizeLinear has an axis, i.e. one scale a channel."""
 
 Severity = Literal["error", "wrong", "warning"]
 SEVERITIES: tuple[Severity, ...] = get_args(Severity)
@@ -220,12 +223,20 @@ class Target(abc.ABC):
         return f"{self.name} has no int8 kernel for {node.op_type}"
 
     def check_types(self, plan: QuantPlan, model: ir.Model) -> None:
-        """Check that the graph's float type can be quantized.
+        """Check that the graph's opset and float type can be quantized.
 
         Raises:
-            PreconditionError: it is float16, and the target lacks such kernels, or the
-                opset float16 scales; the message has a remedy.
+            PreconditionError: the opset has no scales by channel, or the graph is
+                float16, and the target lacks such kernels, or the opset float16
+                scales; the message has a remedy.
         """
+        if plan.chosen and opset_of(model) < MIN_OPSET:
+            _, keeper = raise_opset(model.clone(), MIN_OPSET, "")
+            keeper = keeper or "import-normalize behind the other passes lifts it"
+            raise PreconditionError(
+                f"int8 with one scale a channel needs opset {MIN_OPSET}, the graph is"
+                f" of {opset_of(model)}: {keeper}; -r exact writes a graph without int8"
+            )
         types = {v.name: v.dtype for node in model.graph for v in node.outputs}
         # Float16 needs kernels, and scales of that type.
         halves = [e for e in plan.chosen if types[e.output] == ir.DataType.FLOAT16]

@@ -12,7 +12,7 @@ import onnx_ir as ir
 from me2e_compress import graph
 from me2e_compress.calibration.observers import QUANT_MAX
 from me2e_compress.errors import PreconditionError
-from me2e_compress.graph import CONVOLUTIONS, opset_of, producer_of, rewrite
+from me2e_compress.graph import CONVOLUTIONS, producer_of, rewrite
 from me2e_compress.graph.nodes import array_of, sole_reader, unrenamed
 from me2e_compress.graph.shapes import extent
 from me2e_compress.quantization.decision import Decision
@@ -21,9 +21,6 @@ from me2e_compress.runtime.session import run_once
 
 Stored = TypeVar("Stored", bound=np.generic)
 """The type of stored integers."""
-
-MIN_OPSET = 13
-"""The first opset whose DequantizeLinear has an axis, i.e. one scale a channel."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -52,11 +49,6 @@ def weights_of(
     Layers that share a weight share the result; decisions without a weight are ignored.
     The graph needs opset 13 or later. ``balanced``: see :func:`balanced_steps`.
     """
-    if (opset := opset_of(model)) < MIN_OPSET:
-        raise PreconditionError(
-            f"the graph is of opset {opset}: int8 with one scale a channel needs"
-            f" {MIN_OPSET} or later, export it so"
-        )
     # Find the weight of each planned layer, and its channel axis: -1 for a MatMul.
     nodes = {str(node.outputs[0].name): node for node in model.graph}
     layers = dict[str, tuple[ir.Value, int | None]]()

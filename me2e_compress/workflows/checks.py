@@ -37,8 +37,9 @@ from me2e_compress.driving.adapter.outputs import adapted, state_and_plan
 from me2e_compress.errors import FORMER, GraphError
 from me2e_compress.graph.modules.assign import map_of
 from me2e_compress.graph.modules.module_map import ModuleMap
-from me2e_compress.graph.nodes import is_read, is_standard
+from me2e_compress.graph.nodes import is_read, is_standard, nodes_of, opset_of
 from me2e_compress.graph.opset import read_as
+from me2e_compress.graph.runtime_operators import has_operator
 from me2e_compress.graph.shapes import unshaped_plugins
 from me2e_compress.operators.kernels.trampoline import why_not
 from me2e_compress.registry.drafts import is_marked
@@ -69,6 +70,26 @@ def model_path(text: str | Path, beside: Path = Path()) -> Path:
     raise GraphError(gone)
 
 
+def load_graph(path: Path) -> ir.Model:
+    """Read a graph; refuse one of before opset 7 that onnxruntime cannot run.
+
+    Operators broadcast by attributes there, which onnx 1.23 converts wrongly.
+    """
+    model = graph.load(path)
+    if 0 < (opset := opset_of(model)) < _FIRST_OPSET:
+        used = {node.op_type for node in nodes_of(model) if is_standard(node)}
+        if gone := sorted(each for each in used if not has_operator(each, opset)):
+            raise GraphError(
+                f"{path}: opset {opset}: onnxruntime has no {', '.join(gone)} of before"
+                f" opset {_FIRST_OPSET}: export it again, in 13 or newer"
+            )
+    return model
+
+
+_FIRST_OPSET = 7
+"""From here on onnxruntime has all operators (its docs/Versioning.md)."""
+
+
 def read_graph(
     path: Path, listener: Listener, adapter: Given = None, module_map: Given = None
 ) -> ir.Model:
@@ -76,7 +97,7 @@ def read_graph(
 
     What an adapter and a map state becomes metadata of the graph; see :func:`adapted`.
     """
-    model = graph.load(path)
+    model = load_graph(path)
     adapted(model, adapter, module_map or own_map(path))
     if said := read_as(model):
         listener.on_warning(f"{path}: {said}")
@@ -409,7 +430,7 @@ def opened(
     others: Iterable[Path] = (),
 ) -> OpenedGraph:
     """Read a graph, and open it apart; `others` lend what its own metadata lack."""
-    model = graph.load(path)
+    model = load_graph(path)
     module_map = options.module_map or own_map(path)
     own = {each: graph.load(each).metadata_props for each in others if each != path}
     known = state_and_plan(model, path, options.adapter, module_map, own)

@@ -21,7 +21,12 @@ from me2e_compress.manager import PassManager, recipe
 from me2e_compress.passes import Context
 from me2e_compress.passes.fix_shapes import FixShapes, open_dimensions
 from me2e_compress.passes.freeze_inputs import advice
-from me2e_compress.workflows.checks import load_map, model_path, shortcomings
+from me2e_compress.workflows.checks import (
+    load_graph,
+    load_map,
+    model_path,
+    shortcomings,
+)
 from me2e_compress.workflows.options import InspectOptions
 from me2e_compress.workflows.result import Result, Shown
 
@@ -140,7 +145,7 @@ def inspect(model: str | Path, options: InspectOptions | None = None) -> Inspect
         ModuleMapError: The map does not exist.
     """
     options, path = options or InspectOptions(), model_path(model)
-    loaded = graph.load(path)
+    loaded = load_graph(path)
     adapted(loaded, options.adapter, options.module_map)
     modules = load_map(options.module_map, loaded)
     if options.dims:

@@ -29,7 +29,14 @@ from me2e_compress.quantization.decision import (
 from me2e_compress.quantization.rules import DEFAULT_RULES, RULE_SETS
 from me2e_compress.shipped.drivers import own_map
 from me2e_compress.targets import DEFAULT_TARGET, TARGETS
-from me2e_compress.workflows.checks import load_map, model_path, shortcomings, writing
+from me2e_compress.targets.quantized import describe_quantized
+from me2e_compress.workflows.checks import (
+    load_graph,
+    load_map,
+    model_path,
+    shortcomings,
+    writing,
+)
 from me2e_compress.workflows.options import PlanOptions
 from me2e_compress.workflows.result import Result, Shown
 
@@ -178,7 +185,8 @@ def plan(
         GraphError: The model does not exist, or the output would harm an input.
         RecipeError: A plan, scheme or rule set is not usable, or options are given for
             a plan that is made already.
-        PreconditionError: The graph is quantized and carries no plan.
+        PreconditionError: The graph is quantized and carries no plan, or its opset or
+            float type has no int8.
     """
     options = options or PlanOptions()
     source = model_path(model)
@@ -207,7 +215,7 @@ def _read(path: Path) -> QuantPlan | ir.Model:
     """Read the plan that a file is or carries, else its graph."""
     if path.suffix == ".json":
         return load_plan(path)
-    model = graph.load(path)
+    model = load_graph(path)
     return plan_of(model) or model
 
 
@@ -222,5 +230,6 @@ def _planned(file: Path, model: ir.Model, options: PlanOptions) -> PlanResult:
     adapted(model, None, options.module_map or own_map(file))
     ready = PreparedGraph.of(file, model, options.module_map)
     made = quantizer.plan(ready.model, Context(ready.modules))
+    TARGETS.parse(quantizer.target).check_types(made, ready.model)
     hints = filter(None, (shortcomings(model), advice(model)))
     return PlanResult(made, "; ".join(hints))

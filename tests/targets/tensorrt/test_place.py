@@ -10,7 +10,6 @@ from hypothesis import strategies as st
 
 from me2e_compress import graph
 from me2e_compress.calibration.ranges import Ranges
-from me2e_compress.errors import PreconditionError
 from me2e_compress.graph import array_of, provenance
 from me2e_compress.quantization.plan import make_plan, tensors_of
 from me2e_compress.quantization.rules import RULE_SETS
@@ -69,11 +68,6 @@ def test_the_result_is_a_valid_graph_and_the_source_untouched() -> None:
             assert past.passes == ("quantize-int8",)
             reader = next(iter(node.outputs[0].consumers()))
             assert past.module == provenance.module_of(reader)
-
-
-def test_opset_12_is_refused() -> None:
-    with pytest.raises(PreconditionError, match=r"opset 12: .*needs 13"):
-        placed(layers(opset=12))
 
 
 Floats = npt.NDArray[np.float32]
