@@ -53,10 +53,9 @@ def _commands() -> None:
 def _run(run: Callable[[], None]) -> int:
     from cyclopts import CycloptsError
 
-    from me2e_compress.cli.console import Verbosity, errors, set_verbosity
+    from me2e_compress.cli.console import errors
     from me2e_compress.extras import explained
 
-    set_verbosity(Verbosity.NORMAL)
     try:
         # file names that are not UTF-8, and a current folder that is gone
         try:

@@ -7,7 +7,7 @@ from typing import Annotated
 from cyclopts import App, CycloptsError, Group, Parameter
 
 from me2e_compress.cli import commands, driving
-from me2e_compress.cli.console import Verbosity, set_json, set_verbosity
+from me2e_compress.cli.console import printing
 from me2e_compress.errors import FORMER
 from me2e_compress.extras import missing_module
 from me2e_compress.version import __version__
@@ -44,9 +44,8 @@ def build_app(name: str, about: str = "") -> App:
             verbose: notes and node lists too
             json: print one JSON document
         """
-        if quiet or verbose:
-            set_verbosity(Verbosity.QUIET if quiet else Verbosity.VERBOSE)
-        set_json(json)
+        printing.quiet, printing.verbose = quiet, verbose and not quiet
+        printing.json = json
         _refuse_former(tokens)
         app(tokens)
 

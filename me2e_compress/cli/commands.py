@@ -10,9 +10,8 @@ from typing import Annotated, TypeAlias
 from cyclopts import Parameter
 
 from me2e_compress.cli.console import (
-    is_json,
-    is_verbose,
     listening,
+    printing,
     say,
     show,
     show_of,
@@ -62,13 +61,13 @@ def demo(
         begun = time.monotonic()
         with listening() as listener:
             results[name] = step(listener)
-        if not is_json():
+        if not printing.json:
             seconds = time.monotonic() - begun
             say(f"{name:<10}{seconds:4.0f} s   {figure(results[name])}")
-            if is_verbose():
+            if printing.verbose:
                 show(results[name])
     # with -v every step was shown in full already
-    if is_json() or not is_verbose():
+    if printing.json or not printing.verbose:
         show(DemoResult(results))
 
 
@@ -157,7 +156,7 @@ def frames(
 
     with listening() as listener:
         record_frames(stack, output, options, listener)
-    show(FramesResult(stack, output, options or FramesOptions()))
+    show(FramesResult.of(stack, output, options or FramesOptions()))
 
 
 def plan(
@@ -178,7 +177,7 @@ def plan(
     from me2e_compress.workflows.plan import plan as workflow
 
     result = workflow(model, output, options)
-    show(result, result.shown(every=is_verbose()).tables)
+    show(result, result.shown(every=printing.verbose).tables)
 
 
 def calibrate(
@@ -245,7 +244,7 @@ def lint(model: str, /, *, options: LintOptions | None = None) -> None:
 
     with listening() as listener:
         result = workflow(model, options, listener)
-    show(result, result.shown(every=is_verbose()).tables)
+    show(result, result.shown(every=printing.verbose).tables)
     result.check()
 
 

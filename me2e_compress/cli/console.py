@@ -1,6 +1,6 @@
 """What is printed, and how: results, tables, progress, JSON; ``-q``, ``-v``."""
 
-import enum
+import dataclasses
 import json
 import sys
 import time
@@ -26,45 +26,17 @@ console = Console(record=True, emoji=False)
 errors = Console(stderr=True, highlight=False, emoji=False)
 
 
-class Verbosity(enum.Enum):
-    """How much is printed besides results and errors."""
+@dataclasses.dataclass
+class Printing:
+    """What a run prints besides results and errors, and whether those are JSON."""
 
-    QUIET = enum.auto()
-    NORMAL = enum.auto()
-    VERBOSE = enum.auto()
-
-
-_chosen = Verbosity.NORMAL
-_as_json = False
+    quiet: bool = False
+    verbose: bool = False
+    json: bool = False
 
 
-def set_verbosity(wanted: Verbosity) -> None:
-    """Set how much is printed, until the next call."""
-    global _chosen
-    _chosen = wanted
-
-
-def set_json(wanted: bool) -> None:
-    """Set whether results are printed as JSON, until the next call."""
-    global _as_json
-    _as_json = wanted
-
-
-def is_json() -> bool:
-    """Return whether a result is printed as one JSON document."""
-    return _as_json
-
-
-def is_quiet() -> bool:
-    """Return whether only results and errors are printed."""
-    return _chosen is Verbosity.QUIET
-
-
-def is_verbose() -> bool:
-    """Return whether notes and node lists are printed too."""
-    return _chosen is Verbosity.VERBOSE
-
-
+printing = Printing()
+"""Of the run at hand: the command sets it."""
 WIDE = 120
 """Columns that a terminal must have for intervals beside the numbers."""
 
@@ -76,7 +48,7 @@ def listening(*, stages: bool = False) -> Iterator[Listener]:
     On a terminal progress is a bar with the time left, elsewhere a line now and then,
     and one for every new stage if `stages` is set.
     """
-    if is_quiet():
+    if printing.quiet:
         yield SILENT
         return
     # a log gets lines, since it cannot show a bar
@@ -119,7 +91,7 @@ def _warn(line: str) -> None:
 
 def tell(line: str) -> None:
     """Print a line on stderr without markup; nothing if quiet."""
-    if not is_quiet():
+    if not printing.quiet:
         errors.print(printable(line), soft_wrap=True, markup=False)
 
 
@@ -128,7 +100,7 @@ def show(found: Result, tables: Iterable[Table] | None = None) -> None:
 
     `tables` are printed instead of the result's own.
     """
-    if is_json():
+    if printing.json:
         print_json(found.document())
         return
     # tables first, so that the verdict stays in sight at the end
@@ -181,7 +153,7 @@ def print_table(content: Table) -> None:
         console.print(Text(f"Intervals: in a terminal of {WIDE} columns.", "dim"))
     if content.details:
         lines = counted(content.details.count("\n") + 1, "note")
-        shown = content.details if is_verbose() else f"{lines} more: -v"
+        shown = content.details if printing.verbose else f"{lines} more: -v"
         console.print(Text(shown, "dim"), soft_wrap=True)
 
 

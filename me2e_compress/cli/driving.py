@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from me2e_compress.cli.commands import WRITING, Output
-from me2e_compress.cli.console import is_json, listening, say, show, tell
+from me2e_compress.cli.console import listening, printing, say, show, show_of, tell
 from me2e_compress.errors import OptionError
 from me2e_compress.extras import need_extra
 from me2e_compress.metrics import BUDGET_MS
@@ -42,10 +42,7 @@ def evaluate(
     if check:
         if policy is None:
             raise OptionError("--check needs a policy: POLICY")
-        with listening() as listener:
-            checked = workflow.check_model(policy, options, listener)
-        show(checked)
-        checked.check()
+        show_of(workflow.check_model, policy, options)
         return
     if output is None:
         raise OptionError("driving needs -o RESULTS/")
@@ -147,5 +144,5 @@ def study(
         found = run_study(asked, output, engine, listener, force=writing.force)
         files = write_study(found, output, words, force=writing.force)
     show(found)
-    if not is_json():
+    if not printing.json:
         say(f"wrote {files.report}, {files.tables} and {files.record}")

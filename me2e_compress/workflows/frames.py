@@ -4,6 +4,7 @@ import dataclasses
 from collections.abc import Iterator, Mapping
 from functools import partial
 from pathlib import Path
+from typing import Self
 
 from me2e_compress.calibration.dataset import PixelInput
 from me2e_compress.calibration.recording import (
@@ -36,39 +37,34 @@ DRIVEN_SCENE_LENGTH = 16
 
 @dataclasses.dataclass(frozen=True, repr=False)
 class FramesResult(Result):
-    """A recording that was written for a model."""
+    """A recording that was written for a model.
+
+    Attributes:
+        frames: how many lie there: a log may have fewer than were asked for.
+        seed: None of a log.
+        log: the log that they were read from, as it is written.
+    """
 
     stack: str
     output: Path
-    options: FramesOptions
+    frames: int
+    seed: int | None = None
+    log: str | None = None
 
-    @property
-    def log(self) -> str | None:
-        """The log that they were read from, as it is written."""
-        text = self.options.log
-        return None if text is None else LOGS.text(LOGS.parse(text))
+    @classmethod
+    def of(cls, stack: str, output: Path, options: FramesOptions) -> Self:
+        """Count what was written."""
+        count = sum(1 for _ in output.glob("*.npz"))
+        if options.log is None:
+            return cls(stack, output, count, options.seed)
+        return cls(stack, output, count, log=LOGS.text(LOGS.parse(options.log)))
 
     @property
     def headline(self) -> str:
         """The folder, its frames, the model, and the seed or log."""
-        by = f"seed {self.options.seed}" if self.log is None else f"from {self.log}"
-        count = counted(_written(self.output), "frame")
+        by = f"seed {self.seed}" if self.log is None else f"from {self.log}"
+        count = counted(self.frames, "frame")
         return f"{self.output}: {count} of {self.stack}, {by}"
-
-    def to_json(self) -> object:
-        """Return the recording: stack, folder, frames, seed, log."""
-        return {
-            "stack": self.stack,
-            "output": self.output,
-            "frames": _written(self.output),
-            "seed": self.options.seed if self.log is None else None,
-            "log": self.log,
-        }
-
-
-def _written(folder: Path) -> int:
-    """Count the frames: a log may have fewer than were asked for."""
-    return sum(1 for _ in folder.glob("*.npz"))
 
 
 def record_frames(

@@ -152,7 +152,7 @@ def test_frames_that_there_are_count_not_those_asked_for(
     for name in ("000000.npz", "000001.npz"):
         (tmp_path / name).touch()
 
-    print_json(FramesResult("highway", tmp_path, FramesOptions(count=3)).document())
+    print_json(FramesResult.of("highway", tmp_path, FramesOptions(count=3)).document())
 
     found = strict(cli.capsys.readouterr().out)
     assert faults("frames", found) == []

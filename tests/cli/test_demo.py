@@ -8,7 +8,6 @@ import pytest
 from me2e_compress import graph
 from me2e_compress.study import demo
 from me2e_compress.workflows.frames import FramesResult
-from me2e_compress.workflows.options import FramesOptions
 from tests.command import Cli
 from tests.stand_in import weights
 from tests.study.conftest import Here
@@ -80,7 +79,7 @@ def test_what_is_there_is_refused_before_any_work(
 def test_all_its_steps_are_one_document(
     cli: Cli, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    found = FramesResult("m", Path("f"), FramesOptions())
+    found = FramesResult("m", Path("f"), 0)
     names = ("compress", "weigh", "compare", "drive")
     steps = {name: lambda listener: found for name in names}
     monkeypatch.setattr(demo.DriverDemo, "steps", property(lambda self: steps))

@@ -12,10 +12,8 @@ from me2e_compress.cli.app import COMMANDS
 from me2e_compress.cli.console import (
     EVERY_S,
     ProgressLines,
-    Verbosity,
     listening,
     print_table,
-    set_verbosity,
 )
 from me2e_compress.display import Cell, Table, duration, table
 from me2e_compress.version import __version__
@@ -25,7 +23,7 @@ from tests.command import Cli
 @pytest.fixture(autouse=True)
 def _normal() -> Iterator[None]:
     yield
-    set_verbosity(Verbosity.NORMAL)
+    console.printing.quiet = False
 
 
 def test_the_version(cli: Cli) -> None:
