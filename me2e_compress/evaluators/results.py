@@ -1,6 +1,5 @@
 """A results folder: one JSON file per route, and a manifest; and what fills it."""
 
-import errno
 import hashlib
 import json
 import os
@@ -14,8 +13,7 @@ from me2e_compress.errors import EvaluationError
 from me2e_compress.evaluators.contract import Drive, Driven, Evaluator, Listener
 from me2e_compress.metrics.episode import Episode
 from me2e_compress.metrics.route_scores import route_score
-from me2e_compress.registry import documents
-from me2e_compress.registry.drafts import IN_JSON
+from me2e_compress.registry import documents, drafts
 from me2e_compress.runtime.atomic import write_json
 from me2e_compress.simulator.routes import VERSION, check_version, is_route_id
 
@@ -51,7 +49,7 @@ class ResultsFolder:
         from; None if none are drawn.
         """
         # claim an empty folder
-        try:
+        with drafts.written(path, EvaluationError):
             path.mkdir(parents=True, exist_ok=True)
             if not (path / MANIFEST).exists():
                 # a killed run of ours leaves only drafts
@@ -66,8 +64,6 @@ class ResultsFolder:
             if not (path / MANIFEST).exists():
                 drawn = {} if measured is None else {MEASURED: measured}
                 write_json(path / MANIFEST, made_by | drawn, indent=1)
-        except OSError as error:
-            raise _unwritable(path, error) from error
         folder = cls.open(path)
         # all that decides the results must agree
         both = folder.made_by, made_by
@@ -83,16 +79,8 @@ class ResultsFolder:
     @classmethod
     def open(cls, path: Path) -> Self:
         """Open an existing folder."""
-        try:
+        with documents.reading(path / MANIFEST, EvaluationError, "not JSON"):
             made_by = documents.from_json(documents.content(path / MANIFEST))
-        except OSError as error:
-            raise EvaluationError(
-                f"{path}: not a results folder: {MANIFEST}: {error.strerror}"
-            ) from error
-        except documents.MalformedError as error:
-            raise EvaluationError(
-                f"{path}: not a results folder: {MANIFEST}: not JSON ({error})"
-            ) from error
         _check_manifest(path, made_by)
         return cls(path, made_by)
 
@@ -115,10 +103,8 @@ class ResultsFolder:
     def keep(self, episode: Episode) -> None:
         """Write one route."""
         record = {"fingerprint": self._digest, "episode": episode.to_json()}
-        try:
+        with drafts.written(self._file(episode.route), EvaluationError):
             write_json(self._file(episode.route), record)
-        except OSError as error:
-            raise _unwritable(self._file(episode.route), error) from error
 
     @property
     def _digest(self) -> str:
@@ -164,12 +150,12 @@ def log_cost(folder: Path, driven: Driven) -> None:
         "seconds": round(driven.seconds, 3),
         "memory_mb": round(driven.memory_bytes / 1e6, 1),
     }
-    try:
-        with log.open("a", encoding="utf-8") as lines:
-            mark = {} if lines.tell() else IN_JSON
-            lines.write(f"{json.dumps(cost | mark)}\n")
-    except OSError as error:
-        raise _unwritable(log, error) from error
+    with (
+        drafts.written(log, EvaluationError),
+        log.open("a", encoding="utf-8") as lines,
+    ):
+        mark = {} if lines.tell() else drafts.IN_JSON
+        lines.write(f"{json.dumps(cost | mark)}\n")
 
 
 def _check_manifest(path: Path, made_by: object) -> None:
@@ -193,14 +179,6 @@ def _check_manifest(path: Path, made_by: object) -> None:
             f"{path}: {MANIFEST}: set_size is {_short(size)}, it must be"
             f" {len(routes)} or more"
         )
-
-
-def _unwritable(path: Path, error: OSError) -> EvaluationError:
-    if error.errno == errno.ENOSPC:
-        return EvaluationError(
-            f"{path}: the disk is full; written files are complete, run again to resume"
-        )
-    return EvaluationError(f"{path}: cannot be written: {error.strerror or error}")
 
 
 def _short(value: object) -> str:

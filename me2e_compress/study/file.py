@@ -91,15 +91,11 @@ def load_study(
 
 def _content(path: Path) -> dict[str, object]:
     """Return the tables of a file."""
-    try:
-        content = documents.from_toml(documents.content(path))
-    except FileNotFoundError as error:
+    if not path.exists():
         gone = FORMER.get(f"study {path}")
-        raise StudyError(gone or f"no study {path}: no such file") from error
-    except OSError as error:
-        raise StudyError(f"{path}: cannot be read: {error.strerror}") from error
-    except documents.MalformedError as error:
-        raise StudyError(f"{path}: not TOML: {error}") from error
+        raise StudyError(gone or f"no study {path}: no such file")
+    with documents.reading(path, StudyError, "not TOML"):
+        content = documents.from_toml(documents.content(path))
     if "set_size" in content:  # Python's own
         raise StudyError(f"{path}: no key set_size")
     return content

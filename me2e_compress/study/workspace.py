@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from me2e_compress.errors import StudyError
+from me2e_compress.registry import drafts
 from me2e_compress.study.condition import Condition
 from me2e_compress.study.definition import Variant
 
@@ -40,8 +41,6 @@ class Workspace:
 
     def _made(self, name: str) -> Path:
         path = self.folder / name
-        try:
+        with drafts.written(path, StudyError):
             path.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise StudyError(f"{path}: cannot be made: {error.strerror}") from error
         return path

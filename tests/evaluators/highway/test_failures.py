@@ -68,7 +68,7 @@ def test_a_full_disk_is_one_line_and_nothing_half_written(
 
     with monkeypatch.context() as patch:
         patch.setattr("me2e_compress.runtime.atomic.os.fsync", no_space)
-        with pytest.raises(EvaluationError, match="the disk is full") as caught:
+        with pytest.raises(EvaluationError, match="written: No space") as caught:
             driven(folder, two)
     assert "\n" not in str(caught.value)
     assert list(contents(folder)) == ["evaluation.json"]
