@@ -52,6 +52,36 @@ def test_a_graph_that_is_quantized_already_is_refused(
     assert "quantized already" in cli.refused("calibrate int8.onnx frames -o r.json")
 
 
+@pytest.mark.parametrize(
+    ("zero", "offered"), [("int8 z = {0}", True), ("int8 z = {3}", False),
+                          ("uint8 z = {0}", False), ("uint8 z = {128}", False)]
+)  # fmt: skip
+def test_lower_int8_is_offered_of_what_it_takes_alone(
+    cli: Cli, dense: Path, zero: str, offered: bool
+) -> None:
+    save_text(dense / "m.onnx", "m (float[4,16] camera) => (float[4,16] plan)"
+              f" <float s = {{0.1}}, {zero}> {{ q = QuantizeLinear(camera, s, z)"
+              " plan = DequantizeLinear(q, s, z) }")  # fmt: skip
+
+    said = cli.refused("compress m.onnx -r full --frames frames -o out.onnx")
+    assert ("lower-int8" in said) is offered
+    lowered = cli("compress m.onnx --passes lower-int8 --frames frames -o low.onnx")
+    assert (lowered.code == 0) is offered
+
+
+@pytest.mark.parametrize(
+    ("opset", "node"), [(6, "Relu(camera)"), (11, "Hardmax<axis=1>(camera)")]
+)
+def test_an_old_opset_is_no_fault_where_its_operators_run(
+    cli: Cli, dense: Path, opset: int, node: str
+) -> None:
+    head = f'<ir_version: 3, opset_import: ["" : {opset}]>'
+    text = f"m (float[4,16] camera) => (float[4,16] plan) {{ plan = {node} }}"
+    save_text(dense / "m.onnx", head + text)
+
+    cli.done("compress m.onnx -r exact -o out.onnx")
+
+
 @pytest.mark.parametrize("shape", ["1,4", "N,4"])
 def test_a_graph_of_no_known_stack_is_one_module(
     cli: Cli, tmp_path: Path, shape: str

@@ -13,13 +13,15 @@ from me2e_compress import graph
 from me2e_compress.graph import rewrite
 from me2e_compress.simulator.routes import ROAD_VERSION, VERSION
 from tests.command import Cli, write_frames
-from tests.nets import save_text
+from tests.nets import parsed, save_text, stored
 
 F = "dense.onnx frames --map map.toml"
 EXACT = "in.onnx --map map.toml -o out.onnx --passes fold-constants"
 SPLIT = "in.onnx --map map.toml -o out.onnx --passes"
 BARE = "dense.onnx --map map.toml -o out.onnx"
 INT8 = f"{BARE} --scheme full --frames frames"
+GONE = r"old\.onnx: opset 6: onnxruntime has no Add of before"
+KEPT = "is of 11: Hardmax 'pick' stays as it is: .*; -r exact writes a graph without"
 TIMED = "profile dense.onnx frames -o out.json --samples 2"
 
 COMPRESS = {
@@ -66,6 +68,12 @@ COMPRESS = {
     f"{BARE} --scheme full --ranges loud.json": (
         r"loud\.json: .*a has .*root mean square of 1e\+09; both"
     ),
+    "old.onnx -o out.onnx -r exact": GONE,
+    "old.onnx -o out.onnx -r full --frames frames": GONE,
+    "pick.onnx -o out.onnx -r full --rules paper --frames frames": KEPT,
+    "lstm.onnx -o out.onnx -r full --frames frames": (
+        "made nothing int8; 0 convolutions .*; nothing is written; -r exact writes"
+    ),
     f"{INT8} --rules int4": "no rule set 'int4'; there are safe",
     f"{INT8} --target npu": "no target 'npu'; there are tensorrt",
     f"{INT8} --method int4": "no calibration method 'int4'; ",
@@ -101,6 +109,11 @@ OTHERS = {
     "compare dense.onnx frames --outputs none": "none: no such folder",
     "compare dense.onnx frames --outputs frames": "the dump is of another graph",
     "frames vad-huge -o out": "vad-huge: no such file; models that ship",
+    "inspect old.onnx": GONE,
+    "plan old.onnx": GONE,
+    "plan pick.onnx": KEPT,
+    "compare old.onnx old.onnx frames": GONE,
+    "sensitivity old.onnx frames -o out.toml": GONE,
     "plan latin.json": r"latin\.json: not a plan",
     "inspect open.onnx --set-dim n": "write NAME=SIZE, e.g. batch=1",
     "inspect open.onnx --set-dim n=x": "write NAME=SIZE, e.g. batch=1",
@@ -176,6 +189,21 @@ OPEN = """m (float[n,4] camera) => (float[n,4] plan) {
     ["/plan_head/Sum"] t = ReduceSum(s)
     ["/plan_head/Add"] plan = Add(f, t) }"""
 
+GRAPHS = {
+    "open": OPEN,
+    "path": "m (float[4,16] camera) => (float[4,16] path) { path = Relu(camera) }",
+    "old": """<ir_version: 3, opset_import: ["" : 6]>
+m (float[4,16] camera) => (float[4,16] plan) <float[4] w = {1, 2, 3, 4}> {
+    r = Relu(camera) plan = Add<axis=0, broadcast=1>(r, w) }""",
+    "lstm": """m (float[4,16] camera) => (float[4,1,1,16] plan)
+    <int64[3] one = {4, 1, 16}, int64[3] rows = {1, 64, 16}> {
+    x = Reshape(camera, one) w = ConstantOfShape(rows)
+    plan = LSTM<hidden_size=16>(x, w, w) }""",
+}
+PICK = """<ir_version: 8, opset_import: ["" : 11]>
+m (float[4,16] camera, float[16,32] w) => (float[4,32] plan) {
+    a = MatMul(camera, w) ["pick"] plan = Hardmax<axis=1>(a) }"""
+
 
 @pytest.fixture
 def folder(dense: Path, cli: Cli) -> Path:
@@ -195,9 +223,10 @@ def folder(dense: Path, cli: Cli) -> Path:
         (dense / name).mkdir()
     manifest = json.dumps({"routes": ["a"], VERSION: ROAD_VERSION})
     (dense / "results" / "evaluation.json").write_text(manifest)
-    save_text(dense / "open.onnx", OPEN)
-    save_text(dense / "path.onnx", "m (float[4,16] camera) => (float[4,16] path)"
-              "{ path = Relu(camera) }")  # fmt: skip
+    for name, text in GRAPHS.items():
+        save_text(dense / f"{name}.onnx", text)
+    eye = np.eye(16, 32, dtype=np.float32)
+    graph.save(stored(parsed(PICK), {"w": eye}), dense / "pick.onnx")
     model = graph.load(dense / "in.onnx")
     big = np.random.default_rng(0).normal(size=(1, 4096)).astype(np.float32)
     rewrite.add_constant(model.graph, big, "w")
