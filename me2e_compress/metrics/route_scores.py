@@ -39,11 +39,7 @@ def route_score(episode: Episode) -> RouteScore:
     multiplies the completed percentage by its factor.
     """
     penalty = math.prod(infraction.factor for infraction in episode.infractions)
-    return composed_of(episode.completion_percent, penalty)
-
-
-def composed_of(route: float, penalty: float) -> RouteScore:
-    """Multiply a completion in percent by the factor of all infractions."""
+    route = episode.completion_percent
     return RouteScore(
         round(route, DIGITS),
         round(penalty, DIGITS),

@@ -14,6 +14,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from me2e_compress.errors import EvaluationError
 from me2e_compress.metrics.episode import (
+    FAILURES,
     LARGEST,
     Ending,
     Episode,
@@ -50,7 +51,6 @@ ENDINGS: Mapping[str, Ending] = MappingProxyType(
 )
 """By status. Bench2Drive repeats a route whose status is just ``Failed``,
 as after a crash."""
-CRASHES = (Ending.POLICY_FAILED, Ending.SIMULATOR_FAILED)
 
 
 class BrokenRecordError(ValueError):
@@ -80,7 +80,7 @@ class RouteRecord:
     @property
     def crashed(self) -> bool:
         """Whether the simulator or the agent broke down."""
-        return self.episode.ending in CRASHES
+        return self.episode.ending in FAILURES
 
 
 def read_record(raw: object) -> RouteRecord:
@@ -116,7 +116,7 @@ def read_record(raw: object) -> RouteRecord:
         route_length_m=record.meta.route_length,
         completion_percent=record.scores.score_route,
         ending=ending,
-        failure=record.status if ending in CRASHES else None,
+        failure=record.status if ending in FAILURES else None,
         infractions=tuple(infractions),
         frames=(),
         decisions=(),

@@ -118,15 +118,8 @@ def completion_percent(world: World) -> float:
 
     It has two digits, as in the leaderboard; only reaching the goal makes it 100.
     """
-    return _percent(world.progress_m, world.path.goal_m)
-
-
-def _percent(passed_m: float, goal_m: float) -> float:
-    return min(max(round(100.0 * passed_m / goal_m, 2), 0.0), 99.99)
-
-
-def _outside_percent(outside_m: float, passed_m: float) -> float:
-    return min(100.0, 100.0 * outside_m / max(passed_m, outside_m, 1e-9))
+    percent = round(100.0 * world.progress_m / world.path.goal_m, 2)
+    return min(max(percent, 0.0), 99.99)
 
 
 def junction_m(path: RoutePath) -> float | None:
@@ -157,7 +150,8 @@ def _infractions(world: World, ending: Ending) -> tuple[Infraction, ...]:
     left = next((e for e in world.events if e.kind is EventKind.OUTSIDE_LANES), None)
     if left is not None:
         outside_m = world.outside_distance_m
-        percent = _outside_percent(outside_m, world.progress_m)
+        passed_m = max(world.progress_m, outside_m, 1e-9)
+        percent = min(100.0, 100.0 * outside_m / passed_m)
         kind, at = InfractionKind.OUTSIDE_ROUTE_LANES, (left.time_us, left.x, left.y)
         detail = f"{outside_m:.2f} m"
         infractions.append(Infraction(kind, *at, detail=detail, percent=percent))

@@ -26,6 +26,7 @@ from me2e_compress.evaluators.highway.drivers import image_size_of
 from me2e_compress.evaluators.highway.episode_recorder import EpisodeRecorder
 from me2e_compress.evaluators.highway.observe import ObservationBuilder, road_users
 from me2e_compress.metrics.episode import Ending, Episode, InferenceRecord
+from me2e_compress.metrics.route_scores import BLOCKED_SPEED_MPS, BLOCKED_US
 from me2e_compress.simulator.camera_rig import CLEAR, CameraRig
 from me2e_compress.simulator.cameras.ground import paint_texture
 from me2e_compress.simulator.cameras.renderer import Cameras
@@ -34,8 +35,6 @@ from me2e_compress.simulator.routes import Route
 from me2e_compress.simulator.scene import Control, Ego, Scene
 from me2e_compress.simulator.world import EndReason, World
 
-BLOCKED_MPS = 0.1
-BLOCKED_US = 60_000_000
 TIMEOUT_US = 200_000_000
 """4000 ticks of 50 ms; the leaderboard's own limits are longer."""
 DEVIATION_M = 30.0
@@ -72,7 +71,7 @@ class EndingRules:
         if away_m >= DEVIATION_M or self._astray_m > ASTRAY_SHARE * world.path.goal_m:
             return Ending.DEVIATION
         # standing since when
-        if speed_mps > BLOCKED_MPS:
+        if speed_mps > BLOCKED_SPEED_MPS:
             self._stopped_at_us = None
         elif self._stopped_at_us is None:
             self._stopped_at_us = now_us
