@@ -116,16 +116,14 @@ def held_frames(study: Study, condition: Condition) -> int:
 
 
 def _logged(folder: Path) -> tuple[float, float] | None:
-    """Fit seconds per frame and per decision to the logs; None with too few logs."""
+    """Scale the seconds of frame and decision to the logs; None with too few logs."""
     rows = [
         json.loads(line)
         for log in sorted(folder.glob("results/*.log"))
         for line in log.read_text("utf-8").splitlines()
     ]
-    if len(rows) < ENOUGH:
+    usual = sum(FRAME_S * e["frames"] + DECISION_S * e["decisions"] for e in rows)
+    if len(rows) < ENOUGH or not usual:
         return None
-    from scipy.optimize import nnls  # takes a second to import
-
-    costs = np.array([(row["frames"], row["decisions"]) for row in rows], np.float64)
-    found, _ = nnls(costs, np.array([row["seconds"] for row in rows], np.float64))
-    return float(found[0]), float(found[1])
+    scale = sum(row["seconds"] for row in rows) / usual
+    return scale * FRAME_S, scale * DECISION_S
