@@ -323,9 +323,9 @@ class PairedDifference:
     def to_json(self) -> dict[str, Any]:
         """Return both estimates, all counts and the p-value."""
         return {
-            "driving_score": self.driving_score.to_json(),
-            "room_kept": self.room_kept.to_json(),
-            "success_rate": self.success_rate.to_json(),
+            "driving_score": self.driving_score,
+            "room_kept": self.room_kept,
+            "success_rate": self.success_rate,
             "routes_better": self.better,
             "routes_worse": self.worse,
             "success_gained": self.gained,

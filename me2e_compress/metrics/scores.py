@@ -1,7 +1,7 @@
 """All scores of a set of driven routes."""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from statistics import fmean
 from typing import Any
 
@@ -47,10 +47,6 @@ class SafetyScores:
     smallest_distance: Estimate
     at_fault_collisions: Estimate
 
-    def to_json(self) -> dict[str, Any]:
-        """Return one object per score."""
-        return {each.name: getattr(self, each.name).to_json() for each in fields(self)}
-
 
 @dataclass(frozen=True, slots=True)
 class Scores:
@@ -93,16 +89,15 @@ class Scores:
 
     def to_json(self) -> dict[str, Any]:
         """Return one object per score, and the number of routes."""
-        abilities = {name: each.to_json() for name, each in self.each_ability.items()}
         plain = ("driving_score", "success_rate", "efficiency", "comfort")
         return {
-            **{name: getattr(self, name).to_json() for name in plain},
-            "abilities": {**self.abilities.to_json(), "each": abilities},
+            **{name: getattr(self, name) for name in plain},
+            "abilities": {**self.abilities.to_json(), "each": self.each_ability},
             "bench2drive": {
-                "efficiency": self.bench2drive_efficiency.to_json(),
-                "smoothness": self.bench2drive_smoothness.to_json(),
+                "efficiency": self.bench2drive_efficiency,
+                "smoothness": self.bench2drive_smoothness,
             },
-            "safety": self.safety.to_json(),
+            "safety": self.safety,
             "routes": {
                 "driven": self.routes,
                 "expected": self.expected,

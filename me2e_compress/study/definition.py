@@ -148,11 +148,6 @@ class Variant:
                 "to compress, adapt or time"
             )
 
-    @property
-    def is_model(self) -> bool:
-        """Whether the driver is an ONNX file."""
-        return isinstance(driver_named(self.policy), OnnxDriver)
-
 
 @with_config(FORM)
 @dataclass(frozen=True)
@@ -395,7 +390,11 @@ class Study:
                 " and there are none (frames = FRAMES)"
             )
         # models without a trace are timed on held-out frames
-        untimed = [each for each in self.variants if each.is_model and not each.trace]
+        untimed = [
+            each
+            for each in self.variants
+            if isinstance(driver_named(each.policy), OnnxDriver) and not each.trace
+        ]
         traced = [each.name for each in self.conditions if each.traced]
         if traced and untimed and self.held_out is None:
             raise StudyError(

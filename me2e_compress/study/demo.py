@@ -48,8 +48,8 @@ def before_and_after(outcome: StudyResult) -> Table:
                 Cell(outcome.label(drive)),
                 measure_cell(variant.size_mb, ".2f"),
                 measure_cell(variant.latency_ms[50], ".1f"),
-                measure_cell(variant.fidelity.mean_m, ".3f"),
-                measure_cell(variant.fidelity.max_m, ".2f"),
+                measure_cell(variant.fidelity.plan_mean, ".3f"),
+                measure_cell(variant.fidelity.plan_max, ".2f"),
                 Cell(MISSING) if score is None else estimate_cell(score.driving_score),
                 estimate_cell(gap.driving_score, signed=True) if gap else moved,
             )
@@ -63,6 +63,7 @@ def before_and_after(outcome: StudyResult) -> Table:
 class DriveResult(Result):
     """How the driver drives before and after compression."""
 
+    keys = ("*study",)
     study: StudyResult
     ending: tuple[str, ...]
 
@@ -76,15 +77,12 @@ class DriveResult(Result):
             self.study.alerts(),
         )
 
-    def to_json(self) -> object:
-        """Return the whole study as JSON."""
-        return self.study.to_json()
-
 
 @dataclasses.dataclass(frozen=True, repr=False)
 class DemoResult(Result):
     """Of ``compress``, ``weigh``, ``compare`` and ``drive``, in this order."""
 
+    keys = ("*steps",)
     steps: Mapping[str, Result]
 
     def shown(self) -> Shown:
@@ -92,10 +90,6 @@ class DemoResult(Result):
         *_, last = self.steps.values()
         alerts = [line for each in self.steps.values() for line in each.alerts()]
         return Shown(last.headline, last.tables(), last.lines(), alerts)
-
-    def to_json(self) -> object:
-        """Return the result of each step."""
-        return {name: each.to_json() for name, each in self.steps.items()}
 
 
 def figure(result: Result) -> str:

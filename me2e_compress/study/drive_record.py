@@ -102,8 +102,8 @@ class DriveRecord:
             "scheme": self.variant,
             "condition": self.condition,
             "reason": self.reason or None,
-            "scores": self.scores.to_json() if self.scores else None,
-            "difference": self.difference.to_json() if self.difference else None,
+            "scores": self.scores,
+            "difference": self.difference,
             "routes": [
                 {
                     "route": each.route,
@@ -174,14 +174,11 @@ class Change:
 
     def to_json(self) -> dict[str, Any]:
         """Return both names and every estimate."""
-        beyond = {name: self.beyond.get(name) for name in _CHANGED}
         return {
             "drive": self.drive,
             "against": self.against,
-            **{name: getattr(self, name).to_json() for name in _CHANGED},
-            "beyond_baseline": {
-                name: each and each.to_json() for name, each in beyond.items()
-            },
+            **{name: getattr(self, name) for name in _CHANGED},
+            "beyond_baseline": {name: self.beyond.get(name) for name in _CHANGED},
         }
 
 

@@ -166,11 +166,11 @@ def _scale(study: Study, traces: Mapping[str, LatencyTrace]) -> float:
 
 @dataclass(frozen=True)
 class PlanFidelity:
-    """The plan of a variant compared with the baseline's on held-out frames."""
+    """The plan of a variant compared with the baseline's on held-out frames: m, dB."""
 
-    mean_m: Measure
-    max_m: Measure
-    plan_sqnr_db: Measure
+    plan_mean: Measure
+    plan_max: Measure
+    plan_sqnr: Measure
     frames: int = 0
 
     @classmethod
@@ -178,15 +178,6 @@ class PlanFidelity:
         """Return the result for a variant that was not compared."""
         metres = Measure(None, "m", reason)
         return cls(metres, metres, Measure(None, "dB", reason))
-
-    def to_json(self) -> dict[str, Any]:
-        """Return the three measures with their units, and the number of frames."""
-        return {
-            "plan_mean": self.mean_m.to_json(),
-            "plan_max": self.max_m.to_json(),
-            "plan_sqnr": self.plan_sqnr_db.to_json(),
-            "frames": self.frames,
-        }
 
 
 @dataclass(frozen=True)
@@ -219,9 +210,9 @@ class VariantOutcome:
             "pipeline": prepared.pipeline or None,
             "model_sha256": prepared.sha256,
             "weights": prepared.weights,
-            "size": self.size_mb.to_json(),
-            "fidelity": self.fidelity.to_json(),
-            "latency": {f"p{percent}": each.to_json() for percent, each in latencies},
+            "size": self.size_mb,
+            "fidelity": self.fidelity,
+            "latency": {f"p{percent}": each for percent, each in latencies},
         }
 
 

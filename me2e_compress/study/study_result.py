@@ -21,7 +21,7 @@ from me2e_compress.study.drive_record import (
     held_against,
 )
 from me2e_compress.study.outcome import VariantOutcome
-from me2e_compress.workflows.result import Result, Shown
+from me2e_compress.workflows.result import Result, Shown, plain
 
 SCORES = tuple(each.name for each in COLUMNS)
 MOST_ROUTES = 40
@@ -141,33 +141,34 @@ class StudyResult(Result):
             for heading, tables in sections.items()
         }
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> Any:
         """Return a document; the same study and seed give the same bytes but latencies.
 
         Latencies, and the scale derived from them, are below the keys ``latency``.
         """
         study = self.study
-        return {
+        content = {
             "title": study.title,
             "baseline": study.baseline,
             "seed": study.seed,
             "provider": PROVIDERS.text(study.provider),
             "evaluator": study.evaluator,
             "routes": dict(zip(("driven", "set"), self.coverage, strict=True)),
-            "conditions": [each.to_json() for each in study.conditions],
+            "conditions": study.conditions,
             "latency": {
                 "device_scale": self.device_scale,
                 "samples": study.timing.samples,
                 "threads": study.timing.threads,
                 **({} if self.load is None else self.load.to_json()),
             },
-            "schemes": [each.to_json() for each in self.variants],
-            "drives": [each.to_json() for each in self.drives],
-            "changes": [each.to_json() for each in self.changes],
-            "pairs": [each.to_json() for each in self.pairs],
+            "schemes": self.variants,
+            "drives": self.drives,
+            "changes": self.changes,
+            "pairs": self.pairs,
             "machine": self.machine,
-            "versions": dict(self.versions),
+            "versions": self.versions,
         }
+        return plain(content)
 
 
 def scoreboard(result: StudyResult) -> Table:
@@ -196,8 +197,8 @@ def scoreboard(result: StudyResult) -> Table:
             measure_cell(each.size_mb, ".2f"),
             measure_cell(each.latency_ms[50], ".1f"),
             measure_cell(each.latency_ms[99], ".1f"),
-            measure_cell(each.fidelity.mean_m, ".3f"),
-            measure_cell(each.fidelity.plan_sqnr_db, ".1f"),
+            measure_cell(each.fidelity.plan_mean, ".3f"),
+            measure_cell(each.fidelity.plan_sqnr, ".1f"),
         )
         for each in result.variants
     }

@@ -12,7 +12,7 @@ from me2e_compress import graph
 from me2e_compress.calibration.calibrator import Extremes
 from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.calibration.statistics import first_maker, places_of
-from me2e_compress.display import counted, number, table
+from me2e_compress.display import Table, counted, number, table
 from me2e_compress.errors import (
     EvaluationError,
     FramesError,
@@ -49,41 +49,44 @@ from me2e_compress.workflows.runtime_loss import (
 )
 
 
-@dataclasses.dataclass(frozen=True, repr=False)
-class CompareResult(Result):
-    """How close a graph stays to another.
+@dataclasses.dataclass(frozen=True)
+class Comparison:
+    """How a graph answers beside another: what `compare` says, and `compress`.
 
     `agents` is None unless the metadata ``me2e.sets`` names outputs that both graphs
     have. `liveness` is None if it was not asked for; `runtime`, what onnxruntime's
     int8 answers otherwise, if there is none to ask.
+    """
+
+    fidelity: Fidelity
+    liveness: Liveness | None
+    runtime: RuntimeLoss | None
+    agents: SetFidelity | None
+
+
+@dataclasses.dataclass(frozen=True, repr=False)
+class CompareResult(Comparison, Result):
+    """How close a graph stays to another.
+
     `slow_here` tells by file name of int8 whose form is slow on this CPU, `known` from
     where state and plan are known, `not_finite` which node makes NaN first.
     """
 
+    keys = (
+        *("*fidelity", "agents", "liveness", "runtime"),
+        *("slow_here", "known", "not_finite"),
+    )
     reference: Path
     candidate: Path
-    fidelity: Fidelity
-    liveness: Liveness | None
-    agents: SetFidelity | None = None
-    runtime: RuntimeLoss | None = None
-    slow_here: Mapping[str, str] = dataclasses.field(default_factory=dict)
-    known: str = ""
-    not_finite: tuple[str, ...] = ()
+    slow_here: Mapping[str, str]
+    known: str
+    not_finite: tuple[str, ...]
 
     def shown(self) -> Shown:
         """Return how far outputs, agents and the plan moved, and what is dead."""
-        fidelity, liveness, agents = self.fidelity, self.liveness, self.agents
-        matched = {} if agents is None else agents.sqnr_db
-        rows = [
-            (o.name, f"{matched[o.name]:.1f}", "", "matched")
-            if o.name in matched
-            else (o.name, f"{o.sqnr_db:.1f}", o.by_frame, f"{o.error:.1e}")
-            for o in fidelity.outputs
-        ]
-        rows += [(name, "removed", "", "") for name in fidelity.missing]
+        fidelity, liveness = self.fidelity, self.liveness
         title = f"Fidelity over {counted(fidelity.frames, 'frame')}"
-        columns = ("output", "SQNR dB", "by frame", "max|a-b|/max|a|")
-        outputs = table(title, columns, rows, _agents(agents))
+        outputs = outputs_table(title, fidelity, self.agents)
         faults = () if liveness is None else liveness.faults
         dead = "; ".join(faults)
         return Shown(
@@ -103,17 +106,28 @@ class CompareResult(Result):
             EvaluationError(f"{self.candidate}: {dead}") if dead else None,
         )
 
-    def to_json(self) -> object:
-        """Return the fidelity, agents, and liveness."""
-        return {
-            **dataclasses.asdict(self.fidelity),
-            "agents": self.agents,
-            "liveness": self.liveness,
-            "runtime": self.runtime,
-            "slow_here": self.slow_here,
-            "known": self.known,
-            "not_finite": self.not_finite,
-        }
+
+def outputs_table(
+    title: str,
+    fidelity: Fidelity,
+    agents: SetFidelity | None,
+    floors: Mapping[str, str] | None = None,
+) -> Table:
+    """Return the SQNR and largest error of every output; with `floors`, their words."""
+    matched, n = {} if agents is None else agents.sqnr_db, 4 + (floors is not None)
+    rows = [
+        (
+            each.name,
+            f"{matched.get(each.name, each.sqnr_db):z.1f}",
+            "matched agents" if each.name in matched else each.by_frame,
+            "" if each.name in matched else f"{each.error:.1e}",
+            *([] if floors is None else [floors.get(each.name, "above")]),
+        )
+        for each in fidelity.outputs
+    ]
+    columns = ("output", "SQNR dB", "by frame", "max|a-b|/max|a|", "floor")[:n]
+    rows += [(name, "removed", *[""] * (n - 2)) for name in fidelity.missing]
+    return table(title, columns, rows, _agents(agents))
 
 
 def _plan_moved(fidelity: Fidelity) -> str:
@@ -209,11 +223,9 @@ def compare(
         if made := worst.maker(graphs[path].model.clone(), each):
             makers.setdefault(made, f"{path.name}: {made}")
     known = "; ".join(dict.fromkeys(graphs[path].known for path in paths))
-    return CompareResult(
-        *(*paths, found.fidelity, found.liveness, found.agents, found.runtime, slow),
-        known=known,
-        not_finite=tuple(makers.values()),
-    )
+    answers = found.fidelity, found.liveness, found.runtime, found.agents
+    bad = tuple(makers.values())
+    return CompareResult(*answers, *paths, slow_here=slow, known=known, not_finite=bad)
 
 
 class _FirstBad:
@@ -247,16 +259,6 @@ class _FirstBad:
             return first_maker(model, inputs, read, probe, session.provider)
         except (GraphError, FramesError):  # it runs optimized alone
             return ""
-
-
-@dataclasses.dataclass(frozen=True)
-class Comparison:
-    """How a graph answers beside another: what `compare` says, and `compress`."""
-
-    fidelity: Fidelity
-    liveness: Liveness | None
-    runtime: RuntimeLoss | None
-    agents: SetFidelity | None
 
 
 def compared(
@@ -298,6 +300,7 @@ FRAMES = 2
 class FirstDifferenceResult(Result):
     """Where a graph begins to differ from its source."""
 
+    keys = ("*found",)
     reference: Path
     candidate: Path
     found: FirstDifference
@@ -320,10 +323,6 @@ class FirstDifferenceResult(Result):
         )
         modules = table("Modules", columns, rows, note, words=3)
         return Shown(headline_of(self.found), [modules])
-
-    def to_json(self) -> object:
-        """Return all that was compared."""
-        return self.found
 
 
 def headline_of(found: FirstDifference) -> str:

@@ -84,11 +84,6 @@ class CompressResult(Result):
     slower: str = ""
 
     @property
-    def report_path(self) -> Path:
-        """The file of the report."""
-        return beside(self.output, "report")
-
-    @property
     def weights(self) -> str:
         """What the metadata says of the graph's checkpoint; empty if nothing."""
         return self.report.model.metadata_props.get(WEIGHTS, "")
@@ -105,7 +100,8 @@ class CompressResult(Result):
         An alert says that nothing became int8, that quality is below the floor, or
         that the target refuses the graph or computes it otherwise.
         """
-        headline = f"{self.output}: {self.size}; report: {self.report_path}"
+        report = beside(self.output, "report")
+        headline = f"{self.output}: {self.size}; report: {report}"
         weights = self.weights and f"weights: {self.weights}"
         time = f"took {self.seconds:.0f} CPU s"
         measured = None if self.loss is None else self.loss.table()

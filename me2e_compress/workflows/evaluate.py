@@ -74,15 +74,16 @@ class EvaluateResult(Result):
 
     Attributes:
         policy: the policy as named, or the evaluator where that drives none.
-        late: latencies charged to decisions, against the frame time; None if none were.
+        deadlines: latencies charged to decisions, against the frame time; None if none.
         slow_here: why the policy's file is slow on this CPU, whose form is not its own.
     """
 
+    keys = ("*scores", "deadlines", "slow_here")
     policy: str
     output: Path
     scores: Scores
     pictures: tuple[Path, ...] = ()
-    late: Deadlines | None = None
+    deadlines: Deadlines | None = None
     slow_here: str | None = None
 
     def shown(self) -> Shown:
@@ -91,8 +92,8 @@ class EvaluateResult(Result):
         Alerts are the routes that ended by a failure, and a form that is slow here.
         """
         tables = [scores_table(self.policy, self.scores)]
-        if self.late is not None:
-            tables.append(deadlines_table(self.policy, self.late))
+        if self.deadlines is not None:
+            tables.append(deadlines_table(self.policy, self.deadlines))
         slow = self.slow_here and f"{self.policy}: {self.slow_here}"
         return Shown(
             f"{self.policy}: {driving_score(self.scores)}",
@@ -100,12 +101,6 @@ class EvaluateResult(Result):
             lines=(),  # the tables say everything
             alerts=filter(None, [self.scores.failed, slow]),
         )
-
-    def to_json(self) -> object:
-        """Return the scores, and the latencies charged to decisions."""
-        late = None if self.late is None else self.late.to_json()
-        slow = self.slow_here
-        return {**self.scores.to_json(), "deadlines": late, "slow_here": slow}
 
 
 def evaluate(

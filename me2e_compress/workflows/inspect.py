@@ -2,7 +2,6 @@
 
 import dataclasses
 from collections import Counter
-from collections.abc import Mapping
 from pathlib import Path
 
 import onnx_ir as ir
@@ -126,13 +125,6 @@ class InspectResult(Result):
         )
 
 
-def _with_macs(item: Item, costs: Mapping[str, Item]) -> Item:
-    """Return a module of the file with the MACs of the folded graph."""
-    cost = costs.get(item.module, item)
-    unknown = cost.unknown_macs_nodes
-    return dataclasses.replace(item, macs=cost.macs, unknown_macs_nodes=unknown)
-
-
 _SHAPES = "import-normalize,fold-constants{through_compute=false}"
 
 
@@ -157,7 +149,13 @@ def inspect(model: str | Path, options: InspectOptions | None = None) -> Inspect
     # MACs need shapes, and folded shape arithmetic
     folded = _folded(loaded, modules)
     costs = {item.module: item for item in _costs(folded, modules)}
-    items = tuple(_with_macs(item, costs) for item in items)
+    items = tuple(
+        dataclasses.replace(
+            item, macs=cost.macs, unknown_macs_nodes=cost.unknown_macs_nodes
+        )
+        for item in items
+        for cost in [costs.get(item.module, item)]
+    )
     # say what is unknown, and why
     count, fed_back, wrong = macs_counter(folded), dict[str, str](), ""
     nodes = folded.graph.all_nodes()

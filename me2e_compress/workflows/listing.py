@@ -56,6 +56,7 @@ _SENTENCE = re.compile(r"(.+?\.)(?:\s|$)")
 class ListResult(Result):
     """Names by kind, with descriptions; `closely` shows what each option means."""
 
+    keys = ("*kinds",)
     kinds: Mapping[str, tuple[Entry, ...]]
     closely: bool = False
 
@@ -82,10 +83,6 @@ class ListResult(Result):
             note = by + REGISTRIES[kind].group if kind in REGISTRIES else ""
             tables.append(table(kind, ("name", "what it is"), rows, note, words=2))
         return Shown(headline, tables, ())
-
-    def to_json(self) -> object:
-        """Return the entries by kind."""
-        return self.kinds
 
 
 def _file(path: Traversable) -> Entry:

@@ -8,8 +8,8 @@ from pathlib import Path
 import onnx_ir as ir
 
 from me2e_compress.calibration.dataset import CalibrationSet
-from me2e_compress.calibration.sample import hold_out, spread
-from me2e_compress.display import Table, counted, table
+from me2e_compress.calibration.sample import hold_out
+from me2e_compress.display import Table, counted
 from me2e_compress.errors import EvaluationError, FramesError, GraphError
 from me2e_compress.fidelity.compare import Fidelity, SetFidelity, SetTally, compare
 from me2e_compress.fidelity.floor import Floor, Shortfall, shown
@@ -26,7 +26,7 @@ from me2e_compress.runtime.providers import Provider
 from me2e_compress.runtime.session import Session
 from me2e_compress.shipped.drivers import sample_frames
 from me2e_compress.targets import TARGETS
-from me2e_compress.workflows.compare import compared
+from me2e_compress.workflows.compare import compared, outputs_table
 from me2e_compress.workflows.result import Listener
 from me2e_compress.workflows.runtime_loss import RuntimeLoss, has_int8_kernels
 
@@ -139,21 +139,8 @@ class MeasuredLoss:
             if each.discrete
         }
         said |= dict.fromkeys(below, "below")
-        matched = self._matched
-        rows = [
-            (
-                each.name,
-                f"{matched.get(each.name, each.sqnr_db):z.1f}",
-                "matched agents" if each.name in matched else each.by_frame,
-                "" if each.name in matched else f"{each.error:.1e}",
-                said.get(each.name, "above"),
-            )
-            for each in found.outputs
-        ]
-        rows += [(name, "removed", "", "", "") for name in found.missing]
-        columns = ("output", "SQNR dB", "by frame", "max|a-b|/max|a|", "floor")
         title = f"Fidelity on {counted(found.frames, 'frame')} {self.on}"
-        return table(title, columns, rows)
+        return outputs_table(title, found, self.agents, said)
 
     def record(self) -> dict[str, object]:
         """Return what the report says of it: all but the time."""

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeAlias
 
 from cyclopts import Parameter, Token
 
-from me2e_compress.errors import EvaluationError, OptionError, RecipeError
+from me2e_compress.errors import OptionError, RecipeError
 from me2e_compress.fidelity import ALIVE, SQNR_FLOOR_DB
 from me2e_compress.metrics import BUDGET_MS
 
@@ -57,12 +57,6 @@ def check_count(
         raise OptionError(f"{option} is {value}: it must be {least} or more")
     if most is not None and value > most:
         raise OptionError(f"{option} is {value}: it must be {most:,} at most")
-
-
-def check_budget(budget_ms: float) -> None:
-    """Raise EvaluationError unless the budget of a decision is a positive number."""
-    if not 0.0 < budget_ms < float("inf"):
-        raise EvaluationError(f"--budget-ms {budget_ms:g}: must be a positive number")
 
 
 def _pairs(option: str, form: str, words: Iterable[str]) -> Iterator[tuple[str, str]]:
@@ -378,7 +372,7 @@ class ProfileOptions(WriteOptions, GraphOptions):
     """what a decision may take; 20 Hz: 50"""
 
     def __post_init__(self) -> None:
-        check_budget(self.budget_ms)
+        check_number("--budget-ms", self.budget_ms)
         check_count("--threads", self.threads, most=MOST_THREADS)
         check_count("--samples", self.samples or 0, most=MOST_SAMPLES)
 

@@ -136,6 +136,7 @@ class PlanResult(Result):
         hint: what the graph lacks for more to be known, else empty.
     """
 
+    keys = ("*plan",)
     plan: QuantPlan
     hint: str = ""
 
@@ -164,10 +165,6 @@ class PlanResult(Result):
             columns = ("Concat", "tensors", "read by")
             tables.append(table("On one scale", columns, groups, words=3))
         return Shown(self.plan.headline, tables, lines)
-
-    def to_json(self) -> object:
-        """Return the plan."""
-        return dataclasses.asdict(self.plan)
 
 
 def plan(

@@ -26,7 +26,7 @@ from me2e_compress.runtime.profile import WARM_UP
 from me2e_compress.runtime.profile import profile as measure
 from me2e_compress.targets.onnxruntime import slow_here
 from me2e_compress.workflows.checks import load_map, model_path, opened, writing
-from me2e_compress.workflows.options import ProfileOptions, check_budget
+from me2e_compress.workflows.options import ProfileOptions, check_number
 from me2e_compress.workflows.result import SILENT, Listener, Result, Shown
 
 _SHOWN = 12
@@ -107,7 +107,7 @@ class ProfileResult(Result):
         load = self.trace.others
         return {
             **self.trace.to_json(),
-            "deadlines": self.deadlines.to_json(),
+            "deadlines": self.deadlines,
             "modules": shares(self.trace.modules_us),
             "operators": shares(self.operators_us),
             "energy": self.energy,
@@ -211,8 +211,9 @@ def import_profile(
     Raises:
         GraphError: The model does not exist, or the output would harm an input.
         EvaluationError: The file is missing or malformed.
+        RecipeError: The budget is not positive.
     """
-    check_budget(budget_ms)
+    check_number("--budget-ms", budget_ms)
     source, written = model_path(model), None if output is None else Path(output)
     with writing([written], (source, file), force=force):
         found = read_import(Path(file))

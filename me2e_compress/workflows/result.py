@@ -5,7 +5,7 @@ import math
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import field
 from pathlib import Path
-from typing import Literal
+from typing import Any, ClassVar, Literal
 
 from me2e_compress.display import Table
 from me2e_compress.errors import Me2eError
@@ -39,7 +39,12 @@ class Result:
     """The result of a workflow: its data, and by `shown` what is printed of them.
 
     One of a single line gives its `headline` alone.
+
+    Class attributes:
+        keys: fields that JSON holds, all by default; those of ``*name`` stand flat.
     """
+
+    keys: ClassVar[tuple[str, ...]] = ()
 
     def shown(self) -> Shown:
         """Return what is printed."""
@@ -80,8 +85,12 @@ class Result:
         return "warning" if self.alerts() else "ok"
 
     def to_json(self) -> object:
-        """Return everything, as JSON data: by default what the fields hold."""
-        return plain(self)
+        """Return everything, for `plain`: by default what the `keys` hold."""
+        content, own = dict[str, object](), _fields(self)
+        for key in self.keys or own:
+            name = key.removeprefix("*")
+            content |= {name: own[name]} if name == key else plain(own[name])
+        return content
 
     def document(self) -> dict[str, object]:
         """Return the ``--json`` document: version, status, the lines said, everything.
@@ -96,10 +105,19 @@ class Result:
         return {"schema": SCHEMA, "status": self.status, "verdict": said, **content}
 
 
-def plain(value: object) -> object:
-    """Turn dataclasses, paths, NaN and infinities into what JSON can hold."""
-    if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        return plain(dataclasses.asdict(value))
+def _fields(value: Any) -> dict[str, object]:
+    return {each.name: getattr(value, each.name) for each in dataclasses.fields(value)}
+
+
+def plain(value: object) -> Any:
+    """Turn objects, by their own `to_json` or their fields, into what JSON can hold.
+
+    Paths become strings, NaN and infinities null.
+    """
+    if (own := getattr(value, "to_json", None)) is not None:
+        return plain(own())
+    if dataclasses.is_dataclass(value):
+        return plain(_fields(value))
     if isinstance(value, Mapping):
         return {key: plain(each) for key, each in value.items()}
     if isinstance(value, (list, tuple)):

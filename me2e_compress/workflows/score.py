@@ -23,7 +23,7 @@ from me2e_compress.metrics.scores import (
     Scores,
     leaderboard_scores,
 )
-from me2e_compress.workflows.options import check_budget
+from me2e_compress.workflows.options import check_number
 from me2e_compress.workflows.result import SILENT, Listener, Result, Shown
 from me2e_compress.workflows.score_eer import EerScores, estimate_cells, score_eer
 
@@ -111,10 +111,10 @@ class RealRun:
             },
             "records": {
                 "evaluated": len(found.episodes),
-                **{name: list(each) for name, each in self._named().items()},
-                "unfinished": [str(path) for path in found.unfinished],
-                "broken": dict(found.broken),
-                "intervals_s": dict(found.off_rate),
+                **self._named(),
+                "unfinished": found.unfinished,
+                "broken": found.broken,
+                "intervals_s": found.off_rate,
             },
         }
 
@@ -192,14 +192,11 @@ class ScoreResult(Result):
             {
                 "results": name,
                 **self.real.get(name, scores).to_json(),
-                "deadlines": self.late[name].to_json() if name in self.late else None,
+                "deadlines": self.late.get(name),
             }
             for name, scores in self.scores.items()
         ]
-        return {
-            "folders": found,
-            "eer": None if self.eer is None else self.eer.to_json(),
-        }
+        return {"folders": found, "eer": self.eer}
 
 
 def score(
@@ -218,11 +215,11 @@ def score(
     runs are of.
 
     Raises:
-        EvaluationError: A folder holds no results, EER_AV cannot compare the folders,
-            or the budget is not positive.
+        EvaluationError: A folder holds no results, or EER_AV cannot compare them.
         EnergyError: A file of joules is not usable.
+        RecipeError: The budget is not positive.
     """
-    check_budget(budget_ms)
+    check_number("--budget-ms", budget_ms)
     scores, runs = dict[str, Scores](), dict[str, RealRun]()
     driven, measured = dict[str, Sequence[Episode]](), dict[str, int | None]()
     named = [Path(each) for each in results if Path(each).suffix == ".xml"]

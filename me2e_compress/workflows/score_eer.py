@@ -80,9 +80,9 @@ class EerScores:
             n: dict(zip(MEASURES, each, strict=True)) for n, each in columns.items()
         }
         return {
-            "scores": {n: each.to_json() for n, each in found.scores.items()},
+            "scores": found.scores,
             "scale": scale or None,
-            "left_out": dict(found.left_out),
+            "left_out": found.left_out,
         }
 
 

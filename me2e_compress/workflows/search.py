@@ -181,24 +181,21 @@ def search(
         trials, modules = files.trials(options, listener)
         # sizes and seconds in base units, as they are measured
         mb, ms, most_j = options.max_mb, options.max_ms, options.max_joules
-        budgets = list[Budget]()
-        if mb is not None:
-            budgets.append(
-                Budget(
-                    mb * 1e6,
-                    "bytes of weights",
-                    lambda made: float(graph.size(made).weight_bytes),
-                )
-            )
-        if ms is not None:
-            budgets.append(Budget(ms / 1e3, "s", partial(_seconds, trials)))
-        if most_j is not None:
-            budgets.append(Budget(most_j, "J", partial(_joules, trials)))
+        asked = (
+            (mb and mb * 1e6, "bytes of weights", _weight_bytes),
+            (ms and ms / 1e3, "s", partial(_seconds, trials)),
+            (most_j, "J", partial(_joules, trials)),
+        )
+        budgets = [Budget(m, unit, of) for m, unit, of in asked if m is not None]
         report = partial(listener.on_progress, "modules")
         tried = find(trials, modules, budgets, progress=report)
         written = files.write(Int8Choice(tried[-1].modules), options)
     limits = tuple((each.unit, each.limit) for each in budgets)
     return SearchResult(files.output, tried, limits, written)
+
+
+def _weight_bytes(made: ir.Model) -> float:
+    return float(graph.size(made).weight_bytes)
 
 
 def _joules(trials: Trials, made: ir.Model) -> float:
@@ -234,6 +231,7 @@ class SensitivityResult(Result):
         score: loss of the choice; None where nothing is int8.
     """
 
+    keys = ("*found",)
     output: Path
     found: Sensitivity
     choice: Int8Choice
@@ -263,10 +261,6 @@ class SensitivityResult(Result):
             lines.append(f"its loss: {loss}, limit {significant(self.limit)}")
         modules = table("Int8 module by module", columns, rows, note)
         return Shown(self.written, [modules], lines)
-
-    def to_json(self) -> object:
-        """Return what was found."""
-        return self.found
 
 
 def measure_sensitivity(

@@ -17,6 +17,8 @@ F = "dense.onnx frames --map map.toml"
         f"search {F} -o out --max-ms",
         f"search {F} -o out --max-joules",
         f"sensitivity {F} -o out --limit",
+        "profile dense.onnx frames -o out --budget-ms",
+        "score frames --budget-ms",
     ],
 )
 def test_a_number_that_is_none(cli: Cli, dense: Path, line: str, value: str) -> None:

@@ -103,12 +103,12 @@ def test_a_model_has_size_latency_and_fidelity_and_a_driver_has_none(
     assert fast.latency_ms[99].reason == "needs 100 samples, has 20"
     # fidelity is measured against the baseline
     plans = [each.fidelity for each in found.variants]
-    reasons = [each.mean_m.reason for each in plans[:2]]
+    reasons = [each.plan_mean.reason for each in plans[:2]]
     assert reasons == ["blind is not a model", "the baseline itself"]
-    assert plans[2].mean_m.value == 0.0
-    assert plans[2].plan_sqnr_db.reason == "no noise: equal to the bit"
-    assert plans[3].mean_m.value == pytest.approx(sum(range(2, 14, 2)) / 6)
-    assert plans[3].max_m.value == pytest.approx(12.0)
+    assert plans[2].plan_mean.value == 0.0
+    assert plans[2].plan_sqnr.reason == "no noise: equal to the bit"
+    assert plans[3].plan_mean.value == pytest.approx(sum(range(2, 14, 2)) / 6)
+    assert plans[3].plan_max.value == pytest.approx(12.0)
     assert plans[3].frames == 2
 
 
@@ -301,7 +301,7 @@ def test_state_and_plan_are_those_of_the_variant(
     found = run_study(asked, tmp_path / "study", Here())
 
     assert all(each.latency_ms[50].value for each in found.variants)
-    assert found.variants[1].fidelity.mean_m.value == 0.0
+    assert found.variants[1].fidelity.plan_mean.value == 0.0
     assert [len(each.routes) for each in found.drives] == [1, 1]
 
 
@@ -313,7 +313,7 @@ def test_a_plan_that_is_no_number_is_told(make: Make, tmp_path: Path) -> None:
 
     found = run_study(asked, tmp_path / "study", Here())
 
-    assert found.variants[1].fidelity.mean_m.reason == "its plan is not finite"
+    assert found.variants[1].fidelity.plan_mean.reason == "its plan is not finite"
 
 
 # Records of finished drives: what they keep, and which are not taken.

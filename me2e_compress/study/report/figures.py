@@ -183,7 +183,7 @@ def _costs(outcome: StudyResult, places: Mapping[str, float]) -> Iterator[Panel]
         return Mark(places[of.name], colour, words, measure.value)
 
     def plan(of: VariantOutcome) -> Mark:
-        mean, most = of.fidelity.mean_m, of.fidelity.max_m.value
+        mean, most = of.fidelity.plan_mean, of.fidelity.plan_max.value
         words = measure_cell(mean, ".2f").text
         if most is not None:
             words += f" (at most {number(most, '.2f')})"
