@@ -69,7 +69,6 @@ COMPRESS = {
         r"loud\.json: .*a has .*root mean square of 1e\+09; both"
     ),
     "old.onnx -o out.onnx -r exact": GONE,
-    "old.onnx -o out.onnx -r full --frames frames": GONE,
     "pick.onnx -o out.onnx -r full --rules paper --frames frames": KEPT,
     "lstm.onnx -o out.onnx -r full --frames frames": (
         "made nothing int8; 0 convolutions .*; nothing is written; -r exact writes"
