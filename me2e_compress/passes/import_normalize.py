@@ -11,6 +11,7 @@ from me2e_compress.display import counted
 from me2e_compress.graph import graphs_of, provenance
 from me2e_compress.graph.modules.assign import assign
 from me2e_compress.graph.nodes import array_of, is_plugin, nodes_in, nodes_of, opset_of
+from me2e_compress.graph.opset import OLDEST_OPSET
 from me2e_compress.graph.rewrite import add_constant, lift_constants
 from me2e_compress.graph.rewrite.raise_opset import raise_opset
 from me2e_compress.graph.shapes import static_shape
@@ -157,8 +158,6 @@ def _values(model: ir.Model) -> Iterator[ir.Value]:
         yield from node.outputs
 
 
-LEAST_OPSET = 13
-"""The first opset with scales by channel, and axes as inputs, which bodies have."""
 _FUNCTIONS_SINCE_IR = 8
 """The first ONNX IR version whose models may hold functions (onnx/docs/IR.md)."""
 
@@ -217,7 +216,7 @@ class ImportNormalize(Pass):
                     body.opset_imports[node.domain] = 1
                     changes += 1
         changes += write_products(model, self.name) + _flatten_scales(model, self.name)
-        if opset_of(model) >= LEAST_OPSET:
+        if opset_of(model) >= OLDEST_OPSET:
             changes += unpack_sequences(model, self.name)
         return PassResult(model, changes, tuple(filter(None, (raise_note, note))))
 
@@ -266,10 +265,10 @@ def with_own_domains(model: ir.Model) -> ir.Model:
 
 def _raise(model: ir.Model, by: str) -> tuple[int, str]:
     opset = opset_of(model)
-    if not 0 < opset < LEAST_OPSET:
+    if not 0 < opset < OLDEST_OPSET:
         return 0, ""
-    changes, reason = raise_opset(model, LEAST_OPSET, by)
-    became = f"opset {opset} became {LEAST_OPSET}"
+    changes, reason = raise_opset(model, OLDEST_OPSET, by)
+    became = f"opset {opset} became {OLDEST_OPSET}"
     return changes, f"opset {opset} stays: {reason}" if reason else became
 
 

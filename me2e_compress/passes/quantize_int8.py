@@ -72,9 +72,7 @@ class QuantizeInt8(Pass):
         """Plan, calibrate, and place quantizers.
 
         Raises:
-            PreconditionError: a plan quantized the graph, or its layers are operators
-                on integers; it is of opset below 13, or in float16 that its target or
-                opset has no int8 for.
+            PreconditionError: the graph is quantized, or has an opset or type without.
             FramesError: neither frames nor ranges, or they are of another graph.
         """
         if found := describe_quantized(model):

@@ -17,6 +17,7 @@ from me2e_compress.calibration.ranges import Ranges
 from me2e_compress.errors import PreconditionError, RecipeError
 from me2e_compress.graph import is_standard, opset_of
 from me2e_compress.graph.nodes import LAYOUT_OPERATORS, grid_of
+from me2e_compress.graph.opset import OLDEST_OPSET
 from me2e_compress.graph.rewrite.raise_opset import raise_opset
 from me2e_compress.graph.validity import refusal
 from me2e_compress.quantization.costs import Costs
@@ -37,9 +38,6 @@ __all__ = [
     "valid",
     "warning",
 ]
-
-MIN_OPSET = 13
-"""The first opset whose DequantizeLinear has an axis, i.e. one scale a channel."""
 
 Severity = Literal["error", "wrong", "warning"]
 SEVERITIES: tuple[Severity, ...] = get_args(Severity)
@@ -226,16 +224,15 @@ class Target(abc.ABC):
         """Check that the graph's opset and float type can be quantized.
 
         Raises:
-            PreconditionError: the opset has no scales by channel, or the graph is
-                float16, and the target lacks such kernels, or the opset float16
-                scales; the message has a remedy.
+            PreconditionError: the opset has no scales by channel, or target or opset
+                nothing for float16; the message has a remedy.
         """
-        if plan.chosen and opset_of(model) < MIN_OPSET:
-            _, keeper = raise_opset(model.clone(), MIN_OPSET, "")
+        if plan.chosen and opset_of(model) < OLDEST_OPSET:
+            _, keeper = raise_opset(model.clone(), OLDEST_OPSET, "")
             keeper = keeper or "import-normalize behind the other passes lifts it"
             raise PreconditionError(
-                f"int8 with one scale a channel needs opset {MIN_OPSET}, the graph is"
-                f" of {opset_of(model)}: {keeper}; -r exact writes a graph without int8"
+                f"int8 by channel needs opset {OLDEST_OPSET}, the graph is of"
+                f" {opset_of(model)}: {keeper}; -r exact writes a graph without int8"
             )
         types = {v.name: v.dtype for node in model.graph for v in node.outputs}
         # Float16 needs kernels, and scales of that type.

@@ -73,21 +73,18 @@ def model_path(text: str | Path, beside: Path = Path()) -> Path:
 def load_graph(path: Path) -> ir.Model:
     """Read a graph; refuse one of before opset 7 that onnxruntime cannot run.
 
-    Operators broadcast by attributes there, which onnx 1.23 converts wrongly.
+    That is the first of which it has all operators (its docs/Versioning.md); before it
+    they broadcast by attributes, which onnx 1.23 converts wrongly.
     """
     model = graph.load(path)
-    if 0 < (opset := opset_of(model)) < _FIRST_OPSET:
+    if 0 < (opset := opset_of(model)) < 7:
         used = {node.op_type for node in nodes_of(model) if is_standard(node)}
         if gone := sorted(each for each in used if not has_operator(each, opset)):
             raise GraphError(
                 f"{path}: opset {opset}: onnxruntime has no {', '.join(gone)} of before"
-                f" opset {_FIRST_OPSET}: export it again, in 13 or newer"
+                " opset 7: export it again, in 13 or newer"
             )
     return model
-
-
-_FIRST_OPSET = 7
-"""From here on onnxruntime has all operators (its docs/Versioning.md)."""
 
 
 def read_graph(
