@@ -72,19 +72,12 @@ class QuantizeInt8(Pass):
         """Plan, calibrate, and place quantizers.
 
         Raises:
-            PreconditionError: the graph is quantized, or has an opset or type without.
+            PreconditionError: a plan quantized the graph, or its layers are operators
+                on integers; or it has an opset or type without int8.
             FramesError: neither frames nor ranges, or they are of another graph.
         """
-        if found := describe_quantized(model):
-            rewrite = ", or let lower-int8 rewrite this one for onnxruntime"
-            try:  # only symmetric pairs of int8 have ranges that it could write down
-                onnxruntime.unranged(model)
-            except PreconditionError:
-                rewrite = ""
-            raise PreconditionError(
-                f"the graph is quantized already: {found}; int8 is not put on int8,"
-                f" give the float graph that it was made of{rewrite}"
-            )
+        if METADATA in model.metadata_props:
+            refuse_quantized(model)
         # Plan, and stop if there is nothing to do
         target, plan = self._runtime, self.plan(model, context)
         target.check_types(plan, model)
@@ -138,10 +131,12 @@ class QuantizeInt8(Pass):
 def refuse_quantized(model: ir.Model) -> None:
     """Raise a PreconditionError of a graph that is quantized already."""
     if already := describe_quantized(model):
-        # what is quantized while it runs has no ranges that could be written down
-        pairs = any(node.op_type == QUANTIZE for node in pairs_of(model))
         rewrite = ", or let lower-int8 rewrite this one for onnxruntime"
+        try:  # only symmetric pairs of int8 have ranges that it could write down
+            onnxruntime.unranged(model)
+        except PreconditionError:
+            rewrite = ""
         raise PreconditionError(
             f"the graph is quantized already: {already}; int8 is not put on int8,"
-            f" give the float graph that it was made of{rewrite if pairs else ''}"
+            f" give the float graph that it was made of{rewrite}"
         )

@@ -8,7 +8,7 @@ from pathlib import Path
 import onnx_ir as ir
 
 from me2e_compress.calibration.dataset import CalibrationSet
-from me2e_compress.calibration.sample import hold_out
+from me2e_compress.calibration.sample import hold_out, spread
 from me2e_compress.display import Table, counted
 from me2e_compress.errors import EvaluationError, FramesError, GraphError
 from me2e_compress.fidelity.compare import Fidelity, SetFidelity, SetTally, compare

@@ -29,7 +29,6 @@ from me2e_compress.quantization.decision import (
 from me2e_compress.quantization.rules import DEFAULT_RULES, RULE_SETS
 from me2e_compress.shipped.drivers import own_map
 from me2e_compress.targets import DEFAULT_TARGET, TARGETS
-from me2e_compress.targets.quantized import describe_quantized
 from me2e_compress.workflows.checks import (
     load_graph,
     load_map,
