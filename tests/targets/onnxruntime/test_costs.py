@@ -14,6 +14,7 @@ from me2e_compress.quantization.rules import RULE_SETS
 from me2e_compress.quantization.scheme import QuantScheme
 from me2e_compress.runtime.optimized import optimized
 from me2e_compress.targets.onnxruntime import OnnxRuntime
+from me2e_compress.targets.onnxruntime.costs import work_of
 from tests.nets import FULL, MODULES, drawn, net
 from tests.targets.onnxruntime.lowered import Feeds, feeds, measured, ran, sqnr_db
 
@@ -54,6 +55,13 @@ def test_convolutions(
 
     assert decision.dtype == dtype
     assert decision.rule == ("layer" if dtype == "int8" else "cost")
+
+
+@pytest.mark.parametrize(("read", "kind"), [(64, "int8_mac"), (66, "int8_uneven_mac")])
+def test_channels_that_are_no_multiple_of_four(read: int, kind: str) -> None:
+    text = f"c (float[1,{read},8,8] x, float[8,{read},1,1] w) => (float[1,8,8,8] y)"
+    model = net(f"{text} {{ y = Conv(x, w) }}", {"w": np.ones((8, read, 1, 1))})
+    assert (work_of(model.graph[0]) or ({}, {}))[1][kind] == 8 * 8 * 8 * read
 
 
 @pytest.mark.parametrize(
