@@ -411,10 +411,10 @@ def check_array(array: Declared | Array, value: ir.Value, where: str) -> None:
         )
 
 
-def _fits(found: tuple[int, ...], expected: ir.Shape) -> bool:
-    return len(found) == len(expected) and all(
+def _fits(shape: tuple[int, ...], expected: ir.Shape) -> bool:
+    return len(shape) == len(expected) and all(
         not isinstance(want, int) or have == want
-        for have, want in zip(found, expected, strict=True)
+        for have, want in zip(shape, expected, strict=True)
     )
 
 

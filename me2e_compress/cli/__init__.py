@@ -38,8 +38,8 @@ def run_in_order(run: Callable[[], None], again: str = "") -> int:
     except KeyboardInterrupt:
         code = INTERRUPTED
     if code in (INTERRUPTED, TERMINATED):
-        said = "; ".join(filter(None, ["interrupted", again]))
-        sys.stderr.write(f"me2e-compress: {said}\n")
+        message = "; ".join(filter(None, ["interrupted", again]))
+        sys.stderr.write(f"me2e-compress: {message}\n")
     return code
 
 
@@ -67,14 +67,14 @@ def _run(run: Callable[[], None]) -> int:
                 raise Me2eError(f"{word!a} is not UTF-8: rename the file")
         run()
     except (CycloptsError, Me2eError, OSError, ImportError) as error:
-        told = explained(error)
-        if isinstance(told, ImportError):
+        shown = explained(error)
+        if isinstance(shown, ImportError):
             raise  # of no optional package: a defect of ours, which needs its traceback
         # an error of the user's is one line, without a traceback; that of the system
         # is preceded by its file, if any
-        text = str(told)
-        if isinstance(told, OSError) and told.filename is not None and told.strerror:
-            text = f"{os.fsdecode(told.filename)}: {told.strerror}"
+        text = str(shown)
+        if isinstance(shown, OSError) and shown.filename is not None and shown.strerror:
+            text = f"{os.fsdecode(shown.filename)}: {shown.strerror}"
         line = printable(" ".join(text.split()))
         errors.print(f"me2e-compress: {line}", soft_wrap=True, markup=False)
         usage = isinstance(error, CycloptsError | OptionError) or names_former(error)

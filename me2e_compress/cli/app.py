@@ -79,8 +79,8 @@ def _with_commands() -> App:
         # ``list`` is Python's own
         home = driving if panel == "Drive" else commands
         function = getattr(home, "list_entries" if name == "list" else name)
-        said, _, _ = (inspect.getdoc(function) or "").partition("\n\nArgs:")
-        first, *rest = (" ".join(each.split()) for each in said.split("\n\n"))
+        text, _, _ = (inspect.getdoc(function) or "").partition("\n\nArgs:")
+        first, *rest = (" ".join(each.split()) for each in text.split("\n\n"))
         if name in _DRIVING and missing_module("highway"):
             first += " Needs the extra highway."
         text = "\n\n".join([first, *rest])

@@ -74,8 +74,8 @@ def listening(*, stages: bool = False) -> Iterator[Listener]:
             if stage != shown:
                 bar.reset(task)
             shown = stage
-            told = _done(done, total, what)
-            bar.update(task, description=stage, completed=done, total=total, what=told)
+            text = _done(done, total, what)
+            bar.update(task, description=stage, completed=done, total=total, what=text)
 
         yield Listener(on_progress, _warn)
 
@@ -95,20 +95,20 @@ def tell(line: str) -> None:
         errors.print(printable(line), soft_wrap=True, markup=False)
 
 
-def show(found: Result, tables: Iterable[Table] | None = None) -> None:
+def show(result: Result, tables: Iterable[Table] | None = None) -> None:
     """Print a result as tables and lines, or as one JSON document if asked to.
 
     `tables` are printed instead of the result's own.
     """
     if printing.json:
-        print_json(found.document())
+        print_json(result.document())
         return
     # tables first, so that the verdict stays in sight at the end
-    for each in found.tables() if tables is None else tables:
+    for each in result.tables() if tables is None else tables:
         print_table(each)
-    for line in found.lines():
+    for line in result.lines():
         say(line)
-    for line in found.alerts():
+    for line in result.alerts():
         console.print(Text(printable(line), "bold"), soft_wrap=True)
 
 

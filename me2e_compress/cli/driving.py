@@ -141,8 +141,8 @@ def study(
     tell(ahead.headline)
     with listening() as listener:
         engine = engine_named(running.engine, running.workers)
-        found = run_study(asked, output, engine, listener, force=writing.force)
-        files = write_study(found, output, words, force=writing.force)
-    show(found)
+        result = run_study(asked, output, engine, listener, force=writing.force)
+        files = write_study(result, output, words, force=writing.force)
+    show(result)
     if not printing.json:
         say(f"wrote {files.report}, {files.tables} and {files.record}")

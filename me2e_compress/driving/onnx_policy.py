@@ -133,18 +133,18 @@ class OnnxPolicy:
         adapter: Adapter | None = None,
         provider: Provider = CPU,
         stage: HostStage | None = None,
-        said: Mapping[str, str] | None = None,
+        metadata: Mapping[str, str] | None = None,
     ) -> Self:
         """Load a file, and run it once on zeros.
 
-        ``said`` are metadata that override the model's own.
+        ``metadata`` are metadata that override the model's own.
 
         Raises:
             EvaluationError: It cannot be run, or does not keep the contract.
         """
         try:
             session = Session(
-                path, threads=1, int8_kernels=True, provider=provider, said=said
+                path, threads=1, int8_kernels=True, provider=provider, metadata=metadata
             )
             return cls.of(session, adapter or Adapter(), stage)
         except (GraphError, FramesError, EvaluationError) as error:

@@ -92,13 +92,13 @@ class ResultsFolder:
     @property
     def measured(self) -> int | None:
         """Number of samples that latencies were drawn from, if any."""
-        found = self.made_by.get(MEASURED)
-        return found if type(found) is int and found > 0 else None
+        count = self.made_by.get(MEASURED)
+        return count if type(count) is int and count > 0 else None
 
     def episodes(self) -> dict[str, Episode]:
         """Read every driven route, in the order of the evaluation."""
-        found = {route: self._read(route) for route in self.made_by["routes"]}
-        return {route: one for route, one in found.items() if one is not None}
+        by_route = {route: self._read(route) for route in self.made_by["routes"]}
+        return {route: one for route, one in by_route.items() if one is not None}
 
     def keep(self, episode: Episode) -> None:
         """Write one route."""

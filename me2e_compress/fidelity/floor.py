@@ -46,16 +46,16 @@ class Floor:
     plan_m: float = PLAN_FLOOR_M
 
     def shortfalls(
-        self, found: Fidelity, agents: SetFidelity | None = None
+        self, fidelity: Fidelity, agents: SetFidelity | None = None
     ) -> tuple[Shortfall, ...]:
         """List what is below the floor, the worst first; sets by matched agents."""
         below = []
         matched = {} if agents is None else agents.sqnr_db
-        for each in found.outputs:
+        for each in fidelity.outputs:
             # The noise over what is allowed: above 1 is too much.
             part = ""
-            if found.plan is not None and each.name == found.plan_output:
-                value, unit = found.plan.mean_m, "m"
+            if fidelity.plan is not None and each.name == fidelity.plan_output:
+                value, unit = fidelity.plan.mean_m, "m"
                 excess = value / self.plan_m
             else:
                 value, unit = matched.get(each.name, each.sqnr_db), "dB"

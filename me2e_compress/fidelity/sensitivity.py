@@ -276,7 +276,7 @@ def _blamed(
 # Choose what stays float, and write the choice as a recipe.
 
 
-def advise(trials: Trials, found: Sensitivity, limit: float) -> Int8Choice:
+def advise(trials: Trials, sensitivity: Sensitivity, limit: float) -> Int8Choice:
     """Choose what keeps the loss within a limit, with as little in float as possible.
 
     It starts with all modules in int8. Until the measured loss is within the limit, the
@@ -287,12 +287,12 @@ def advise(trials: Trials, found: Sensitivity, limit: float) -> Int8Choice:
     """
 
     def fits(given: Sequence[_Sacrifice]) -> bool:
-        choice = _without(trials, found, given)
+        choice = _without(trials, sensitivity, given)
         return not choice.modules or trials.score(choice).loss <= limit
 
     # give up nodes and modules until the limit is kept
     order, given = list[_Sacrifice](), list[_Sacrifice]()
-    for each in found.findings:
+    for each in sensitivity.findings:
         name, own = each.module, each.score.loss
         order += [_Sacrifice(name, (node,), loss) for node, loss in each.blamed]
         order.append(_Sacrifice(name, None, own))
@@ -303,7 +303,7 @@ def advise(trials: Trials, found: Sensitivity, limit: float) -> Int8Choice:
         kept = [other for other in given if other is not last]
         if last.loss <= limit and fits(kept):
             given = kept
-    return _without(trials, found, given)
+    return _without(trials, sensitivity, given)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -316,7 +316,7 @@ class _Sacrifice:
 
 
 def _without(
-    trials: Trials, found: Sensitivity, given: Sequence[_Sacrifice]
+    trials: Trials, sensitivity: Sensitivity, given: Sequence[_Sacrifice]
 ) -> Int8Choice:
     """Return the choice of all modules but what was given up."""
     gone = {each.module for each in given if each.nodes is None}
@@ -327,10 +327,10 @@ def _without(
     # A module that gave up each of its nodes is given up.
     gone |= {
         each.module
-        for each in found.findings
+        for each in sensitivity.findings
         if len(set(names.get(each.module, ()))) >= each.nodes
     }
-    left = {each.module for each in found.findings} - gone
+    left = {each.module for each in sensitivity.findings} - gone
     floats = [name for module in names if module in left for name in names[module]]
     modules = (name for name in trials.modules.names() if name in left)
     return Int8Choice(tuple(modules), tuple(floats))

@@ -209,8 +209,8 @@ def _external_files(path: Path) -> list[Path]:
     if not _holds(path, _LOCATION):
         return []
     model = ir.load(path, format="protobuf")
-    found = [data_file(path, tensor) for tensor in external_tensors(model)]
-    return list(dict.fromkeys(found))
+    files = [data_file(path, tensor) for tensor in external_tensors(model)]
+    return list(dict.fromkeys(files))
 
 
 def _holds(path: Path, words: bytes, hasher: "hashlib._Hash | None" = None) -> bool:
@@ -218,15 +218,15 @@ def _holds(path: Path, words: bytes, hasher: "hashlib._Hash | None" = None) -> b
 
     It is read block by block: a mapped file would count as memory of this process.
     """
-    found, tail = False, b""
+    held, tail = False, b""
     for block in _blocks(path):
         if hasher is not None:
             hasher.update(block)
         seen = tail + block
-        found, tail = found or words in seen, seen[-len(words) :]
-        if found and hasher is None:
+        held, tail = held or words in seen, seen[-len(words) :]
+        if held and hasher is None:
             break
-    return found
+    return held
 
 
 def _blocks(path: Path) -> Iterator[bytes]:
@@ -298,14 +298,14 @@ def data_file(model: Path, tensor: ir.ExternalTensor) -> Path:
             f"{model}: the data of {tensor.name} lie at {location!r}, which is not a"
             " path within the model's folder: not read"
         )
-    found = Path(os.path.realpath(model.parent / location))
+    resolved = Path(os.path.realpath(model.parent / location))
     homes = (os.path.realpath(model.parent), Path(os.path.realpath(model)).parent)
-    if not any(found.is_relative_to(each) for each in homes):
+    if not any(resolved.is_relative_to(each) for each in homes):
         raise GraphError(
-            f"{model}: the data of {tensor.name} lie at {location!r} = {found}, outside"
-            " the model's folder: not read"
+            f"{model}: the data of {tensor.name} lie at {location!r} = {resolved},"
+            " outside the model's folder: not read"
         )
-    return found
+    return resolved
 
 
 def _places(
@@ -342,17 +342,17 @@ def _anchored(tensor: ir.ExternalTensor, path: Path) -> ir.ExternalTensor:
     if not data.is_file():
         missing = path.parent / str(tensor.location)
         raise GraphError(f"{path}: its weights file {missing} is missing")
-    found = data.stat()
+    status = data.stat()
     end = (tensor.offset or 0) + max(tensor.length or 0, tensor.nbytes)
-    if found.st_size < end:
+    if status.st_size < end:
         raise GraphError(
             f"{path}: {data} is cut short: {tensor.name} ends at byte {end},"
-            f" the file at {found.st_size}"
+            f" the file at {status.st_size}"
         )
-    if found.st_nlink > 1:  # what onnx and onnx-ir refuse to read
+    if status.st_nlink > 1:  # what onnx and onnx-ir refuse to read
         raise GraphError(
             f"{path}: the data of {tensor.name} lie in {data}, a file with"
-            f" {found.st_nlink} hard links, which onnx refuses: copy it"
+            f" {status.st_nlink} hard links, which onnx refuses: copy it"
         )
     return ir.ExternalTensor(
         data.name,

@@ -83,13 +83,13 @@ class PluginKnowledge(Protocol):
 def knowledge() -> PluginKnowledge:
     """Return what the room of the fused operators says.
 
-    That room stands above this one, and is found by its name, as registries find
+    That room stands above this one, and is plugins by its name, as registries find
     their entries; a graph without plugins never imports it.
     """
-    found: PluginKnowledge = pkgutil.resolve_name(
+    plugins: PluginKnowledge = pkgutil.resolve_name(
         "me2e_compress.operators.replace:DialectKnowledge"
     )()
-    return found
+    return plugins
 
 
 INLINE_BYTES = 1024

@@ -223,11 +223,11 @@ def ttc_exposure(episode: Episode) -> Measure:
 
     This is the time exposed (TET, Minderhoud and Bovy 2001) over the time driven.
     """
-    found = episode.conflicts
-    if found is None or not found.ttc_s:
+    conflicts = episode.conflicts
+    if conflicts is None or not conflicts.ttc_s:
         return Measure(None, "%", NOT_RECORDED)
-    exposed = sum(ttc is not None and ttc < TTC_CRITICAL_S for ttc in found.ttc_s)
-    return Measure(100.0 * exposed / len(found.ttc_s), "%")
+    exposed = sum(ttc is not None and ttc < TTC_CRITICAL_S for ttc in conflicts.ttc_s)
+    return Measure(100.0 * exposed / len(conflicts.ttc_s), "%")
 
 
 def room_kept(episode: Episode) -> Measure:

@@ -153,8 +153,8 @@ class RouteSummary:
             *("smallest_ttc", "smallest_pet", "smallest_distance"),
             *("bench2drive_efficiency", "bench2drive_smoothness"),
         )
-        found = {name: getattr(self, name) for name in measured}
-        known = {name: each for name, each in found.items() if each is not None}
+        values = {name: getattr(self, name) for name in measured}
+        known = {name: each for name, each in values.items() if each is not None}
         return replace(self, **{n: round(each, DIGITS) for n, each in known.items()})
 
 
@@ -365,19 +365,19 @@ def _estimate(values: RouteValues, seed: int) -> Estimate:
 
     The interval over types drawn anew is at least as wide as that over these types.
     """
-    found = values.mean(seed)
-    if found.value is None or found.low is None or found.high is None:
-        return found
+    mean = values.mean(seed)
+    if mean.value is None or mean.low is None or mean.high is None:
+        return mean
     # widen the interval over these types
-    least, most = unseen_interval(found.value, found.n, values.bounds)
-    low = found.low if least is None else min(least, found.low)
-    high = found.high if most is None else max(most, found.high)
+    least, most = unseen_interval(mean.value, mean.n, values.bounds)
+    low = mean.low if least is None else min(least, mean.low)
+    high = mean.high if most is None else max(most, mean.high)
     # the interval over new types must contain it
-    if found.anew_low is None or found.anew_high is None:
-        return dataclasses.replace(found, low=low, high=high)
+    if mean.anew_low is None or mean.anew_high is None:
+        return dataclasses.replace(mean, low=low, high=high)
     return dataclasses.replace(
-        found, low=low, high=high,
-        anew_low=min(low, found.anew_low), anew_high=max(high, found.anew_high),
+        mean, low=low, high=high,
+        anew_low=min(low, mean.anew_low), anew_high=max(high, mean.anew_high),
     )  # fmt: skip
 
 
@@ -388,8 +388,8 @@ def holm(p_values: Sequence[float]) -> tuple[float, ...]:
     result is at least as large as the one before, and at most 1.
     """
     order = sorted(range(len(p_values)), key=lambda i: p_values[i])
-    found, least = [1.0] * len(p_values), 0.0
+    corrected, least = [1.0] * len(p_values), 0.0
     for rank, i in enumerate(order):
         least = max(least, min(1.0, p_values[i] * (len(p_values) - rank)))
-        found[i] = least
-    return tuple(found)
+        corrected[i] = least
+    return tuple(corrected)

@@ -171,10 +171,10 @@ def _over(
     seed: int,
     bounds: Bounds | None = None,
 ) -> Estimate:
-    found = [(metric(episode), episode.scenario) for episode in episodes]
-    known = [(each.value, kind) for each, kind in found if each.value is not None]
+    measured = [(metric(episode), episode.scenario) for episode in episodes]
+    known = [(each.value, kind) for each, kind in measured if each.value is not None]
     if not known:
-        reason = found[0][0].reason if found else "no route was driven"
+        reason = measured[0][0].reason if measured else "no route was driven"
         return Estimate.missing(unit, reason)
     values, types = zip(*known, strict=True)
     return mean_estimate(values, types, unit, seed, bounds)
@@ -186,9 +186,9 @@ def _rate(outcomes: Sequence[bool], types: Sequence[str], seed: int) -> Estimate
     if n == 0:
         return Estimate.missing("%", "no such route was driven")
     percents = [100.0 * outcome for outcome in outcomes]
-    found = mean_estimate(percents, types, "%", seed, PERCENT)
+    mean = mean_estimate(percents, types, "%", seed, PERCENT)
     low, high = binomial_interval(good, n)
-    return replace(found, low=low, high=high)
+    return replace(mean, low=low, high=high)
 
 
 def _abilities(

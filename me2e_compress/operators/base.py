@@ -214,8 +214,8 @@ def score_inputs() -> Mapping[str, int]:
 
 def int8_inputs(node: ir.Node) -> tuple[int, ...]:
     """Return the inputs of a fused node that may be int8."""
-    found = find(node) if node.op_type in int8_op_types() else None
-    return () if found is None else found[0].int8_inputs
+    plugin = find(node) if node.op_type in int8_op_types() else None
+    return () if plugin is None else plugin[0].int8_inputs
 
 
 @functools.cache

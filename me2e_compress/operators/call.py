@@ -261,8 +261,8 @@ def _infer(node: ir.Node, opset: int) -> None:
             value.type = ir.TensorType(ir.DataType.from_numpy(known.dtype))
             value.shape = ir.Shape(known.shape)
     try:
-        found = infer_node(node, opset, known=_whole)
+        inferred = infer_node(node, opset, known=_whole)
     except REFUSALS:
         return
-    for value, known_of in found.items():
+    for value, known_of in inferred.items():
         value.type, value.shape = known_of

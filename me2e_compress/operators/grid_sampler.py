@@ -50,7 +50,7 @@ def grid_sample_array(inputs: Arrays, attributes: Attributes) -> NdArray:
     ]
     total = np.zeros((batch, channels, *grid.shape[1:-1]))
     first = np.arange(batch).reshape(batch, *(1 for _ in sizes))
-    # Add all combinations of neighbours
+    # Add all combinations of around
     for near in itertools.product(*axes):
         index = np.zeros(grid.shape[:-1], np.int64)
         share, step = np.ones(grid.shape[:-1]), 1
@@ -73,14 +73,14 @@ def _nearby(
     part = pixel - low
     # Neighbours and their shares
     if mode == _NEAREST:
-        found = [(np.round(pixel), np.ones_like(pixel))]
+        around = [(np.round(pixel), np.ones_like(pixel))]
     elif mode == _BILINEAR:
-        found = [(low, 1 - part), (low + 1, part)]
+        around = [(low, 1 - part), (low + 1, part)]
     else:
-        found = [(low + step, _cubic(np.abs(part - step))) for step in (-1, 0, 1, 2)]
-    # Bicubic neighbours are padded one by one
+        around = [(low + step, _cubic(np.abs(part - step))) for step in (-1, 0, 1, 2)]
+    # Bicubic around are padded one by one
     result = []
-    for place, share in found:
+    for place, share in around:
         edge = _looked_up(place, size, options) if mode == _BICUBIC else place
         kept = edge.clip(0, size - 1)
         result.append((kept.astype(np.int64), np.where(kept == edge, share, 0)))
@@ -228,7 +228,7 @@ class GridSampler2D(Operator):
         return grid_sample_array(inputs, attributes)
 
     def macs(self, shapes: Sequence[Dims | None], attributes: Attributes) -> int | None:
-        """Count the neighbours of each element: 2, 1 or 4 along each axis."""
+        """Count the around of each element: 2, 1 or 4 along each axis."""
         mode = number(attributes, "interpolation_mode")
         whole = super().macs(shapes, attributes)
         if whole is None:

@@ -171,11 +171,11 @@ def set_output(node: ir.Node, operator: Operator, dialect: Dialect) -> bool:
     # Merge the inferred dimensions into the known ones
     shape = operator.output_shape(shapes, attributes)
     result, known = node.outputs[0], False
-    if shape is not None and None in (found := open_shape(result) or (None,)):
+    if shape is not None and None in (inferred := open_shape(result) or (None,)):
         own = dialect.shape_from_own(shape)
-        merged = [a if a is not None else b for a, b in zip(found, own, strict=False)]
+        merged = [b if a is None else a for a, b in zip(inferred, own, strict=False)]
         dims = own if result.shape is None else merged
-        if len(dims) == len(own) and (result.shape is None or tuple(dims) != found):
+        if len(dims) == len(own) and (result.shape is None or tuple(dims) != inferred):
             result.shape, known = ir.Shape(list(dims)), True
     # The type follows from the inputs
     kind = dialect.output_type(node.inputs)
@@ -201,12 +201,12 @@ def hold_constants(function: ir.Function) -> None:
 def _found(
     node: ir.Node, known: tuple[Operator, Dialect] | None
 ) -> tuple[Operator, Dialect]:
-    found = find(node) if known is None else known
-    if found is None:
+    operator = find(node) if known is None else known
+    if operator is None:
         raise GraphError(f"node {node.name}: {node.op_type} is no fused operator")
     if read := [value.name for value in node.outputs[1:] if is_read(value)]:
         raise PreconditionError(f"node {node.name}: it has no output {read[0]}")
-    return found
+    return operator
 
 
 def _own_call(call: FusedCall, dialect: Dialect) -> tuple[Values, Attributes]:
@@ -224,19 +224,21 @@ class DialectKnowledge:
 
     def infer(self, node: ir.Node) -> bool:
         """Write the type and shape of a node's output; return whether any is new."""
-        found = find(node)
+        operator = find(node)
         try:
-            if found is not None:
-                found[1].check(node)
-                return set_output(node, *found)
+            if operator is not None:
+                operator[1].check(node)
+                return set_output(node, *operator)
         except PreconditionError:
             pass
         return False
 
     def macs(self, node: ir.Node) -> int | None:
         """Count a node's multiply-accumulates, if known."""
-        found = find(node)
+        operator = find(node)
         try:
-            return None if found is None else found[0].cost(node, found[1]).macs
+            return (
+                None if operator is None else operator[0].cost(node, operator[1]).macs
+            )
         except PreconditionError:
             return None

@@ -104,11 +104,11 @@ def _has_domain(node: ir.Node) -> bool:
 
 def _alike(calls: Sequence[FusedNode]) -> list[list[FusedNode]]:
     """Group calls that agree in attributes and number of inputs."""
-    found: dict[tuple[object, ...], list[FusedNode]] = {}
+    groups: dict[tuple[object, ...], list[FusedNode]] = {}
     for each in calls:
-        said = sorted((n, str(a.value)) for n, a in each.node.attributes.items())
-        found.setdefault((len(each.node.inputs), *said), []).append(each)
-    return list(found.values())
+        options = sorted((n, str(a.value)) for n, a in each.node.attributes.items())
+        groups.setdefault((len(each.node.inputs), *options), []).append(each)
+    return list(groups.values())
 
 
 def _overload(calls: Sequence[FusedNode], model: ir.Model) -> None:

@@ -49,10 +49,10 @@ class _Product:
     @classmethod
     def of(cls, equation: str) -> "_Product | None":
         """Read an equation; None where it is no product of two matrices."""
-        found = _TWO_OPERANDS.fullmatch(equation.replace(" ", ""))
-        if found is None:
+        match = _TWO_OPERANDS.fullmatch(equation.replace(" ", ""))
+        if match is None:
             return None
-        left, right, out = found.groups()
+        left, right, out = match.groups()
         if any(len(set(labels)) < len(labels) for labels in (left, right, out)):
             return None
         batch = "".join(x for x in out if x in left and x in right)

@@ -93,19 +93,19 @@ def find_geometry(
             walk.sources[value] = source
     for node in model.graph if walk.sources else ():
         walk.enter(node)
-    return walk.found
+    return walk.reasons
 
 
 class _GeometryWalk:
     """Geometry on its way through a graph.
 
-    ``sources`` are those of the values that are geometry, ``found`` the products that
+    ``sources`` are those of the values that are geometry, ``reasons`` the products that
     it went through.
     """
 
     def __init__(self, constants: Collection[ir.Value]) -> None:
         self.sources: dict[ir.Value, _Source] = {}
-        self.found: dict[ir.Node, str] = {}
+        self.reasons: dict[ir.Node, str] = {}
         self._constants = constants
         self._learned: set[ir.Value] = set()
         self._inverses = op_types("inverse")
@@ -121,7 +121,7 @@ class _GeometryWalk:
         shape = open_shape(node.outputs[0])
         goes_on = False
         if met and product:
-            self.found[node] = f"multiplies what comes from the input {met[0].name}"
+            self.reasons[node] = f"multiplies what comes from the input {met[0].name}"
             goes_on = self._passes(node)
         elif met and (node.op_type in _ARITHMETIC or node.op_type in self._inverses):
             # arithmetic with learned values: few numbers are still points

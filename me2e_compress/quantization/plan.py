@@ -267,7 +267,7 @@ def _residuals(
     for node in graph:
         below = 1 + max((depth.get(each, 0) for each in node.inputs), default=0)
         depth.update(dict.fromkeys(node.outputs, below))
-    found: dict[ir.Node, Decision] = {}
+    decisions: dict[ir.Node, Decision] = {}
     for node in graph:
         if node.op_type != "Add" or not is_standard(node):
             continue
@@ -283,12 +283,12 @@ def _residuals(
         main = max(fused, key=lambda at: depth.get(node.inputs[at], 0))
         pin = pins.get(node)
         if pin is not None and pin.dtype == FLOAT:
-            found[node] = dataclasses.replace(
+            decisions[node] = dataclasses.replace(
                 decided[node], rule="override", reason=pin.why
             )
             continue
         names = ["" if each is None else each.name for each in node.inputs]
-        found[node] = dataclasses.replace(
+        decisions[node] = dataclasses.replace(
             decided[node],
             dtype=INT8,
             rule=RESIDUAL,
@@ -296,7 +296,7 @@ def _residuals(
             f" residual branch {names[1 - main]} is read as int8",
             activations=(1 - main,),
         )
-    return found
+    return decisions
 
 
 def _ends_convolution(

@@ -234,8 +234,8 @@ class Registry(Generic[T]):
             raise self.error(f"{what} does not define {lacks}")
         if getattr(cls, "name", None) != entry.name:
             raise self.error(f"{what} calls itself {getattr(cls, 'name', None)!r}")
-        found: type[T] = cls
-        return found
+        built: type[T] = cls
+        return built
 
 
 def fields_of(cls: type) -> tuple["dataclasses.Field[Any]", ...]:
@@ -366,9 +366,9 @@ def options_of(cls: type) -> tuple[Option, ...]:
 
 def _docs(cls: type) -> Mapping[str, str]:
     """Return what the section Attributes (or Args) says, by field; a base's, too."""
-    found = dict[str, str]()
+    docs = dict[str, str]()
     for each in reversed(cls.__mro__):
         section = _SECTION.search(inspect.cleandoc(each.__doc__ or "") + "\n")
         options = [] if section is None else _OPTION.findall(section.group(1))
-        found |= {name: " ".join(text.split()) for name, text in options}
-    return found
+        docs |= {name: " ".join(text.split()) for name, text in options}
+    return docs

@@ -63,15 +63,15 @@ def write_float_products(where: ir.Graph) -> int:
     Result:  y = MatMulIntegerToFloat(Reshape(x), w, scale of x, scales of w,
                  zero point of x, zero points of w, b)                   b float32 [N]
     """
-    found = [each for node in where if (each := _product(node)) is not None]
+    products = [each for node in where if (each := _product(node)) is not None]
     names = rewrite.value_names(where)
     opset = where.opset_imports[""]
-    for each in found:
+    for each in products:
         _write(each, FusedCall(each.gemm, opset=opset, by="session", names=names))
-    if found:
+    if products:
         where.opset_imports.setdefault(DOMAIN, 1)
         rewrite.remove_dead(where)
-    return len(found)
+    return len(products)
 
 
 def _write(product: _Product, call: FusedCall) -> None:

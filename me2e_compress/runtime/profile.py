@@ -26,19 +26,19 @@ def profile(
     warm_up: int = WARM_UP,
     threads: int = 1,
     provider: Provider = CPU,
-    said: Mapping[str, str] | None = None,
+    metadata: Mapping[str, str] | None = None,
     on_sample: Callable[[int, int], None] = lambda done, total: None,
 ) -> LatencyTrace:
     """Measure the latency of a model on every frame, one at a time.
 
     Recurrent state is fed forward and reset where scenes begin; reading a frame is not
     counted. The recording is repeated as often as needed; by default there is one
-    sample a frame. The closed loop uses one thread. ``said`` is metadata that overrides
+    sample a frame. The closed loop uses one thread. ``metadata`` overrides
     the model's own; ``on_sample`` is called with samples done and all samples.
     """
     wanted = len(frames) if samples is None else samples
     check_work(wanted, warm_up, frames)
-    session = TimedSession(model, threads=threads, provider=provider, said=said)
+    session = TimedSession(model, threads=threads, provider=provider, metadata=metadata)
     # Warm up and measure in one replay of the repeated recording.
     endless = chain.from_iterable(repeat(frames))
     for done, _ in enumerate(islice(replay(session, endless), warm_up + wanted), 1):
@@ -76,10 +76,14 @@ class TimedSession(Session):
         *,
         threads: int,
         provider: Provider = CPU,
-        said: Mapping[str, str] | None = None,
+        metadata: Mapping[str, str] | None = None,
     ) -> None:
         super().__init__(
-            model, threads=threads, int8_kernels=True, provider=provider, said=said
+            model,
+            threads=threads,
+            int8_kernels=True,
+            provider=provider,
+            metadata=metadata,
         )
         self.taken_us = list[int]()
 
@@ -123,20 +127,23 @@ def record_traces(
     warm_up: int = WARM_UP,
     threads: int = 1,
     provider: Provider = CPU,
-    said: Mapping[str, Mapping[str, str]] | None = None,
+    metadata: Mapping[str, Mapping[str, str]] | None = None,
     on_sample: Callable[[int, int, str], None] = lambda done, total, name: None,
 ) -> dict[str, LatencyTrace]:
     """Record the latency of models, each warm, in alternating blocks.
 
     Recurrent state is fed forward and reset where scenes begin; the recording is
-    repeated as often as needed. ``models`` has ONNX files, ``said`` metadata of them;
+    repeated as often as needed. ``models`` has ONNX files, ``metadata`` that of them;
     ``samples`` and ``warm_up`` count for each model; ``on_sample`` is called with
     samples done, all samples and the model's name.
     """
     check_work(samples, warm_up, frames)
     sessions = {
         name: TimedSession(
-            path, threads=threads, provider=provider, said=(said or {}).get(name)
+            path,
+            threads=threads,
+            provider=provider,
+            metadata=(metadata or {}).get(name),
         )
         for name, path in models.items()
     }

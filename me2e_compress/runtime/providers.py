@@ -241,11 +241,11 @@ class TensorRtRtxProvider(Provider):
             ort.register_execution_provider_library(
                 self.native, module.get_library_path()
             )
-        found = [each for each in ort.get_ep_devices() if each.ep_name == self.native]
-        if not found:
+        devices = [each for each in ort.get_ep_devices() if each.ep_name == self.native]
+        if not devices:
             raise ProviderError(f"provider {self.name}: there is no RTX GPU here")
         cache = {} if self.cache is None else {"nv_runtime_cache_path": str(self.cache)}
-        options.add_provider_for_devices(found[:1], cache)
+        options.add_provider_for_devices(devices[:1], cache)
 
     def chain(self) -> None:
         """Return None: the options of the session name its device."""
@@ -286,7 +286,7 @@ def provider_named(text: str, plugins: Sequence[Path] = ()) -> Provider:
     Raises:
         ProviderError: no such provider, option or library, or it is not installed.
     """
-    found = PROVIDERS.parse(text)
-    found = dataclasses.replace(found, plugins=(*found.plugins, *plugins))
-    found.check()
-    return found
+    provider = PROVIDERS.parse(text)
+    provider = dataclasses.replace(provider, plugins=(*provider.plugins, *plugins))
+    provider.check()
+    return provider

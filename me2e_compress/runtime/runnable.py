@@ -253,8 +253,8 @@ def _endless(nodes: Iterable[ir.Node], rounds: float) -> ir.Node | None:
         if inside > MOST_ROUNDS:
             return node
         for body in bodies:
-            if (found := _endless(body, inside)) is not None:
-                return found
+            if (inner := _endless(body, inside)) is not None:
+                return inner
     return None
 
 

@@ -214,15 +214,15 @@ def _opened(
     provider: Provider,
     left_out: Sequence[str],
 ) -> ort.InferenceSession:
-    found = ort.InferenceSession(
+    session = ort.InferenceSession(
         source,
         options,
         providers=provider.chain(),
         disabled_optimizers=list(left_out),
         enable_fallback=False,  # to another provider, with a print
     )
-    provider.confirm(found.get_providers())
-    return found
+    provider.confirm(session.get_providers())
+    return session
 
 
 # Sessions that run one graph, and the replay of recordings.
@@ -264,7 +264,7 @@ class Session:
             weights beside it; it fits this machine's kernels only.
         provider: execution provider, and the libraries of operators it knows.
         profiled: a folder for the profile that :meth:`end_profile` writes.
-        said: metadata that overrides the model's own.
+        metadata: what overrides the model's own.
 
     Raises:
         GraphError: onnxruntime cannot run this graph; the message names the operator.
@@ -284,7 +284,7 @@ class Session:
         rewritten: Path | None = None,
         provider: Provider = CPU,
         profiled: Path | None = None,
-        said: Mapping[str, str] | None = None,
+        metadata: Mapping[str, str] | None = None,
     ) -> None:
         options = ort.SessionOptions()
         provider.attach(options)
@@ -323,10 +323,10 @@ class Session:
         try:
             self.inputs = _ports(self._ort.get_inputs())
             self.outputs = _ports(self._ort.get_outputs())
-            metadata: dict[str, str] = self._ort.get_modelmeta().custom_metadata_map
+            stored: dict[str, str] = self._ort.get_modelmeta().custom_metadata_map
         except UnicodeDecodeError as error:
             raise GraphError(f"a name in the graph is not UTF-8: {error}") from error
-        self.metadata = {**metadata, **(said or {})}
+        self.metadata = {**stored, **(metadata or {})}
         self.recurrent = recurrence(self.metadata, self.inputs, self.outputs)
 
     def first_state(self, held: Mapping[str, Array]) -> dict[str, Array]:

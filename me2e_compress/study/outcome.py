@@ -132,7 +132,7 @@ def _measured(
     traces = record_traces(
         {each.variant.name: each.model for each in timed if each.model is not None},
         frames,
-        said={each.variant.name: each.said for each in timed},
+        metadata={each.variant.name: each.metadata for each in timed},
         samples=timing.samples,
         threads=timing.threads,
         provider=study.provider,
@@ -239,10 +239,10 @@ def judge(
     recording = CalibrationSet(study.held_out)
     stage = f"fidelity of {prepared.variant.name}"
     left, right = (
-        Session(path, provider=study.provider, said=said)
-        for path, said in (
-            (baseline.model, baseline.said),
-            (prepared.model, prepared.said),
+        Session(path, provider=study.provider, metadata=metadata)
+        for path, metadata in (
+            (baseline.model, baseline.metadata),
+            (prepared.model, prepared.metadata),
         )
     )
 

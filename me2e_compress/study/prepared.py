@@ -40,7 +40,7 @@ class PreparedVariant:
         failure: Why there is no model that can drive; empty if there is one.
         weights: Origin of the weights in a line, such as a checkpoint; empty if
             unknown.
-        said: What adapter and map state of plan and state, as metadata.
+        metadata: What adapter and map state of plan and state, as metadata.
         known: Which inputs are state and which output is the plan, and from where.
     """
 
@@ -53,7 +53,7 @@ class PreparedVariant:
     size_bytes: int | None = None
     failure: str = ""
     weights: str = ""
-    said: Mapping[str, str] = field(default_factory=dict)
+    metadata: Mapping[str, str] = field(default_factory=dict)
     known: str = ""
 
 
@@ -101,14 +101,16 @@ def prepare_variant(
         origin = _reported_beside(model) or origin
     loaded = graph.load(model)
     weights = loaded.metadata_props.get(WEIGHTS, "")
-    said, known = state_and_plan(loaded, model, variant.adapter, variant.module_map, {})
+    metadata, known = state_and_plan(
+        loaded, model, variant.adapter, variant.module_map, {}
+    )
     if slow := slow_here(loaded, study.provider):
         listener.on_warning(f"variant {variant.name}: {slow}")
     size = graph.file_bytes(model)
     return PreparedVariant(
         *(variant, driver, model, *origin, sha256, size),
         weights=weights,
-        said=said,
+        metadata=metadata,
         known=known,
     )
 

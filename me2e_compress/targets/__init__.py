@@ -82,9 +82,9 @@ def valid(model: ir.Model) -> Iterator[LintFinding]:
         yield error("onnx", None, f"not valid ONNX: {reason}")
 
 
-def worst_first(found: Iterable[LintFinding]) -> tuple[LintFinding, ...]:
+def worst_first(findings: Iterable[LintFinding]) -> tuple[LintFinding, ...]:
     """Sort findings by their severity."""
-    return tuple(sorted(found, key=lambda each: SEVERITIES.index(each.severity)))
+    return tuple(sorted(findings, key=lambda each: SEVERITIES.index(each.severity)))
 
 
 def of_opset(model: ir.Model) -> Iterator[LintFinding]:
@@ -266,8 +266,8 @@ class Target(abc.ABC):
         copy = model.clone()
         copy.meta.update(model.meta)  # what the file is, beside what was read of it
         graph.infer_shapes(copy)
-        found = [finding for rule in self.lint_rules() for finding in rule(copy)]
-        return worst_first(found)
+        findings = [finding for rule in self.lint_rules() for finding in rule(copy)]
+        return worst_first(findings)
 
     def read_back(
         self, model: ir.Model, provider: Provider = CPU

@@ -184,9 +184,9 @@ def _excess(error: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
     sign = np.sign(total)
     order = np.argsort(-error * sign, axis=-1, kind="stable")
     first = np.arange(error.shape[-1]) < np.rint(np.abs(total))
-    found = np.empty_like(error)
-    np.put_along_axis(found, order, np.where(first, sign, 0.0), -1)
-    return found
+    excess = np.empty_like(error)
+    np.put_along_axis(excess, order, np.where(first, sign, 0.0), -1)
+    return excess
 
 
 def _quantize(

@@ -96,8 +96,8 @@ def read_graph(
     """
     model = load_graph(path)
     adapted(model, adapter, module_map or own_map(path))
-    if said := read_as(model):
-        listener.on_warning(f"{path}: {said}")
+    if change := read_as(model):
+        listener.on_warning(f"{path}: {change}")
     if hint := shortcomings(model):
         listener.on_warning(f"{path}: {hint}")
     return model
@@ -408,14 +408,14 @@ class OpenedGraph:
     """A graph that takes the frames, and opened in another process.
 
     Attributes:
-        said: what adapter, map and another file state of state and plan: metadata of
-            the model, and for sessions of the file, which lacks them.
+        metadata: what adapter, map and another file state of state and plan: that of
+            the model, and for sessions of the file, which lacks it.
         known: which inputs are state and which output is the plan, and from where that
             is known, in a line; empty if neither is.
     """
 
     model: ir.Model
-    said: Mapping[str, str]
+    metadata: Mapping[str, str]
     known: str
 
 

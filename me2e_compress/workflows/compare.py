@@ -49,7 +49,7 @@ from me2e_compress.workflows.runtime_loss import (
 )
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, repr=False)
 class Comparison:
     """How a graph answers beside another: what `compare` says, and `compress`.
 
@@ -133,24 +133,24 @@ def outputs_table(
 def _plan_moved(fidelity: Fidelity) -> str:
     if fidelity.plan is None:
         return f"plan displacement: not measured ({fidelity.plan_reason})"
-    said = (
+    line = (
         f"plan displacement: mean {fidelity.plan.mean_m:.4f} m, largest"
         f" {fidelity.plan.max_m:.4f} m over {counted(fidelity.frames, 'frame')}"
     )
     if fidelity.same_choice is None:
-        return said
-    return f"{said}; the same candidate on {fidelity.same_choice:.1%} of them"
+        return line
+    return f"{line}; the same candidate on {fidelity.same_choice:.1%} of them"
 
 
-def _agents(found: SetFidelity | None) -> str:
+def _agents(sets: SetFidelity | None) -> str:
     """Describe how outputs that are sets are compared; empty without any."""
-    if found is None:
+    if sets is None:
         return ""
-    agents = counted(found.agents, "agent")
+    agents = counted(sets.agents, "agent")
     return (
         "matched: agents with a score of 0.5 or more, each against the nearest. The"
         f" first graph has {agents} of such scores, the second one within 2 m of"
-        f" {found.matched} of them."
+        f" {sets.matched} of them."
     )
 
 
@@ -200,7 +200,7 @@ def compare(
     def session(path: Path, *, optimize: bool = True, stock: bool = False) -> Session:
         return Session(
             path, optimize=optimize, stock=stock, release=True, provider=provider,
-            said=graphs[path].said,
+            metadata=graphs[path].metadata,
         )  # fmt: skip
 
     left = session(paths[0], optimize=not options.as_it_stands)
@@ -215,7 +215,7 @@ def compare(
     if not options.as_it_stands and has_int8_kernels(judged, provider):
         kernels = session(paths[1], stock=True)
     shown, worst = map(reported, recording), _FirstBad()
-    found = compared(
+    comparison = compared(
         left, right, shown, judged, kernels, sets, worst, alive=options.alive
     )
     makers = dict[str, str]()
@@ -223,7 +223,12 @@ def compare(
         if made := worst.maker(graphs[path].model.clone(), each):
             makers.setdefault(made, f"{path.name}: {made}")
     known = "; ".join(dict.fromkeys(graphs[path].known for path in paths))
-    answers = found.fidelity, found.liveness, found.runtime, found.agents
+    answers = (
+        comparison.fidelity,
+        comparison.liveness,
+        comparison.runtime,
+        comparison.agents,
+    )
     bad = tuple(makers.values())
     return CompareResult(*answers, *paths, slow_here=slow, known=known, not_finite=bad)
 
@@ -303,12 +308,12 @@ class FirstDifferenceResult(Result):
     keys = ("*found",)
     reference: Path
     candidate: Path
-    found: FirstDifference
+    difference: FirstDifference
 
     def shown(self) -> Shown:
         """Return the worst value that each module hands on."""
         worst: dict[str, BorderValue] = {}
-        for each in self.found.values:
+        for each in self.difference.values:
             known = worst.setdefault(each.module, each)
             if each.sqnr_db < known.sqnr_db:
                 worst[each.module] = each
@@ -318,26 +323,26 @@ class FirstDifferenceResult(Result):
         ]
         columns = ("module", "worst value", "node", "SQNR dB")
         note = (
-            f"Of {counted(len(self.found.values), 'value')} that modules hand on."
-            f" {self.found.unknown} of either graph have no namesake in the other."
+            f"Of {counted(len(self.difference.values), 'value')} that modules hand on."
+            f" {self.difference.unknown} of either graph have no namesake in the other."
         )
         modules = table("Modules", columns, rows, note, words=3)
-        return Shown(headline_of(self.found), [modules])
+        return Shown(headline_of(self.difference), [modules])
 
 
-def headline_of(found: FirstDifference) -> str:
+def headline_of(difference: FirstDifference) -> str:
     """Name the first module that differs, or say that there is none."""
-    if found.first is not None:
-        return f"first below {found.floor_db:g} dB: {found.first}"
-    below = sum(each.sqnr_db < found.floor_db for each in found.values)
+    if difference.first is not None:
+        return f"first below {difference.floor_db:g} dB: {difference.first}"
+    below = sum(each.sqnr_db < difference.floor_db for each in difference.values)
     if not below:
         return (
-            f"no difference: {counted(len(found.values), 'value')} at"
-            f" {found.floor_db:g} dB or more"
+            f"no difference: {counted(len(difference.values), 'value')} at"
+            f" {difference.floor_db:g} dB or more"
         )
     return (
-        f"{below} of {counted(len(found.values), 'value')} are below"
-        f" {found.floor_db:g} dB, but no output is"
+        f"{below} of {counted(len(difference.values), 'value')} are below"
+        f" {difference.floor_db:g} dB, but no output is"
     )
 
 
@@ -369,8 +374,8 @@ def first_difference(
     }
     shown = tuple(itertools.islice(recording, FRAMES))
     first, second = (models[path] for path in paths)
-    found = find_first_difference(first, second, shown, options.runs_on)
-    return FirstDifferenceResult(*paths, found)
+    difference = find_first_difference(first, second, shown, options.runs_on)
+    return FirstDifferenceResult(*paths, difference)
 
 
 def with_modules(model: ir.Model) -> ir.Model:

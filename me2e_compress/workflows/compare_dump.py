@@ -116,14 +116,16 @@ def compare_dump(
     answered.check(recording)
     notes, inner = _checked_names(answered, path, graph.load(path)), None
     opening = opened(path, recording, options, listener)
-    loaded, said = opening.model, opening.said
+    loaded, metadata = opening.model, opening.metadata
     provider = options.runs_on
-    session = Session(path, optimize=False, release=True, provider=provider, said=said)
+    session = Session(
+        path, optimize=False, release=True, provider=provider, metadata=metadata
+    )
     run = EngineRun(session, recording, answered)
     source, original, why = None, None, ""
     if float_graph is not None:
         source = model_path(float_graph)
-        original = Session(source, release=True, provider=provider, said=said)
+        original = Session(source, release=True, provider=provider, metadata=metadata)
     elif describe_quantized(loaded) is None:
         why = f"{path.name} is not quantized"
     else:

@@ -162,14 +162,14 @@ class CompressResult(Result):
 
         The same run thus writes the same file; numbers that are not finite become null.
         """
-        found = {
+        findings = {
             "weights": self.weights,
             "int8": self.int8,
             "fidelity": None if self.loss is None else self.loss.record(),
             "lint": None if self.lint is None else self.lint.summary(),
             "verdict": [*self.verdict(), *self.alerts()],
         }
-        return {name: plain(each) for name, each in found.items()}
+        return {name: plain(each) for name, each in findings.items()}
 
     def to_json(self) -> object:
         """Return the report file's content except the verdict, which `lines` has."""

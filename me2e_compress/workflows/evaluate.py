@@ -259,7 +259,7 @@ def check_model(
     read = Adapter() if driver.adapter is None else Adapter.load(driver.adapter)
     try:
         session = Session(
-            driver.path, threads=1, provider=driver.provider, said=driver.said()
+            driver.path, threads=1, provider=driver.provider, metadata=driver.metadata()
         )
     except (GraphError, FramesError) as error:
         raise EvaluationError(str(error)) from error
@@ -267,8 +267,8 @@ def check_model(
     fed = input_uses(session, read, recurrent)
     outputs, unread = output_uses(session, read, recurrent)
     # problems are listed once each; only a model without any is run
-    found = [*(each.problem for each in fed), unread]
-    problems = dict.fromkeys(filter(None, found))
+    texts = [*(each.problem for each in fed), unread]
+    problems = dict.fromkeys(filter(None, texts))
     if not problems:
         try:
             OnnxPolicy.of(session, read)  # it runs the model on zeros

@@ -121,9 +121,9 @@ def _recorded(
         pixels, about["log"] = log.pixels(request), LOGS.text(log)
     else:
         try_first(model, model.name, listener=listener, provider=options.runs_on)
-        said = adapted(load(model), None, options.module_map)
-        of += f" {said}" if said else ""
-        make, about["seed"] = _driven(model, adapter, said, options), options.seed
+        metadata = adapted(load(model), None, options.module_map)
+        of += f" {metadata}" if metadata else ""
+        make, about["seed"] = _driven(model, adapter, metadata, options), options.seed
 
     def reported(begin: Begin) -> Iterator[Frame]:
         for frame in make(begin):
@@ -136,13 +136,16 @@ def _recorded(
 
 
 def _driven(
-    model: Path, adapter: Path | None, said: Mapping[str, str], options: FramesOptions
+    model: Path,
+    adapter: Path | None,
+    metadata: Mapping[str, str],
+    options: FramesOptions,
 ) -> Source:
     need_extra("highway", "recording frames of a driver")
     from me2e_compress.evaluators.highway.driven_frames import driven_frames
 
     loaded = None if adapter is None else Adapter.load(adapter)
-    policy = OnnxPolicy.open(model, loaded, options.runs_on, said=said)
+    policy = OnnxPolicy.open(model, loaded, options.runs_on, metadata=metadata)
     driver = OnnxPolicy.open(shipped("highway"))
     length = options.scene_length
     return lambda begin: driven_frames(

@@ -114,8 +114,8 @@ class InspectResult(Result):
         if not self.unknown_macs_nodes:
             return total
         known = "" if self.macs is None else f"at least {total}, "
-        found = [f"{count} {op_type}" for op_type, count in self.uncounted.items()]
-        why = ", ".join(found[:_SHOWN]) + (", ..." if len(found) > _SHOWN else "")
+        types = [f"{count} {op_type}" for op_type, count in self.uncounted.items()]
+        why = ", ".join(types[:_SHOWN]) + (", ..." if len(types) > _SHOWN else "")
         ways = ""
         if self.open_dimensions:
             ways = f"; --set-dim NAME=SIZE for {', '.join(self.open_dimensions)}"

@@ -114,7 +114,7 @@ class Int8Outcome:
     @property
     def line(self) -> str:
         """How many nodes became int8, and which weights did not."""
-        said = f"int8: {counted(self.nodes, 'node')}"
+        line = f"int8: {counted(self.nodes, 'node')}"
         if self.float_bytes:
             rules = ", ".join(
                 f"{rule} {megabytes(count)}"
@@ -122,9 +122,9 @@ class Int8Outcome:
                 if count >= LEAST_SHOWN
             )
             total = megabytes(sum(self.float_bytes.values()))
-            said += f"; {total} MB of weights stay float"
-            said += f", by rule: {rules}" if rules else ""
-        return said
+            line += f"; {total} MB of weights stay float"
+            line += f", by rule: {rules}" if rules else ""
+        return line
 
     @property
     def empty(self) -> str:
@@ -132,10 +132,10 @@ class Int8Outcome:
         if self.nodes:
             return ""
         # say what the layers are kept float by, the commonest rules first
-        found = [f"{self.by} made nothing int8"]
+        parts = [f"{self.by} made nothing int8"]
         if self.layers is not None:
             of = "(convolutions, matrix products) in the graph"
-            found.append(f"{counted(self.layers, 'layer')} {of}")
+            parts.append(f"{counted(self.layers, 'layer')} {of}")
         most = list(self.kept.items())[:2]
-        found += [f"{count} by rule {why}" for why, count in most]
-        return "; ".join(found)
+        parts += [f"{count} by rule {why}" for why, count in most]
+        return "; ".join(parts)

@@ -87,8 +87,8 @@ class ListResult(Result):
 
 def _file(path: Traversable) -> Entry:
     """Describe a TOML file by the first sentence of the comment at its head."""
-    found = _COMMENT.match(path.read_text(encoding="utf-8"))
-    text = " ".join((found.group() if found else "").replace("#", " ").split())
+    comment = _COMMENT.match(path.read_text(encoding="utf-8"))
+    text = " ".join((comment.group() if comment else "").replace("#", " ").split())
     sentence = _SENTENCE.match(text)
     doc = sentence[1] if sentence else text
     return Entry(path.name.removesuffix(".toml"), _OURS, doc)
@@ -216,14 +216,14 @@ def doctor() -> DoctorResult:
 
 
 def _energy() -> Checkup:
-    found = open_counter()
-    if isinstance(found, Absent):
-        advice = f"joules are not measured here: {found.reason}"
+    counter = open_counter()
+    if isinstance(counter, Absent):
+        advice = f"joules are not measured here: {counter.reason}"
         return Checkup("energy counter", None, advice)
-    if isinstance(found, EnergyRecording):
-        return Checkup("energy counter", found.counter)
-    with contextlib.closing(found):
-        what = f"{found.counter} of {found.device}: {found.scope}"
+    if isinstance(counter, EnergyRecording):
+        return Checkup("energy counter", counter.counter)
+    with contextlib.closing(counter):
+        what = f"{counter.counter} of {counter.device}: {counter.scope}"
         return Checkup("energy counter", what)
 
 

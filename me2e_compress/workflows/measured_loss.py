@@ -78,27 +78,27 @@ class MeasuredLoss:
 
     def lines(self) -> Iterator[str]:
         """Yield how far the outputs moved, and which are alive or not judged."""
-        found = self.fidelity
-        if found is not None:
+        fidelity = self.fidelity
+        if fidelity is not None:
             parts = list[str]()
-            if found.plan is not None:
+            if fidelity.plan is not None:
                 parts.append(
-                    f"the plan moves {found.plan.mean_m:.3f} m on average,"
-                    f" {found.plan.max_m:.2f} m at most"
+                    f"the plan moves {fidelity.plan.mean_m:.3f} m on average,"
+                    f" {fidelity.plan.max_m:.2f} m at most"
                 )
             judged = [
                 each
-                for each in found.outputs
-                if each.name not in (found.plan_output, *self._matched)
+                for each in fidelity.outputs
+                if each.name not in (fidelity.plan_output, *self._matched)
                 and not each.discrete
             ]
             if judged:
                 worst = min(judged, key=lambda each: each.sqnr_db)
                 noise, reach = shown(worst.sqnr_db, "dB"), worst.by_frame
-                every = f" of {found.frames + found.seen}" if found.seen else ""
-                reach = f" ({reach} by frame{every})" if reach else ""
+                every = fidelity.seen and f" of {fidelity.frames + fidelity.seen}"
+                reach = f" ({reach} by frame{every or ''})" if reach else ""
                 parts.append(f"the noisiest output is {worst.name}, {noise}{reach}")
-            where = f"on {counted(found.frames, 'frame')} {self.on}"
+            where = f"on {counted(fidelity.frames, 'frame')} {self.on}"
             yield f"{'; '.join(parts) or 'no output could be judged'} ({where})"
         elif self.on != NOT_ASKED:
             yield f"fidelity: not measured ({self.on})"
@@ -129,18 +129,18 @@ class MeasuredLoss:
 
     def table(self) -> Table | None:
         """Return the SQNR and largest error of every output; None if not measured."""
-        found = self.fidelity
-        if found is None:
+        fidelity = self.fidelity
+        if fidelity is None:
             return None
         below = {each.output for each in self.shortfalls}
-        said = {
+        verdicts = {
             each.name: "not judged: whole numbers"
-            for each in found.outputs
+            for each in fidelity.outputs
             if each.discrete
         }
-        said |= dict.fromkeys(below, "below")
-        title = f"Fidelity on {counted(found.frames, 'frame')} {self.on}"
-        return outputs_table(title, found, self.agents, said)
+        verdicts |= dict.fromkeys(below, "below")
+        title = f"Fidelity on {counted(fidelity.frames, 'frame')} {self.on}"
+        return outputs_table(title, fidelity, self.agents, verdicts)
 
     def record(self) -> dict[str, object]:
         """Return what the report says of it: all but the time."""
@@ -255,12 +255,12 @@ def _compared(
     if written and has_int8_kernels(after, provider):
         kernels = open_session(after, stock=True)
     sets = SetTally.of(reference, session)
-    found = compared(reference, session, frames, after, kernels, sets)
+    comparison = compared(reference, session, frames, after, kernels, sets)
     if seen is not None:
-        beside = found.fidelity.beside(compare(reference, session, seen))
-        found = dataclasses.replace(found, fidelity=beside)
-    loss = dataclasses.replace(loss, **vars(found))
-    below = loss.floor.shortfalls(found.fidelity, found.agents)
+        beside = comparison.fidelity.beside(compare(reference, session, seen))
+        comparison = dataclasses.replace(comparison, fidelity=beside)
+    loss = dataclasses.replace(loss, **vars(comparison))
+    below = loss.floor.shortfalls(comparison.fidelity, comparison.agents)
     if not below:
         return loss
     int8 = any(isinstance(each, QuantizeInt8) for each in passes)

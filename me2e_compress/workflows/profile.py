@@ -153,12 +153,12 @@ def profile(
         # each measurement has inferences of its own: the profiler takes time itself
         recording, threads = CalibrationSet(Path(frames)), options.threads
         opening = opened(source, recording, options, listener)
-        loaded, said = opening.model, opening.said
+        loaded, metadata = opening.model, opening.metadata
         provider = options.runs_on
         with OthersLoad() as others:
             trace = measure(
                 source, recording, samples=options.samples, threads=threads,
-                provider=provider, said=said,
+                provider=provider, metadata=metadata,
                 on_sample=listener.counting("profile", "inferences"),
             )  # fmt: skip
         trace = dataclasses.replace(trace, others=others.load)
@@ -176,7 +176,7 @@ def profile(
         if options.energy is not None:
             energy = measure_energy(
                 {source.name: source}, recording, options.energy, threads=threads,
-                provider=provider, said=said,
+                provider=provider, metadata=metadata,
                 on_window=lambda done, total, name: windows(done, total),
             )[source.name]  # fmt: skip
         # files are written all or none
@@ -216,16 +216,18 @@ def import_profile(
     check_number("--budget-ms", budget_ms)
     source, written = model_path(model), None if output is None else Path(output)
     with writing([written], (source, file), force=force):
-        found = read_import(Path(file))
+        imported = read_import(Path(file))
         # the trace belongs to the very file that was measured
-        trace = LatencyTrace(graph.sha256_of(source), found.machine, found.samples_us)
+        trace = LatencyTrace(
+            graph.sha256_of(source), imported.machine, imported.samples_us
+        )
         if written is not None:
             trace.save(written)
     return ProfileResult(
         source,
         trace,
         written,
-        operators_us=found.layers_us,
+        operators_us=imported.layers_us,
         budget_ms=budget_ms,
     )
 

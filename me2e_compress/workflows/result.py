@@ -93,7 +93,7 @@ class Result:
         return content
 
     def document(self) -> dict[str, object]:
-        """Return the ``--json`` document: version, status, the lines said, everything.
+        """Return the ``--json`` document: version, status, the lines shown, everything.
 
         Dataclasses and paths become objects and strings, numbers that are not finite
         null.
@@ -101,8 +101,8 @@ class Result:
         content = plain(self.to_json())
         if not isinstance(content, Mapping):
             raise TypeError(f"{type(self).__name__}.to_json: not an object")
-        said = [*(self.lines() or (self.headline,)), *self.alerts()]
-        return {"schema": SCHEMA, "status": self.status, "verdict": said, **content}
+        verdict = [*(self.lines() or (self.headline,)), *self.alerts()]
+        return {"schema": SCHEMA, "status": self.status, "verdict": verdict, **content}
 
 
 def _fields(value: Any) -> dict[str, object]:

@@ -87,34 +87,34 @@ class RealRun:
 
     def alerts(self, name: str) -> Iterator[str]:
         """Yield warnings, one line each."""
-        found = self.collected
-        if found.route_set is None:
+        collected = self.collected
+        if collected.route_set is None:
             yield f"{name}: its routes are of no set of Bench2Drive that is known"
-        doubtful = {*found.foreign, *found.contradictory, *found.off_rate}
-        routes = f"of {len(found.episodes)} routes do not count as they should"
+        doubtful = {*collected.foreign, *collected.contradictory, *collected.off_rate}
+        routes = f"of {len(collected.episodes)} routes do not count as they should"
         files = "files or records are broken and left out"
-        for count, what in ((len(doubtful), routes), (len(found.broken), files)):
+        for count, what in ((len(doubtful), routes), (len(collected.broken), files)):
             if count:
                 yield f"{name}: {count} {what}: see the table of records, or --json"
-        yield from found.notes[:_NAMED]
+        yield from collected.notes[:_NAMED]
 
     def to_json(self) -> dict[str, object]:
         """Return scores, quotients, and every route that was named."""
-        found = self.collected
+        collected = self.collected
         return {
             **self.scores.to_json(),
             "leaderboard": {
-                "route_set": found.route_set,
+                "route_set": collected.route_set,
                 "set_size": self.leaderboard.set_size,
                 "given": self.leaderboard.given,
                 "computed": self.leaderboard.computed,
             },
             "records": {
-                "evaluated": len(found.episodes),
+                "evaluated": len(collected.episodes),
                 **self._named(),
-                "unfinished": found.unfinished,
-                "broken": found.broken,
-                "intervals_s": found.off_rate,
+                "unfinished": collected.unfinished,
+                "broken": collected.broken,
+                "intervals_s": collected.off_rate,
             },
         }
 
@@ -188,7 +188,7 @@ class ScoreResult(Result):
 
     def to_json(self) -> object:
         """Return the scores of every folder, and EER_AV of all together."""
-        found = [
+        collected = [
             {
                 "results": name,
                 **self.real.get(name, scores).to_json(),
@@ -196,7 +196,7 @@ class ScoreResult(Result):
             }
             for name, scores in self.scores.items()
         ]
-        return {"folders": found, "eer": self.eer}
+        return {"folders": collected, "eer": self.eer}
 
 
 def score(
@@ -270,18 +270,18 @@ def _episodes(folder: ResultsFolder, listener: Listener) -> tuple[Episode, ...]:
 
 def driving_score(scores: Scores) -> str:
     """Return driving score and room kept with intervals, and the number of routes."""
-    found = scores.driving_score
+    score = scores.driving_score
     routes = f"{scores.routes} of {scores.expected} routes"
-    if found.value is None:
-        return f"driving score not measured ({found.measure.reason}); {routes}"
+    if score.value is None:
+        return f"driving score not measured ({score.measure.reason}); {routes}"
     room = scores.safety.room_kept
     kept = "" if room.value is None else f", room kept {_between(room)} %"
-    return f"driving score {_between(found)}{kept}; {routes}"
+    return f"driving score {_between(score)}{kept}; {routes}"
 
 
-def _between(found: Estimate) -> str:
-    low, high = number(found.low, ".1f"), number(found.high, ".1f")
-    return f"{number(found.value, '.1f')} ({low} to {high})"
+def _between(estimate: Estimate) -> str:
+    low, high = number(estimate.low, ".1f"), number(estimate.high, ".1f")
+    return f"{number(estimate.value, '.1f')} ({low} to {high})"
 
 
 def scores_table(name: str, scores: Scores) -> Table:

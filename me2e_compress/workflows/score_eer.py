@@ -37,11 +37,11 @@ UNPAIRED = "a drive in each"
 class EerScores:
     """EER_AV of folders, and their order."""
 
-    found: EerResult
+    result: EerResult
 
     def tables(self) -> tuple[Table, ...]:
         """Return the scores and their weights."""
-        scores, scale = self.found.scores, self.found.scale
+        scores, scale = self.result.scores, self.result.scale
         rows = [[n, *estimate_cells(each, ".2f")] for n, each in scores.items()]
         why = not_measured(
             {
@@ -61,28 +61,28 @@ class EerScores:
                 MEASURES, scale.weights, scale.offset, scale.span, UNITS, strict=True
             )
         ]
-        left = [f"{n} for want of {name}" for name, n in self.found.left_out.items()]
+        left = [f"{n} for want of {name}" for name, n in self.result.left_out.items()]
         note = f"Routes left out of all: {', '.join(left)}." if left else ""
         columns = ("measure", "weight", "0 is", "1 is", "unit")
         return (points, table("Weights by CRITIC, min-max", columns, rows, note))
 
     def lines(self) -> tuple[str, ...]:
         """Return the order of the folders."""
-        if self.found.scale is None:
+        if self.result.scale is None:
             return ()
-        return (f"EER_AV, best first: {', '.join(self.found.ranking)}",)
+        return (f"EER_AV, best first: {', '.join(self.result.ranking)}",)
 
     def to_json(self) -> dict[str, Any]:
         """Return scores, scale and routes left out."""
-        found = self.found
-        columns = {} if found.scale is None else dataclasses.asdict(found.scale)
+        result = self.result
+        columns = {} if result.scale is None else dataclasses.asdict(result.scale)
         scale = {
             n: dict(zip(MEASURES, each, strict=True)) for n, each in columns.items()
         }
         return {
-            "scores": found.scores,
+            "scores": result.scores,
             "scale": scale or None,
-            "left_out": found.left_out,
+            "left_out": result.left_out,
         }
 
 
@@ -100,11 +100,11 @@ def score_eer(
     paired, others = paired_drives(folders)
     variants = _variants(paired, joules)
     types = [episode.scenario for episode in next(iter(paired.values()), ())]
-    found = eer(variants, types=types)
+    result = eer(variants, types=types)
     if others:
-        left_out = {UNPAIRED: others, **found.left_out}
-        found = dataclasses.replace(found, left_out=left_out)
-    return EerScores(found)
+        left_out = {UNPAIRED: others, **result.left_out}
+        result = dataclasses.replace(result, left_out=left_out)
+    return EerScores(result)
 
 
 def paired_drives(

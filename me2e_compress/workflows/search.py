@@ -233,7 +233,7 @@ class SensitivityResult(Result):
 
     keys = ("*found",)
     output: Path
-    found: Sensitivity
+    sensitivity: Sensitivity
     choice: Int8Choice
     score: Score | None
     limit: float
@@ -241,18 +241,18 @@ class SensitivityResult(Result):
 
     def shown(self) -> Shown:
         """Return what int8 costs by module, the nodes to blame, recipe and its loss."""
-        found, unit = self.found, self.found.together.unit
+        sensitivity, unit = self.sensitivity, self.sensitivity.together.unit
         rows = [
             (each.module, str(each.nodes), *_cells(each.score))
-            for each in found.findings
+            for each in sensitivity.findings
         ]
-        rows.append(("together", "", *_cells(found.together)))
+        rows.append(("together", "", *_cells(sensitivity.together)))
         columns = ("module", "nodes", f"loss {unit}", "worst output, dB")
-        size = megabytes(found.together.weight_bytes)
-        note = f"{counted(found.trials, 'variant')} run; all together {size} MB"
+        size = megabytes(sensitivity.together.weight_bytes)
+        note = f"{counted(sensitivity.trials, 'variant')} run; all together {size} MB"
         lines = [
             f"{each.module}: {node}: {significant(alone)} {unit} alone"
-            for each in found.findings
+            for each in sensitivity.findings
             for node, alone in each.blamed
         ]
         lines.append(self.written)
@@ -288,11 +288,13 @@ def measure_sensitivity(
         # calibrate once, try modules and nodes, then choose within the limit
         trials, modules = files.trials(options, listener)
         report, most = partial(listener.on_progress, "modules"), options.node_trials
-        found = analyse(trials, modules, node_trials=most, progress=report)
-        choice = advise(trials, found, options.limit)
+        sensitivity = analyse(trials, modules, node_trials=most, progress=report)
+        choice = advise(trials, sensitivity, options.limit)
         written = files.write(choice, options)
         score = trials.score(choice) if choice.modules else None
-    return SensitivityResult(files.output, found, choice, score, options.limit, written)
+    return SensitivityResult(
+        files.output, sensitivity, choice, score, options.limit, written
+    )
 
 
 def _cells(score: Score) -> tuple[str, str]:

@@ -392,12 +392,8 @@ def test_compare_matches_what_both_graphs_have(
     if has_scores:
         assert found.agents is not None
         assert found.agents.sqnr_db["boxes"] == math.inf
-        assert [each.text for each in outputs.rows[0]] == [
-            "boxes",
-            "inf",
-            "",
-            "matched",
-        ]
+        texts = [each.text for each in outputs.rows[0]]
+        assert texts == ["boxes", "inf", "matched agents", ""]
     else:
         assert found.agents is None
         assert outputs.rows[0][1].text == f"{found.fidelity.outputs[0].sqnr_db:.1f}"

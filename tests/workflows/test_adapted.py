@@ -137,7 +137,7 @@ def test_all_that_run_a_graph_feed_the_state_back(
     assert timed.trace.modules_us
     options = SensitivityOptions(adapter=adapter, node_trials=0)
     cost = measure_sensitivity(mine, frames, tmp_path / "int8.toml", options)
-    assert cost.found.together.unit == "m"  # without a drive
+    assert cost.sensitivity.together.unit == "m"  # without a drive
 
 
 @pytest.mark.parametrize(

@@ -48,11 +48,11 @@ def test_every_folder_has_a_score_by_its_own_joules() -> None:
     found = score_eer(FOLDERS, {"fast": 2.0, "runs/slow": 3.0})
 
     assert found is not None
-    scale = found.found.scale
+    scale = found.result.scale
     assert scale is not None
     # 9 and 5 decisions of 2 J, 20 and 14 of 3 J
     assert (scale.offset[3], scale.offset[3] + scale.span[3]) == (10.0, 60.0)
-    first, last = found.found.ranking
+    first, last = found.result.ranking
     assert found.lines() == (f"EER_AV, best first: {first}, {last}",)
 
 
@@ -83,8 +83,8 @@ def test_what_one_real_run_lacks_is_left_out_of_all() -> None:
     found = score_eer(real, {"fast": 2.0, "slow": 3.0})
 
     assert found is not None
-    assert found.found.left_out == {"a drive in each": 1}
-    assert found.found.scores["runs/slow"].n == 2
+    assert found.result.left_out == {"a drive in each": 1}
+    assert found.result.scores["runs/slow"].n == 2
 
 
 @pytest.mark.parametrize(

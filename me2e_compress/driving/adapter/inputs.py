@@ -63,13 +63,13 @@ class ModelInputs:
             EvaluationError: Names the first port that cannot be fed.
         """
         _check_names(session, adapter, recurrent)
-        found, problems = cls.found(session, adapter, recurrent)
+        opened, problems = cls.opened(session, adapter, recurrent)
         for problem in problems.values():
             raise EvaluationError(problem)
-        return found
+        return opened
 
     @classmethod
-    def found(
+    def opened(
         cls, session: Session, adapter: Adapter, recurrent: Mapping[str, str]
     ) -> tuple[Self, dict[str, str]]:
         """Return what can be fed, and by input why the rest cannot."""
@@ -96,8 +96,8 @@ class ModelInputs:
         }
         # and by something that fits
         images, size, faults = _images(session, adapter, tables)
-        found = cls(session.inputs, adapter, tables, images, given, size)
-        return found, {**problems, **faults, **found.faults()}
+        opened = cls(session.inputs, adapter, tables, images, given, size)
+        return opened, {**problems, **faults, **opened.faults()}
 
     @property
     def normalization(self) -> ImageNormalization | None:

@@ -74,19 +74,19 @@ def plan_of(
 ) -> PlanAdapter:
     """Return the adapter's reading of the plan, or else the metadata's."""
     # the plan and the scores that pick its mode must be outputs
-    found = adapted or PlanAdapter.of(metadata, outputs)
+    plan = adapted or PlanAdapter.of(metadata, outputs)
     there = ", ".join(outputs)
-    if found is None:
+    if plan is None:
         raise EvaluationError(
             f"the model has no output plan, and no adapter or metadata names one; "
             f"there are {there}"
         )
-    for what, name in (("plan", found.output), ("scores", found.scores)):
+    for what, name in (("plan", plan.output), ("scores", plan.scores)):
         if name is not None and name not in outputs:
             raise EvaluationError(
                 f"no output {name}, which is named as the {what}; there are {there}"
             )
-    return found
+    return plan
 
 
 # Plan and state, as a module map or an adapter state them, as metadata of a graph.
@@ -111,17 +111,17 @@ def adapted(
         for ports in (*modules.optional, modules.ports):
             metadata |= _of_map(model, modules, ports, metadata)
     if adapter is not None:
-        found = Adapter.load(adapter_file(Path(adapter)))
+        adapter_of = Adapter.load(adapter_file(Path(adapter)))
         inputs = [str(each.name) for each in model.graph.inputs]
         # every input that the adapter names must exist
-        for name in (*found.feeds, *found.images):
+        for name in (*adapter_of.feeds, *adapter_of.images):
             if name not in inputs:
                 raise EvaluationError(
                     f"adapter {adapter}: it feeds input {name}; there are"
                     f" {', '.join(inputs)}"
                 )
-        metadata |= found.metadata({**model.metadata_props, **metadata})
-        _check_fit(model, f"adapter {adapter}", found.plan, metadata)
+        metadata |= adapter_of.metadata({**model.metadata_props, **metadata})
+        _check_fit(model, f"adapter {adapter}", adapter_of.plan, metadata)
     model.metadata_props.update(metadata)
     return metadata
 
@@ -163,8 +163,8 @@ def state_and_plan(
         there = known.setdefault(origin, [])
         there.append(name if there else f"state {name}")
     outputs = [str(each.name) for each in model.graph.outputs]
-    if (found := PlanAdapter.of(model.metadata_props, outputs)) is not None:
-        known.setdefault(plan[1], []).append(f"plan {found.output}")
+    if (own_plan := PlanAdapter.of(model.metadata_props, outputs)) is not None:
+        known.setdefault(plan[1], []).append(f"plan {own_plan.output}")
     line = "; ".join(f"{', '.join(each)}: {origin}" for origin, each in known.items())
     return added, line
 
@@ -205,16 +205,16 @@ def _of_map(
     if plan is None and not pairs and not sets:
         return {}
     origin = f"map {modules.name}"
-    found = Adapter.parse({"plan": plan, "recurrent": pairs}, origin)
-    metadata = found.metadata(own) | sets
+    adapter = Adapter.parse({"plan": plan, "recurrent": pairs}, origin)
+    metadata = adapter.metadata(own) | sets
     try:
-        _check_fit(model, origin, found.plan, metadata)
+        _check_fit(model, origin, adapter.plan, metadata)
         outputs = [str(each.name) for each in model.graph.outputs]
         for name in np.hstack([np.array([], str), *ports.sets.values()]):
             if name not in outputs:
                 raise EvaluationError(f"{origin}: sets: no output {name}")
-        if found.plan is not None:
-            check_command(found.plan, [str(each.name) for each in model.graph.inputs])
+        if adapter.plan is not None:
+            check_command(adapter.plan, [str(each.name) for each in model.graph.inputs])
     except EvaluationError as error:
         if is_optional:
             return {}
@@ -265,16 +265,16 @@ def input_uses(
     session: Session, adapter: Adapter, recurrent: Mapping[str, str]
 ) -> tuple[PortUse, ...]:
     """List the inputs of a graph, in its order, with what each is fed."""
-    found, problems = ModelInputs.found(session, adapter, recurrent)
+    inputs, problems = ModelInputs.opened(session, adapter, recurrent)
     # each input's feed in words
     words = {
         name: f"{answer} of the frame before" for name, answer in recurrent.items()
     }
-    for name, table in found.tables.items():
+    for name, table in inputs.tables.items():
         cameras = ", ".join(table.cameras)
         words[name] = "the six cameras" if len(table.cameras) == 6 else cameras
         words[name] += ", side by side" if table.stitch else ""
-    for name, feed in found.given.items():
+    for name, feed in inputs.given.items():
         words[name] = ", ".join(INPUT_SOURCES.text(part.source) for part in feed.parts)
     # faults of types and first values
     for name, port in session.inputs.items():

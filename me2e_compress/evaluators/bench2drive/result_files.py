@@ -254,26 +254,26 @@ def find_files(folder: Path) -> FoundFiles:
     """Find and read the results files below a folder, and find its recordings."""
     if not folder.exists():
         raise EvaluationError(f"{folder}: no such folder")
-    found = FoundFiles()
+    files = FoundFiles()
     for path, kind in _kinds(folder):
         if path.name == _DECISIONS:
-            found.decisions.append(path)
+            files.decisions.append(path)
         # incomplete files are reported, recordings are only listed
         if kind is None:
             continue
         if kind in _UNREADABLE:
-            found.broken[path] = _UNREADABLE[kind]
+            files.broken[path] = _UNREADABLE[kind]
             continue
         if kind != _CHECKPOINT:
-            found.recordings.append(path)
+            files.recordings.append(path)
             continue
         try:
-            found.results.append(_read(path))
+            files.results.append(_read(path))
         except documents.MalformedError as error:
-            found.broken[path] = f"not JSON: {error}"
+            files.broken[path] = f"not JSON: {error}"
         except (OSError, BrokenRecordError) as error:
-            found.broken[path] = str(getattr(error, "strerror", None) or error)
-    return found
+            files.broken[path] = str(getattr(error, "strerror", None) or error)
+    return files
 
 
 def _kinds(folder: Path) -> Iterator[tuple[Path, bytes | None]]:
@@ -373,13 +373,13 @@ class DriveRecordings:
                 exact.append(path)
             elif any(each.endswith(f"_{record.recording}") for each in names):
                 prefixed.append(path)
-        found = (*exact, *prefixed)
-        if not found:
+        matches = (*exact, *prefixed)
+        if not matches:
             where = self._beside.get(record.content)
-            found = tuple(path for path in self._names if path.parent == where)
-            found = found if len(found) == 1 else ()
-        self._taken.update(found)
-        return found
+            matches = tuple(path for path in self._names if path.parent == where)
+            matches = matches if len(matches) == 1 else ()
+        self._taken.update(matches)
+        return matches
 
     @property
     def of_none(self) -> list[Path]:

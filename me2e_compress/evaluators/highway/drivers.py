@@ -54,10 +54,10 @@ class OnnxDriver(Driver):
                 f" are {', '.join(POLICIES.names())}"
             )
         adapter = None if self.adapter is None else Adapter.load(self.adapter)
-        stage, said = self.host_stage, self.said()
-        return OnnxPolicy.open(self.path, adapter, self.provider, stage, said)
+        stage, metadata = self.host_stage, self.metadata()
+        return OnnxPolicy.open(self.path, adapter, self.provider, stage, metadata)
 
-    def said(self) -> dict[str, str]:
+    def metadata(self) -> dict[str, str]:
         """Return what the map says, as metadata of the graph."""
         from me2e_compress.driving.adapter.outputs import adapted
 

@@ -156,10 +156,10 @@ class _Sizes:
                 continue
             for other in linked[1:]:
                 parent[root(other)] = root(linked[0])
-        found: dict[Expression, list[Expression]] = {}
+        groups: dict[Expression, list[Expression]] = {}
         for one in parent:
-            found.setdefault(root(one), []).append(one)
-        return list(found.values())
+            groups.setdefault(root(one), []).append(one)
+        return list(groups.values())
 
     def _is_read_outside(self, value: ir.Value) -> bool:
         readers = (self._expression(use.node) for use in value.uses())
@@ -246,8 +246,8 @@ class FoldConstants(Pass):
             for body in list(graphs_of(model.graph))[1:]:
                 self._fold(body, opset, tally, set(), trust=False)
         # Shapes of graph outputs may have become known
-        found = [value.shape for value in model.graph.outputs]
-        refined = sum(a is not b for a, b in zip(declared, found, strict=True))
+        shapes = [value.shape for value in model.graph.outputs]
+        refined = sum(a is not b for a, b in zip(declared, shapes, strict=True))
         return PassResult(model, tally.changes + refined, _notes(tally))
 
     def _fold(

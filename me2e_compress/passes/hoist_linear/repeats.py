@@ -167,10 +167,10 @@ def _sizes(
             small.append(1)
             large.append(1)
         for stays, group in itertools.groupby(pieces, is_kept):
-            found = list(group)
-            large.append(math.prod(digit.size for digit in found))
+            digits = list(group)
+            large.append(math.prod(digit.size for digit in digits))
             small.append(large[-1] if stays else 1)
-            mine.extend(found if stays else ())
+            mine.extend(digits if stays else ())
     return (tuple(small), tuple(large)) if merged(mine) == kept else None
 
 
@@ -233,13 +233,13 @@ class _Operand:
     Attributes:
         value: what it reads now.
         shape: the shape of what it reads instead.
-        found: where the elements are that it reads once.
+        repeated: where the elements are that it reads once.
         numbers: or those of a constant.
     """
 
     value: ir.Value
     shape: tuple[int, ...]
-    found: RepeatedAxes | None = None
+    repeated: RepeatedAxes | None = None
     numbers: Array | None = None
 
 
@@ -284,31 +284,34 @@ def _plan(node: ir.Node, opset: int) -> _Plan | None:
     if node.op_type in BINARY:
         return _combined(node, shape)
     # An operator along the last axis needs it whole
-    found, given = repeated_axes(value), static_shape(value)
-    if found is None or not given:
+    repeated, given = repeated_axes(value), static_shape(value)
+    if repeated is None or not given:
         return None
-    operand = _Operand(value, found.small, found)
+    operand = _Operand(value, repeated.small, repeated)
     if node.op_type in UNARY:
-        return _Plan((operand,), found.small, found.large)
-    if not found.small[-1] == found.large[-1] == given[-1]:
+        return _Plan((operand,), repeated.small, repeated.large)
+    if not repeated.small[-1] == repeated.large[-1] == given[-1]:
         return None
-    small, large = ((*sizes[:-1], shape[-1]) for sizes in (found.small, found.large))
+    small, large = (
+        (*sizes[:-1], shape[-1]) for sizes in (repeated.small, repeated.large)
+    )
     if node.op_type != "Gemm":
         return _Plan((operand,), small, large)
     rows = math.prod(small[:-1])
-    found = dataclasses.replace(found, small=(rows, given[-1]))
-    operand = _Operand(value, found.small, found)
+    repeated = dataclasses.replace(repeated, small=(rows, given[-1]))
+    operand = _Operand(value, repeated.small, repeated)
     return _Plan((operand,), small, large, (rows, shape[-1]))
 
 
 def _turned(node: ir.Node, value: ir.Value) -> _Plan | None:
-    found, order = repeated_axes(value), permutation_of(node)
-    if found is None or order is None or found.large != static_shape(value):
+    repeated, order = repeated_axes(value), permutation_of(node)
+    if repeated is None or order is None or repeated.large != static_shape(value):
         return None
     small, large = (
-        tuple(sizes[axis] for axis in order) for sizes in (found.small, found.large)
+        tuple(sizes[axis] for axis in order)
+        for sizes in (repeated.small, repeated.large)
     )
-    return _Plan((_Operand(value, found.small, found),), small, large)
+    return _Plan((_Operand(value, repeated.small, repeated),), small, large)
 
 
 def _combined(node: ir.Node, shape: tuple[int, ...]) -> _Plan | None:
@@ -319,18 +322,20 @@ def _combined(node: ir.Node, shape: tuple[int, ...]) -> _Plan | None:
         if value is None or given is None:
             return None
         same = value.dtype == node.outputs[0].dtype and not holds_numbers(value)
-        found = repeated_axes(value) if same else None
-        if found is not None and found.large != given:
-            return _split(node, found, shape)
-        small = given if found is None else found.small
-        operands.append(_Operand(value, small, found))
-    if all(each.found is None for each in operands):
+        repeated = repeated_axes(value) if same else None
+        if repeated is not None and repeated.large != given:
+            return _split(node, repeated, shape)
+        small = given if repeated is None else repeated.small
+        operands.append(_Operand(value, small, repeated))
+    if all(each.repeated is None for each in operands):
         return None
     small = np.broadcast_shapes(*(each.shape for each in operands))
     return _Plan(tuple(operands), small, shape)
 
 
-def _split(node: ir.Node, found: RepeatedAxes, shape: tuple[int, ...]) -> _Plan | None:
+def _split(
+    node: ir.Node, repeated: RepeatedAxes, shape: tuple[int, ...]
+) -> _Plan | None:
     """Plan the same where an axis repeats in part: the other varies behind it alone."""
     operands: list[_Operand] = []
     for value in node.inputs:
@@ -338,14 +343,14 @@ def _split(node: ir.Node, found: RepeatedAxes, shape: tuple[int, ...]) -> _Plan 
         if value is None or given is None:
             return None
         mine = repeated_axes(value) if given == shape else None
-        if mine is not None and mine.large == found.large:
+        if mine is not None and mine.large == repeated.large:
             operands.append(_Operand(value, mine.small, mine))
-        elif found.large[-len(given) :] == shape[-len(given) :] or given == ():
+        elif repeated.large[-len(given) :] == shape[-len(given) :] or given == ():
             operands.append(_Operand(value, given))
         else:
             return None
     small = np.broadcast_shapes(*(each.shape for each in operands))
-    return _Plan(tuple(operands), small, found.large)
+    return _Plan(tuple(operands), small, repeated.large)
 
 
 def _joined(node: ir.Node, shape: tuple[int, ...]) -> _Plan | None:
@@ -354,14 +359,14 @@ def _joined(node: ir.Node, shape: tuple[int, ...]) -> _Plan | None:
     axis = node.attributes.get_int("axis", 0) % len(shape)
     stored = {value: array_of(value) for value in values if holds_numbers(value)}
     common = set(range(len(shape))) - {axis}
-    found: dict[ir.Value, RepeatedAxes] = {}
+    repeats: dict[ir.Value, RepeatedAxes] = {}
     if len(stored) == len(values):
         return None
     # The axes along which every operand repeats
     for value in values:
         one = None if value in stored else repeated_axes(value)
         if one is not None and one.large == static_shape(value):
-            found[value] = one
+            repeats[value] = one
             common = {at for at in common if one.small[at] != one.large[at]}
         elif value not in stored:
             return None
@@ -371,14 +376,14 @@ def _joined(node: ir.Node, shape: tuple[int, ...]) -> _Plan | None:
     if not common:
         return None
     operands = tuple(
-        _once(value, common, found.get(value), stored.get(value)) for value in values
+        _once(value, common, repeats.get(value), stored.get(value)) for value in values
     )
     small = [1 if at in common else size for at, size in enumerate(shape)]
     return _Plan(operands, tuple(small), shape)
 
 
 def _once(
-    value: ir.Value, axes: set[int], found: RepeatedAxes | None, array: Array | None
+    value: ir.Value, axes: set[int], repeated: RepeatedAxes | None, array: Array | None
 ) -> _Operand:
     shape = tuple(
         1 if at in axes else size for at, size in enumerate(static_shape(value) or ())
@@ -387,7 +392,7 @@ def _once(
         array = array[
             tuple(slice(1 if at in axes else None) for at in range(len(shape)))
         ]
-    return _Operand(value, shape, found, array)
+    return _Operand(value, shape, repeated, array)
 
 
 def _pays(node: ir.Node, plan: _Plan) -> bool:
@@ -398,17 +403,20 @@ def _pays(node: ir.Node, plan: _Plan) -> bool:
     after = 1.0 + (plan.flat is not None) + products / MACS_PER_NODE
     for operand in plan.operands:
         moved += math.prod(operand.shape) * item
-        if operand.found is None:
+        if operand.repeated is None:
             continue
         # The nodes of a repetition that only this one needs
         owned = itertools.takewhile(
-            lambda each: sole_reader(each.outputs[0]) is not None, operand.found.nodes
+            lambda each: sole_reader(each.outputs[0]) is not None,
+            operand.repeated.nodes,
         )
         before += sum(map(work, owned))
-        if static_shape(operand.found.source) != operand.found.small:
+        if static_shape(operand.repeated.source) != operand.repeated.small:
             after += 1.0
-        if operand.shape != operand.found.small:
-            moved += (math.prod(operand.shape) + math.prod(operand.found.small)) * item
+        if operand.shape != operand.repeated.small:
+            moved += (
+                math.prod(operand.shape) + math.prod(operand.repeated.small)
+            ) * item
             after += 1.0
     # Repeating the result, and giving it its shape
     if plan.small != plan.large:
@@ -436,7 +444,9 @@ def _rewrite(node: ir.Node, plan: _Plan, rewriter: Rewriter) -> None:
     shape = plan.flat or plan.small
     new = writer.write(node.op_type, inputs, shape, list(attributes.values()))
     # Repeat the result, unless its readers see no difference
-    axes = [operand.found for operand in plan.operands if operand.found is not None]
+    axes = [
+        operand.repeated for operand in plan.operands if operand.repeated is not None
+    ]
     writer.sources = (node, *dict.fromkeys(one for each in axes for one in each.nodes))
     new = writer.shape(writer.shape(new, plan.small), plan.large, "Expand")
     rewriter.swap(old, writer.shape(new, static_shape(old) or ()))
@@ -444,7 +454,7 @@ def _rewrite(node: ir.Node, plan: _Plan, rewriter: Rewriter) -> None:
 
 def _written(node: ir.Node, operand: _Operand, rewriter: Rewriter) -> ir.Value:
     """Return what a node reads instead, written where needed."""
-    value, axes = operand.value, operand.found
+    value, axes = operand.value, operand.repeated
     if operand.numbers is not None:
         return rewriter.store(operand.numbers, f"{value.name}_once")
     if axes is None:

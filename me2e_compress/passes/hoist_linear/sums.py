@@ -234,8 +234,8 @@ class _Search:
             node = value.producer()
             if depth and node is not None and node.graph is self.rewriter.graph:
                 for rule in (self._two_layers, self._over_sum, self._before_view):
-                    found = rule(value, node, owned, depth - 1)
-                    forms.extend(() if found is None else (found,))
+                    form = rule(value, node, owned, depth - 1)
+                    forms.extend(() if form is None else (form,))
             self.known[value] = min(forms, key=lambda form: form.cost)
         return self.known[value]
 
@@ -313,17 +313,17 @@ class _Search:
         order = permutation_of(node) if node.op_type == "Transpose" else None
         if node.op_type == "Transpose" and (not order or order[-1] != len(order) - 1):
             return None
-        found = self.of(source, owned=owned, depth=depth)
+        source_form = self.of(source, owned=owned, depth=depth)
 
         def write(matrix: Numbers) -> Terms:
             self.writer.sources += (node,)
-            rows = self.total(found.write(matrix), (*inner[:-1], self.columns))
+            rows = self.total(source_form.write(matrix), (*inner[:-1], self.columns))
             moved = (*shape[:-1], self.columns)
             if order is None:
                 return [self.writer.shape(rows, moved)]
             return [self.writer.transpose(rows, order)]
 
-        return Form(found.macs, found.cost + (not owned), write)
+        return Form(source_form.macs, source_form.cost + (not owned), write)
 
     def total(self, terms: Terms, shape: tuple[int, ...]) -> ir.Value:
         """Write a sum, its terms of the fewest rows first; these take the vectors."""

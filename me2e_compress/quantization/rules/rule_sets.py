@@ -265,12 +265,12 @@ class FileSize(Rule):
         self, int8: Collection[ir.Node], facts: RuleFacts
     ) -> Mapping[ir.Node, str]:
         """Object to the layers whose integers take more than the floats that go."""
-        kept, found = dict.fromkeys(int8), dict[ir.Node, str]()
+        kept, objections = dict.fromkeys(int8), dict[ir.Node, str]()
         while True:
             more = {node: why for node in kept if (why := self._why(node, kept, facts))}
             if not more:
-                return found
-            found |= more
+                return objections
+            objections |= more
             kept = {node: None for node in kept if node not in more}
 
     def _why(

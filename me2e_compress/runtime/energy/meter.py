@@ -239,7 +239,7 @@ def measure_energy(
     *,
     threads: int = 1,
     provider: Provider = CPU,
-    said: Mapping[str, str] | None = None,
+    metadata: Mapping[str, str] | None = None,
     on_window: Callable[[int, int, str], None] = lambda done, total, name: None,
 ) -> dict[str, EnergyResult]:
     """Measure the energy of models, one frame at a time, in alternating windows.
@@ -247,7 +247,7 @@ def measure_energy(
     Recurrent state is fed forward and reset where scenes begin. The first frames, as
     many as fit into 500 MB, are repeated as often as needed. Nothing else may run on
     the device. ``models`` has ONNX files by name; ``counter``
-    is described at ``open_counter``; ``said`` is metadata that overrides the models'
+    is described at ``open_counter``; ``metadata`` overrides the models'
     own; ``on_window`` is called with windows done, windows in all, and the model's
     name.
 
@@ -268,7 +268,7 @@ def measure_energy(
         results = dict.fromkeys(models, opened.measured(schedule or EnergySchedule()))
     else:
         with contextlib.closing(opened):
-            work = _work_of(models, frames, threads, provider, said)
+            work = _work_of(models, frames, threads, provider, metadata)
             meter = EnergyMeter(opened, schedule, on_window=on_window)
             results = meter.measure(work)
     # Each result carries the digest of its model's files.
@@ -283,7 +283,7 @@ def _work_of(
     frames: Frames,
     threads: int,
     provider: Provider,
-    said: Mapping[str, str] | None,
+    metadata: Mapping[str, str] | None,
 ) -> dict[str, Work]:
     """Open each model, to replay endlessly the first frames that fit into memory."""
     kept, size = list[Frame](), 0
@@ -296,7 +296,11 @@ def _work_of(
         raise EnergyError("energy: there is no frame to run")
     sessions = {
         name: Session(
-            path, threads=threads, int8_kernels=True, provider=provider, said=said
+            path,
+            threads=threads,
+            int8_kernels=True,
+            provider=provider,
+            metadata=metadata,
         )
         for name, path in models.items()
     }

@@ -163,8 +163,8 @@ def sampled_work(node: ir.Node) -> tuple[Counts, Counts] | None:
 
     On maps that fit the cache, only the conversion of the integers is counted.
     """
-    found, shape = find(node), static_shape(node.inputs[0])
-    macs = None if found is None else found[0].cost(node, found[1]).macs
+    plugin, shape = find(node), static_shape(node.inputs[0])
+    macs = None if plugin is None else plugin[0].cost(node, plugin[1]).macs
     if macs is None or shape is None:
         return None
     if 4 * math.prod(shape[1:]) > CACHE_BYTES:
