@@ -305,7 +305,7 @@ FRAMES = 2
 class FirstDifferenceResult(Result):
     """Where a graph begins to differ from its source."""
 
-    keys = ("*found",)
+    keys = ("*difference",)
     reference: Path
     candidate: Path
     difference: FirstDifference

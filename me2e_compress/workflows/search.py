@@ -231,7 +231,7 @@ class SensitivityResult(Result):
         score: loss of the choice; None where nothing is int8.
     """
 
-    keys = ("*found",)
+    keys = ("*sensitivity",)
     output: Path
     sensitivity: Sensitivity
     choice: Int8Choice
