@@ -183,8 +183,13 @@ def main() -> int:
             for line in differences(job, before, after):
                 different += 1
                 print(line, flush=True)
-        print(f"{different} of {len(jobs)} recipes differ from {base}")
-    return int(different > 0)
+        # a run in which nothing is written would show no difference either
+        empty = sum(not (after.folder / job.file).is_file() for job in jobs)
+        print(
+            f"{different} of {len(jobs)} recipes differ from {base};"
+            f" {empty} write no file"
+        )
+    return int(different > 0 or empty == len(jobs))
 
 
 def last_tag() -> str:
