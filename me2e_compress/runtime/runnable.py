@@ -177,19 +177,19 @@ def compiled_or_expanded(
     if not ours:
         return model, ()
     copy = model.clone()
+    known = [node for node in unknown_nodes(copy) if node.op_type in ours]
     # Bodies depend on the types and ranks of their inputs, which a file may leave out.
     if any(
         value is not None and (value.type is None or value.shape is None)
-        for node in unknown_nodes(copy)
-        if node.op_type in ours
+        for node in known
         for value in node.inputs
     ):
         graph.infer_shapes(copy)
     # Expand the fused nodes, unless the file has bodies that may run.
     fused = [
         node
-        for node in unknown_nodes(copy)
-        if node.op_type in ours and operators.find(node) is not None
+        for node in known
+        if operators.find(node) is not None
         if compiled or node.op_identifier() not in copy.functions
     ]
     try:
@@ -201,13 +201,14 @@ def compiled_or_expanded(
     except PreconditionError as error:
         raise GraphError(str(error)) from error
     # Kernels that can read int8 do.
-    for node in list(unknown_nodes(copy)) if compiled else ():
-        if node.domain == kernels.DOMAIN and node.op_type in _FLOAT_KERNELS:
+    calls = [node for node in unknown_nodes(copy) if node.domain == kernels.DOMAIN]
+    for node in calls:
+        if compiled and node.op_type in _FLOAT_KERNELS:
             read_int8(node, *_surroundings(node, copy, taken))
     # List the kernels, and import their domain.
     needed: dict[str, kernels.CompiledKernel] = {}
-    for node in unknown_nodes(copy):
-        if node.domain == kernels.DOMAIN and node.graph is not None:
+    for node in calls:
+        if node.graph is not None:
             needed[node.op_type] = _COMPILED[node.op_type]
             node.graph.opset_imports[kernels.DOMAIN] = 1
     return copy, tuple(needed.values())
