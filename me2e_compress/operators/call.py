@@ -15,7 +15,7 @@ from me2e_compress.graph.rewrite import (
     replace_value,
     value_names,
 )
-from me2e_compress.graph.shapes import REFUSALS, infer_node
+from me2e_compress.graph.shapes import REFUSALS, infer_node, static_shape
 
 AttributeValue: TypeAlias = int | float | str | Sequence[int]
 Attributes: TypeAlias = Mapping[str, AttributeValue]
@@ -29,6 +29,7 @@ class FusedCall:
     New nodes inherit its module and origins, and their shape and type are inferred at
     once. ``names`` of all values of the model grow; None collects them from the whole
     graph, which is slow for many nodes. ``compiled`` allows calls of compiled kernels.
+    ``sources`` are the nodes that the next new one stands for: at first this one.
     """
 
     def __init__(
@@ -43,7 +44,7 @@ class FusedCall:
         if node.graph is None:
             raise GraphError(f"node {node.name} is not in a graph")
         self.node, self.opset, self.by = node, opset, by
-        self.compiled = compiled
+        self.compiled, self.sources = compiled, (node,)
         self._where: ir.Graph | ir.Function = node.graph
         self.names = names_in(self._where) if names is None else names
         self._stem = node.name or str(node.outputs[0].name)
@@ -65,7 +66,7 @@ class FusedCall:
         for index, value in enumerate(made.outputs):
             value.name = fresh_name(f"{name}_{index}", self.names)
         # Shape and type are inferred at once
-        provenance.inherit(made, [self.node], by=self.by)
+        provenance.inherit(made, self.sources, by=self.by)
         self._where.insert_before(self.node, made)
         _infer(made, self.opset)
         return made.outputs[0]
@@ -81,7 +82,7 @@ class FusedCall:
         result.type = result.type if result.type is not None else old.type
         name = old.name
         if isinstance(self._where, ir.Graph):
-            replace_value(old, result)
+            replace_value(old, result, self.names)
         else:
             old.replace_all_uses_with(result, replace_graph_outputs=True)
         self._where.remove(node, safe=True)
@@ -183,6 +184,12 @@ class FusedCall:
         if result.shape is None:
             result.shape = _shape(sizes)
         return result
+
+    def view(self, value: ir.Value, shape: Sequence[int]) -> ir.Value:
+        """Reshape a value, unless it has that shape."""
+        if static_shape(value) == tuple(shape):
+            return value
+        return self.reshape(value, shape)
 
     def transpose(self, value: ir.Value, order: Sequence[int]) -> ir.Value:
         """Permute the axes of a value."""

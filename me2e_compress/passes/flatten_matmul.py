@@ -8,13 +8,14 @@ import numpy as np
 import onnx_ir as ir
 
 from me2e_compress.display import counted
-from me2e_compress.graph import array_of, is_standard, opset_of, static_shape
+from me2e_compress.graph import is_standard, opset_of, static_shape
 from me2e_compress.graph.nodes import VIEWS, graphs_of
-from me2e_compress.graph.rewrite import remove_dead, value_names
+from me2e_compress.graph.rewrite import remove_dead, remove_unread, value_names
 from me2e_compress.graph.summary import value_bytes
+from me2e_compress.operators import FusedCall
 from me2e_compress.passes.base import Context, Pass, PassResult
-from me2e_compress.passes.hoist_linear.rebuilding import NodeWriter, Rewriter
 from me2e_compress.passes.hoist_linear.repeats import broadcasts
+from me2e_compress.passes.hoist_linear.sums import replace
 from me2e_compress.passes.work import (
     MOVED_BYTES_PER_NODE,
     SMALL_PRODUCTS_PER_NODE,
@@ -49,20 +50,21 @@ class FlattenMatmul(Pass):
 
     def run(self, model: ir.Model, context: Context) -> PassResult:
         """Rewrite every product that has a cheaper form, until none has."""
-        if opset_of(model) < OLDEST_OPSET:
+        opset = opset_of(model)
+        if opset < OLDEST_OPSET:
             return PassResult(model, 0)
         repeats = flattened = open_shapes = 0
         names = value_names(model.graph)
         for body in graphs_of(model.graph):
-            rewriter = Rewriter(body, names, self.name)
             for node in list(body):
                 if node.op_type != "MatMul" or not is_standard(node):
                     continue
                 product: ir.Node | None = node
                 open_shapes += _shapes(node) is None
                 while product is not None:
-                    repeats += _read_unrepeated(product, rewriter)
-                    product = _flatten(product, rewriter)
+                    call = FusedCall(product, opset=opset, by=self.name, names=names)
+                    repeats += _read_unrepeated(call)
+                    product = _flatten(call)
                     flattened += product is not None
         if repeats or flattened:
             remove_dead(model.graph)
@@ -128,8 +130,9 @@ class _Form:
         return price + 2 * moved / MOVED_BYTES_PER_NODE
 
 
-def _flatten(product: ir.Node, rewriter: Rewriter) -> ir.Node | None:
+def _flatten(call: FusedCall) -> ir.Node | None:
     """Write the cheapest form of a product, and return its node; None if it has one."""
+    product = call.node
     shapes, (left, right) = _shapes(product), product.inputs[:2]
     if shapes is None or left is None or right is None:
         return None
@@ -143,7 +146,7 @@ def _flatten(product: ir.Node, rewriter: Rewriter) -> ir.Node | None:
     now = small_products(*shapes) / SMALL_PRODUCTS_PER_NODE
     if best is None or best.price >= now:
         return None
-    return _write(product, best, rewriter)
+    return _write(call, best)
 
 
 def _form(
@@ -171,51 +174,41 @@ def _form(
     return _Form(rows, axes, order, len(kept), matrix, sizes, turned)
 
 
-class _Writer(NodeWriter):
-    """Writes around a product; constants that only it reads stay constants."""
-
-    def __init__(self, rewriter: Rewriter, product: ir.Node) -> None:
-        super().__init__(rewriter, product, product.outputs[0].name)
-
-    def shape(
-        self, value: ir.Value, shape: Shape, op_type: str = "Reshape"
-    ) -> ir.Value:
-        """Return a value in another shape."""
-        known = array_of(value)
-        owned = len(value.uses()) == 1 and not value.is_graph_output()
-        if known is None or not owned or static_shape(value) == shape:
-            return super().shape(value, shape, op_type)
-        return self.rewriter.store(known.reshape(shape), value.name or "constant")
+def _view(call: FusedCall, value: ir.Value, shape: Shape) -> ir.Value:
+    """Return a value in another shape; a constant that is read here alone stays one."""
+    owned = len(value.uses()) == 1 and not value.is_graph_output()
+    if owned and static_shape(value) != shape:
+        return call.reshape_table(value, shape)
+    return call.view(value, shape)
 
 
-def _write(product: ir.Node, form: _Form, rewriter: Rewriter) -> ir.Node:
-    old, writer = product.outputs[0], _Writer(rewriter, product)
+def _write(call: FusedCall, form: _Form) -> ir.Node:
+    old, rows = call.node.outputs[0], form.rows
     # Both operands as they are multiplied
-    rows = form.rows
     if form.moves:
-        rows = writer.transpose(writer.shape(rows, form.axes), form.order)
-    rows = writer.shape(rows, form.rows_shape)
+        rows = call.transpose(_view(call, rows, form.axes), form.order)
+    rows = _view(call, rows, form.rows_shape)
     shape = _turned(form.matrix_shape) if form.turned else form.matrix_shape
-    matrix = writer.shape(form.matrix, shape)
+    matrix = _view(call, form.matrix, shape)
     if form.turned:
         rank = len(shape)
-        matrix = writer.transpose(matrix, (*range(rank - 2), rank - 1, rank - 2))
-    new = writer.write("MatMul", [rows, matrix], form.shape)
+        matrix = call.transpose(matrix, (*range(rank - 2), rank - 1, rank - 2))
+    new = call.add("MatMul", [rows, matrix])
     node = new.producer()
     assert node is not None
     # The product as it was
     if form.moves:
         sizes = (*form.sorted_axes[form.batch : -1], form.shape[-1])
-        new = writer.shape(new, (*form.shape[: form.batch], *sizes))
+        new = call.view(new, (*form.shape[: form.batch], *sizes))
         back = [form.order.index(axis) for axis in range(len(form.order))]
-        new = writer.transpose(new, back)
-    rewriter.swap(old, writer.shape(new, static_shape(old) or ()))
+        new = call.transpose(new, back)
+    replace(call, call.view(new, static_shape(old) or ()))
     return node
 
 
-def _read_unrepeated(product: ir.Node, rewriter: Rewriter) -> int:
+def _read_unrepeated(call: FusedCall) -> int:
     """Read operands in front of their repetitions where the product broadcasts."""
-    count = 0
+    product, count = call.node, 0
     for index in (0, 1):
         shapes, value = _shapes(product), product.inputs[index]
         if shapes is None or value is None:
@@ -228,9 +221,8 @@ def _read_unrepeated(product: ir.Node, rewriter: Rewriter) -> int:
         batch = np.broadcast_shapes(*(shape[:-2] for shape in pair))
         same = batch == np.broadcast_shapes(*(shape[:-2] for shape in shapes))
         if small[-2:] == shapes[index][-2:] and same:
-            view = _Writer(rewriter, product).shape(source, small)
-            product.replace_input_with(index, view)
-            rewriter.drop(value)
+            product.replace_input_with(index, _view(call, source, small))
+            remove_unread([value])
             count += 1
     return count
 

@@ -1,6 +1,6 @@
 """The edits that every rewrite is made of; none of them touches the interface."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 import onnx_ir as ir
@@ -8,7 +8,7 @@ import onnx_ir.passes.common as common
 
 from me2e_compress.errors import GraphError
 from me2e_compress.graph import graphs_of, provenance
-from me2e_compress.graph.nodes import Array, bodies_of, is_read, nodes_in
+from me2e_compress.graph.nodes import Array, bodies_of, is_read, nodes_in, producer_of
 
 
 def value_names(graph: ir.Graph) -> set[str]:
@@ -141,6 +141,17 @@ def remove_node(node: ir.Node) -> None:
     for body in bodies_of(node):
         _empty(body)
     graph.remove(node, safe=True)
+
+
+def remove_unread(values: Iterable[ir.Value | None]) -> None:
+    """Remove the makers of values, and all that only they needed, if nothing reads."""
+    waiting = [producer_of(value) for value in values]
+    while waiting:
+        node = waiting.pop()
+        if node is None or node.graph is None or any(map(is_read, node.outputs)):
+            continue
+        waiting.extend(node.predecessors())
+        remove_node(node)
 
 
 def _empty(body: ir.Graph) -> None:

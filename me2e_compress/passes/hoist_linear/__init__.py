@@ -9,8 +9,8 @@ from me2e_compress.display import counted
 from me2e_compress.graph import macs, nodes_of, opset_of
 from me2e_compress.graph.nodes import graphs_of
 from me2e_compress.graph.rewrite import remove_dead, value_names
+from me2e_compress.operators import FusedCall
 from me2e_compress.passes.base import Context, Pass, PassResult
-from me2e_compress.passes.hoist_linear.rebuilding import Rewriter
 from me2e_compress.passes.hoist_linear.repeats import before_repeat
 from me2e_compress.passes.hoist_linear.sums import layer_at, multiply_earlier
 from me2e_compress.passes.work import BYTES_PER_NODE
@@ -56,29 +56,26 @@ class HoistLinear(Pass):
             return PassResult(model, 0)
         unread = remove_dead(model.graph)  # it would hold on to what it reads
         names, macs_before = value_names(model.graph), _macs(model)
-        rewriters = [
-            Rewriter(body, names, self.name) for body in graphs_of(model.graph)
-        ]
-        products = others = left = 0
+        bodies, products, others, left = list(graphs_of(model.graph)), 0, 0, 0
         for _ in range(ROUNDS):
             moved, left = products + others, 0  # those of the last round are left
-            for rewriter in rewriters:
-                for node in list(rewriter.graph):
-                    if node.graph is not rewriter.graph:
-                        continue
-                    layer = layer_at(node)
-                    before = before_repeat(node, rewriter, opset)
-                    if before:
-                        products += layer is not None
-                        others += layer is None
-                        continue
-                    left += before is False
-                    if layer is not None:
-                        price = self.bytes_per_node
-                        products += multiply_earlier(layer, rewriter, price)
+            for node in [node for body in bodies for node in body]:
+                if node.graph is None:
+                    continue
+                layer, by = layer_at(node), self.name
+                before = before_repeat(FusedCall(node, opset=opset, by=by, names=names))
+                if before:
+                    products += layer is not None
+                    others += layer is None
+                    continue
+                left += before is False
+                if layer is not None:
+                    last = layer.nodes[-1]
+                    call = FusedCall(last, opset=opset, by=by, names=names)
+                    products += multiply_earlier(layer, call, self.bytes_per_node)
+            remove_dead(model.graph)
             if products + others == moved:
                 break
-            remove_dead(model.graph)
         less = f"{(macs_before - _macs(model)) / 1e6:,.1f} MMACs fewer"
         notes = (
             (products, f"moved {counted(products, 'product')}: {less}"),

@@ -32,6 +32,7 @@ from me2e_compress.graph.nodes import (
     permutation_of,
     sole_reader,
 )
+from me2e_compress.operators import FusedCall
 from me2e_compress.passes.digits import (
     Digit,
     Digits,
@@ -43,8 +44,7 @@ from me2e_compress.passes.digits import (
     split_like,
     whole,
 )
-from me2e_compress.passes.hoist_linear.rebuilding import NodeWriter, Rewriter
-from me2e_compress.passes.hoist_linear.sums import is_product
+from me2e_compress.passes.hoist_linear.sums import is_product, replace
 from me2e_compress.passes.work import (
     MACS_PER_NODE,
     MOVED_BYTES_PER_NODE,
@@ -256,17 +256,17 @@ class _Plan:
     flat: tuple[int, ...] | None = None
 
 
-def before_repeat(node: ir.Node, rewriter: Rewriter, opset: int) -> bool | None:
+def before_repeat(call: FusedCall) -> bool | None:
     """Compute a node before the repetition of what it reads.
 
     Returns False where that does not pay, and None where nothing it reads repeats.
     """
-    plan = _plan(node, opset)
+    plan = _plan(call.node, call.opset)
     if plan is None:
         return None
-    if not _pays(node, plan):
+    if not _pays(call.node, plan):
         return False
-    _rewrite(node, plan, rewriter)
+    _rewrite(call, plan)
     return True
 
 
@@ -426,38 +426,41 @@ def _pays(node: ir.Node, plan: _Plan) -> bool:
     return before - after > moved / MOVED_BYTES_PER_NODE
 
 
-def _rewrite(node: ir.Node, plan: _Plan, rewriter: Rewriter) -> None:
-    old, rank = node.outputs[0], len(plan.small)
-    writer = NodeWriter(rewriter, node, old.name)
+def _rewrite(call: FusedCall, plan: _Plan) -> None:
+    node, rank = call.node, len(plan.small)
     # Operands once; an operator along the last axis keeps to it
-    inputs: list[ir.Value | None] = [
-        _written(node, operand, rewriter) for operand in plan.operands
-    ]
+    inputs = [_written(call, operand) for operand in plan.operands]
     inputs.extend(node.inputs[len(inputs) :])
-    attributes = dict(node.attributes)
+    attributes = {name: each.value for name, each in node.attributes.items()}
+    call.sources = (node,)
     if node.op_type in ALONG_AXIS:
-        attributes["axis"] = ir.AttrInt64("axis", rank - 1)
+        attributes["axis"] = rank - 1
     elif node.op_type in REDUCTIONS and "axes" in attributes:
-        attributes["axes"] = ir.AttrInt64s("axes", [rank - 1])
+        attributes["axes"] = [rank - 1]
     elif node.op_type in REDUCTIONS:
-        inputs[1] = rewriter.target((rank - 1,), f"{old.name}_axes")
-    shape = plan.flat or plan.small
-    new = writer.write(node.op_type, inputs, shape, list(attributes.values()))
+        inputs[1] = call.integers([rank - 1])
+    new = call.add(node.op_type, inputs, attributes)
     # Repeat the result, unless its readers see no difference
     axes = [
         operand.repeated for operand in plan.operands if operand.repeated is not None
     ]
-    writer.sources = (node, *dict.fromkeys(one for each in axes for one in each.nodes))
-    new = writer.shape(writer.shape(new, plan.small), plan.large, "Expand")
-    rewriter.swap(old, writer.shape(new, static_shape(old) or ()))
+    call.sources = (node, *dict.fromkeys(one for each in axes for one in each.nodes))
+    new = _expanded(call, call.view(new, plan.small), plan.large)
+    replace(call, call.view(new, static_shape(node.outputs[0]) or ()))
 
 
-def _written(node: ir.Node, operand: _Operand, rewriter: Rewriter) -> ir.Value:
-    """Return what a node reads instead, written where needed."""
-    value, axes = operand.value, operand.repeated
-    if operand.numbers is not None:
-        return rewriter.store(operand.numbers, f"{value.name}_once")
-    if axes is None:
+def _expanded(call: FusedCall, value: ir.Value, shape: tuple[int, ...]) -> ir.Value:
+    if static_shape(value) == shape:
         return value
-    writer = NodeWriter(rewriter, node, value.name, axes.nodes)
-    return writer.shape(writer.shape(axes.source, axes.small), operand.shape, "Expand")
+    return call.add("Expand", [value, call.integers(shape)])
+
+
+def _written(call: FusedCall, operand: _Operand) -> ir.Value | None:
+    """Return what a node reads instead, written where needed."""
+    axes = operand.repeated
+    if operand.numbers is not None:
+        return call.constant(operand.numbers, "once")
+    if axes is None:
+        return operand.value
+    call.sources = axes.nodes
+    return _expanded(call, call.view(axes.source, axes.small), operand.shape)

@@ -33,7 +33,8 @@ from me2e_compress.graph.nodes import (
     permutation_of,
     sole_reader,
 )
-from me2e_compress.passes.hoist_linear.rebuilding import NodeWriter, Rewriter
+from me2e_compress.graph.rewrite import remove_unread
+from me2e_compress.operators import FusedCall
 from me2e_compress.passes.work import MACS_PER_NODE, item_bytes
 
 DEEPEST = 32
@@ -188,11 +189,12 @@ class Form:
     write: Callable[[Numbers], Terms]
 
 
-def multiply_earlier(
-    layer: LinearLayer, rewriter: Rewriter, bytes_per_node: int
-) -> bool:
-    """Write a layer in its cheapest form; False if it has that."""
-    search = _Search(layer, rewriter, bytes_per_node)
+def multiply_earlier(layer: LinearLayer, call: FusedCall, bytes_per_node: int) -> bool:
+    """Write a layer in its cheapest form; False if it has that.
+
+    ``call`` is of the last node of the layer.
+    """
+    search = _Search(layer, call, bytes_per_node)
     source = layer.source
     now, best = search.direct(source), search.of(source, owned=True, depth=DEEPEST)
     if now.cost - best.cost < 1.0 or best.macs >= now.macs:
@@ -205,26 +207,32 @@ def multiply_earlier(
         terms = [*best.write(matrix), *([] if bias is None else [bias])]
         new = search.total(terms, static_shape(layer.result) or ())
     except OverflowError:
-        rewriter.undo(search.writer.values)
+        remove_unread(reversed(search.written))
         return False
-    rewriter.swap(layer.result, new)
+    replace(call, new)
     return True
+
+
+def replace(call: FusedCall, new: ir.Value) -> None:
+    """Put a value in the place of a node's, and remove what only that node needed."""
+    read = call.node.inputs
+    call.put(new)
+    remove_unread(read)
 
 
 class _Search:
     """Finds and writes the forms of one layer's product."""
 
     def __init__(
-        self, layer: LinearLayer, rewriter: Rewriter, bytes_per_node: int
+        self, layer: LinearLayer, call: FusedCall, bytes_per_node: int
     ) -> None:
-        self.result, self.rewriter = layer.result, rewriter
+        self.result, self.call = layer.result, call
+        call.sources = layer.nodes
         self.columns = (static_shape(layer.result) or (0,))[-1]
         self.item_cost = item_bytes(layer.result) / max(bytes_per_node, 1e-9)
         self.known: dict[ir.Value, Form] = {}
         self.stored: dict[int, tuple[Numbers, ir.Value]] = {}
-        self.writer = NodeWriter(
-            rewriter, layer.product, layer.result.name, layer.nodes
-        )
+        self.written: list[ir.Value] = []
 
     def of(self, value: ir.Value, *, owned: bool, depth: int) -> Form:
         """Return the cheapest form; ``owned``: only this product needs its reader."""
@@ -232,7 +240,7 @@ class _Search:
             owned = owned and sole_reader(value) is not None
             forms = [self.direct(value, owned=owned)]
             node = value.producer()
-            if depth and node is not None and node.graph is self.rewriter.graph:
+            if depth and node is not None and node.graph is self.call.node.graph:
                 for rule in (self._two_layers, self._over_sum, self._before_view):
                     form = rule(value, node, owned, depth - 1)
                     forms.extend(() if form is None else (form,))
@@ -249,9 +257,7 @@ class _Search:
         macs = math.prod(shape) * self.columns
 
         def write(matrix: Numbers) -> Terms:
-            inputs, rows = [value, self._stored(matrix, "weight")], shape[:-1]
-            new = self.writer.write("MatMul", inputs, (*rows, self.columns))
-            return [new]
+            return [self._write("MatMul", value, self._stored(matrix, "weight"))]
 
         return Form(macs, 1.0 + macs / MACS_PER_NODE, write)
 
@@ -271,7 +277,7 @@ class _Search:
         cost -= owned * len(layer.nodes) + gone / MACS_PER_NODE
 
         def write(matrix: Numbers) -> Terms:
-            self.writer.sources += layer.nodes
+            self.call.sources += layer.nodes
             bias = layer.bias()
             terms = inner.write(layer.matrix() @ matrix)
             return [*terms, *([] if bias is None else [bias @ matrix])]
@@ -295,7 +301,7 @@ class _Search:
         cost += minus * shape[-1] * self.columns * self.item_cost
 
         def write(matrix: Numbers) -> Terms:
-            self.writer.sources += (node,)
+            self.call.sources += (node,)
             return [*one.write(matrix), *two.write(-matrix if minus else matrix)]
 
         return Form(one.macs + two.macs, cost, write)
@@ -316,12 +322,13 @@ class _Search:
         source_form = self.of(source, owned=owned, depth=depth)
 
         def write(matrix: Numbers) -> Terms:
-            self.writer.sources += (node,)
+            self.call.sources += (node,)
             rows = self.total(source_form.write(matrix), (*inner[:-1], self.columns))
-            moved = (*shape[:-1], self.columns)
-            if order is None:
-                return [self.writer.shape(rows, moved)]
-            return [self.writer.transpose(rows, order)]
+            if order is not None:
+                self.written.append(self.call.transpose(rows, order))
+            else:
+                self.written.append(self.call.view(rows, (*shape[:-1], self.columns)))
+            return self.written[-1:]
 
         return Form(source_form.macs, source_form.cost + (not owned), write)
 
@@ -343,9 +350,12 @@ class _Search:
             items[:2] = items[1], items[0]
         first, *rest = items
         for item in rest:
-            sizes = static_shape(first) or (), static_shape(item) or ()
-            first = self.writer.write("Add", [first, item], np.broadcast_shapes(*sizes))
-        return self.writer.shape(first, shape)
+            first = self._write("Add", first, item)
+        return self.call.view(first, shape)
+
+    def _write(self, op_type: str, *inputs: ir.Value) -> ir.Value:
+        self.written.append(self.call.add(op_type, inputs))
+        return self.written[-1]
 
     def _stored(self, numbers: Numbers, name: str) -> ir.Value:
         """Return the initializer of a matrix or of constant rows."""
@@ -356,7 +366,7 @@ class _Search:
                 array = numbers.astype(dtype.numpy())
             if overflow(numbers, array):
                 raise OverflowError(name)
-            value = self.rewriter.store(array, f"{self.result.name}_{name}")
+            value = self.call.constant(array, name)
             self.stored[id(numbers)] = numbers, value
         return self.stored[id(numbers)][1]
 
