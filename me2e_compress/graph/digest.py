@@ -35,7 +35,7 @@ def _graph(hasher: "hashlib.blake2b", graph: ir.Graph) -> None:
     for name in sorted(graph.initializers):
         hasher.update(f"={name}\n".encode())
         tensor = graph.initializers[name].const_value
-        hasher.update(b"?" if tensor is None else _tensor(tensor))
+        hasher.update(b"?" if tensor is None else digest_of_tensor(tensor))
     _nodes(hasher, graph)
 
 
@@ -64,15 +64,17 @@ def _attribute(hasher: "hashlib.blake2b", attribute: ir.Attr) -> None:
         for graph in attribute.as_graphs():
             _graph(hasher, graph)
     elif attribute.type == ir.AttributeType.TENSOR:
-        hasher.update(_tensor(attribute.value))  # as_tensor() checks a protocol: slow
+        tensor = attribute.value  # as_tensor() checks a protocol: slow
+        hasher.update(digest_of_tensor(tensor))
     elif attribute.type == ir.AttributeType.TENSORS:
         for tensor in attribute.as_tensors():
-            hasher.update(_tensor(tensor))
+            hasher.update(digest_of_tensor(tensor))
     else:
         hasher.update(repr(attribute.value).encode())
 
 
-def _tensor(tensor: ir.TensorProtocol) -> bytes:
+def digest_of_tensor(tensor: ir.TensorProtocol) -> bytes:
+    """Hash type, shape and numbers of a tensor, once for every object."""
     known = _TENSORS.get(tensor)
     if known is None:
         # SHA-256 has processor instructions: half the time of BLAKE2 on weights.

@@ -1,7 +1,6 @@
 """Remove what does nothing or is there twice."""
 
 import dataclasses
-import hashlib
 from collections import Counter
 from typing import ClassVar
 
@@ -9,6 +8,7 @@ import onnx_ir as ir
 import onnx_ir.passes.common as common
 
 from me2e_compress.graph import infer_shapes, opset_of, provenance, static_shape
+from me2e_compress.graph.digest import digest_of_tensor
 from me2e_compress.graph.nodes import (
     attribute_values,
     draws,
@@ -22,9 +22,6 @@ from me2e_compress.passes.base import Context, Pass, PassResult
 from me2e_compress.passes.eliminate_redundant.rules import MergeSite, identity_of, merge
 
 COMMUTATIVE = frozenset({"Add", "And", "Equal", "Mul", "Or", "Xor"})
-
-EDGE_BYTES = 64
-"""How much of each end of a weight is compared before all of it is hashed."""
 
 
 def share_nodes(graph: ir.Graph, by: str) -> int:
@@ -62,35 +59,16 @@ def share_nodes(graph: ir.Graph, by: str) -> int:
 
 def share_initializers(graph: ir.Graph) -> int:
     """Merge equal initializers into the first and count the removed ones."""
-    # Group by type, shape and edges; hash only within a group
-    groups: dict[object, list[ir.Value]] = {}
-    for value in graph.initializers.values():
-        if value.const_value is not None and not value.is_graph_input():
-            groups.setdefault(_edges(value.const_value), []).append(value)
-    count = 0
-    for group in groups.values():
-        first: dict[bytes, ir.Value] = {}
-        for value in group if len(group) > 1 else ():
-            tensor, content = value.const_value, b""
-            if tensor is not None and tensor.dtype != ir.DataType.STRING:
-                content = hashlib.blake2b(tensor.tobytes(), digest_size=16).digest()
-            known = first.setdefault(content, value)
-            if known is not value and not value.is_graph_output():
-                value.replace_all_uses_with(known)
-                del graph.initializers[value.name or ""]
-                count += 1
+    count, first = 0, dict[bytes, ir.Value]()
+    for value in list(graph.initializers.values()):
+        if value.const_value is None or value.is_graph_input():
+            continue
+        known = first.setdefault(digest_of_tensor(value.const_value), value)
+        if known is not value and not value.is_graph_output():
+            value.replace_all_uses_with(known)
+            del graph.initializers[value.name or ""]
+            count += 1
     return count
-
-
-def _edges(tensor: ir.TensorProtocol) -> object:
-    head = (tensor.dtype, tuple(tensor.shape.numpy()))
-    if tensor.dtype == ir.DataType.STRING:
-        return (*head, tuple(tensor.numpy().reshape(-1).tolist()))
-    if tensor.dtype.bitwidth < 8 or tensor.nbytes <= 2 * EDGE_BYTES:
-        return (*head, tensor.tobytes())
-    flat = tensor.numpy().reshape(-1)
-    size = EDGE_BYTES // flat.itemsize
-    return (*head, flat[:size].tobytes(), flat[-size:].tobytes())
 
 
 __all__ = ["EliminateRedundant"]
