@@ -12,16 +12,19 @@ from me2e_compress.errors import PreconditionError, RecipeError
 from me2e_compress.graph import provenance, rewrite
 from me2e_compress.graph.modules.module_map import ModuleMap, Substitute
 from me2e_compress.graph.nodes import LAYOUT_OPERATORS, makers_of, reads_of
+from me2e_compress.operators import FusedCall
 from me2e_compress.passes.base import Context, Pass, PassResult
 from me2e_compress.passes.edges import Edge, add_edge
 from me2e_compress.passes.parts import (
     Part,
-    Substitution,
     means_of,
     module_of,
     replace_readers,
     result_of,
+    shaped_like,
     within,
+    writer_for,
+    zeros_like,
 )
 
 PLANNER = "planner"
@@ -160,7 +163,7 @@ class AblateModules(Pass):
         ]
         if self.fill != "means":
             for value in exits:
-                replace_readers(value, self._instead(model, value).zeros(value))
+                replace_readers(value, zeros_like(self._writer(model, value), value))
             return [f"{value.name} reads as zeros" for value in exits]
         means, how = means_of(model, exits, context)
         for value in exits:
@@ -168,10 +171,10 @@ class AblateModules(Pass):
             replace_readers(value, rewrite.add_constant(model.graph, array, name))
         return [f"{value.name} reads as {how}" for value in exits]
 
-    def _instead(self, model: ir.Model, value: ir.Value) -> Substitution:
+    def _writer(self, model: ir.Model, value: ir.Value) -> FusedCall:
         """Return what writes for the readers of a value, those that stay first."""
         readers = sorted(value.consumers(), key=self._goes)
-        return Substitution(model.graph, readers, self.name)
+        return writer_for(model, readers, self.name)
 
     def _cut_outputs(self, model: ir.Model) -> list[str]:
         owned = [value for value in model.graph.outputs if self._goes(value.producer())]
@@ -206,7 +209,7 @@ class AblateModules(Pass):
         if self._goes(old.producer()):
             return f"{wanted.scope} is dropped itself: nothing is substituted"
         if wanted.by is None:
-            replace_readers(old, self._instead(model, old).zeros(old))
+            replace_readers(old, zeros_like(self._writer(model, old), old))
             return f"{wanted.scope} reads as zeros"
         # A substitute must stay in the graph and not read the old result
         new = result_of(model, Part.of(wanted.by, modules), like=old)
@@ -220,7 +223,7 @@ class AblateModules(Pass):
             raise PreconditionError(
                 f"{wanted.by} cannot substitute for {wanted.scope}: it reads its result"
             )
-        replace_readers(old, self._instead(model, old).shaped_like(new, old))
+        replace_readers(old, shaped_like(self._writer(model, old), new, old))
         return f"{wanted.scope} replaced by {wanted.by}"
 
 

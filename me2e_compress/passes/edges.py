@@ -15,7 +15,15 @@ from me2e_compress.graph import rewrite
 from me2e_compress.graph.modules.module_map import ModuleMap
 from me2e_compress.graph.nodes import makers_of
 from me2e_compress.graph.shapes import REFUSALS, infer_node
-from me2e_compress.passes.parts import Part, Substitution, fit, listed, stretched
+from me2e_compress.operators import FusedCall
+from me2e_compress.passes.parts import (
+    Part,
+    fit,
+    listed,
+    shaped_like,
+    stretched,
+    writer_for,
+)
 
 # Propagate the size of an axis that grew through the rest of a graph.
 
@@ -155,7 +163,7 @@ def add_edge(
         )
     # Redirect only the readers inside the reading part
     uses = [(node, index) for node, index in old.uses() if node in readers]
-    joined = _join(Substitution(model.graph, readers, by), edge, new, old)
+    joined = _join(writer_for(model, readers, by), edge, new, old)
     for node, index in uses:
         node.replace_input_with(index, joined)
     model.graph.sort()
@@ -241,20 +249,12 @@ def _as_queries(new: ir.Value, old: ir.Value) -> tuple[int, ...] | None:
     return (1,) * (len(want) - len(have)) + have
 
 
-def _join(
-    substitution: Substitution, edge: Edge, new: ir.Value, old: ir.Value
-) -> ir.Value:
-    want = graph.static_shape(old) or ()
+def _join(call: FusedCall, edge: Edge, new: ir.Value, old: ir.Value) -> ir.Value:
     if edge.how == "replace":
-        return substitution.shaped_like(new, old)
+        return shaped_like(call, new, old)
     if edge.how == "add":
+        want = graph.static_shape(old) or ()
         padded = stretched(graph.static_shape(new) or (), want) or want
-        node = ir.node("Add", [old, substitution.reshaped(new, padded)])
-    else:
-        padded = _as_queries(new, old) or ()
-        values = [old, substitution.reshaped(new, padded)]
-        node = ir.node("Concat", values, {"axis": edge.axis})
-        size = list(want)
-        size[edge.axis] += padded[edge.axis]
-        want = tuple(size)
-    return substitution.add(node, want, old, f"{old.name}_joined")
+        return call.add("Add", [old, call.view(new, padded)])
+    padded = _as_queries(new, old) or ()
+    return call.add("Concat", [old, call.view(new, padded)], {"axis": edge.axis})

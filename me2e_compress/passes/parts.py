@@ -12,7 +12,7 @@ from me2e_compress import graph
 from me2e_compress.calibration.means import token_means
 from me2e_compress.display import counted
 from me2e_compress.errors import FramesError, PreconditionError
-from me2e_compress.graph import provenance, rewrite
+from me2e_compress.graph import provenance
 from me2e_compress.graph.modules.module_map import (
     ModuleMap,
     PathGlob,
@@ -20,6 +20,7 @@ from me2e_compress.graph.modules.module_map import (
     leaving,
     scope_of,
 )
+from me2e_compress.operators import FusedCall
 from me2e_compress.passes.base import Context
 from me2e_compress.runtime.frames import Array
 
@@ -187,58 +188,34 @@ def layout_of(value: ir.Value) -> tuple[tuple[int, ...], np.dtype[np.generic]]:
     return shape, value.dtype.numpy()
 
 
-@dataclasses.dataclass(frozen=True)
-class Substitution:
-    """Writes what some readers of a graph are given; ``by`` is the pass's name."""
+def writer_for(model: ir.Model, readers: Sequence[ir.Node], by: str) -> FusedCall:
+    """Return what writes nodes for some readers; the graph is to be sorted then."""
+    there = [node for node in readers if node.graph is model.graph]
+    place = (there or [model.graph[-1]])[0]
+    call = FusedCall(place, opset=graph.opset_of(model), by=by)
+    call.sources = tuple(readers)
+    return call
 
-    where: ir.Graph
-    readers: Sequence[ir.Node]
-    by: str
 
-    def zeros(self, value: ir.Value) -> ir.Value:
-        """Add zeros of a value's shape and type, in a few bytes of any size."""
-        shape, dtype = layout_of(value)
-        filling = {"value": ir.tensor(np.zeros(1, dtype), name="zero")}
-        node = ir.node("ConstantOfShape", [self._size(shape, value)], filling)
-        return self.add(node, shape, value, f"{value.name}_zeros")
+def zeros_like(call: FusedCall, value: ir.Value) -> ir.Value:
+    """Write zeros of a value's shape and type, in a few bytes of any size."""
+    shape, _ = layout_of(value)
+    return call.full(shape, 0.0, value)
 
-    def shaped_like(self, new: ir.Value, old: ir.Value) -> ir.Value:
-        """Give ``new`` the shape of ``old``: add ones, repeat along axes of size 1.
 
-        It must fit, see :func:`fit`.
-        """
-        have, want = graph.static_shape(new), graph.static_shape(old)
-        padded = have and want and stretched(have, want)
-        if have == want or not padded or not want:
-            return new
-        shaped = self.reshaped(new, padded)
-        if padded == want:
-            return shaped
-        node = ir.node("Expand", [shaped, self._size(want, old)])
-        return self.add(node, want, new, f"{new.name}_repeated")
+def shaped_like(call: FusedCall, new: ir.Value, old: ir.Value) -> ir.Value:
+    """Give ``new`` the shape of ``old``: add ones, repeat along axes of size 1.
 
-    def reshaped(self, value: ir.Value, shape: tuple[int, ...]) -> ir.Value:
-        """Reshape a value, unless it has that shape."""
-        if graph.static_shape(value) == shape:
-            return value
-        node = ir.node("Reshape", [value, self._size(shape, value)])
-        return self.add(node, shape, value, f"{value.name}_reshaped")
-
-    def add(
-        self, node: ir.Node, shape: tuple[int, ...], like: ir.Value, name: str
-    ) -> ir.Value:
-        """Name a new node and its only output, append it, and return the output."""
-        provenance.inherit(node, self.readers, by=self.by)
-        unique = rewrite.fresh_name(name, rewrite.value_names(self.where))
-        output = node.outputs[0]
-        node.name = output.name = unique
-        output.shape, output.type = ir.Shape(shape), like.type
-        self.where.append(node)
-        return output
-
-    def _size(self, shape: tuple[int, ...], of: ir.Value) -> ir.Value:
-        array = np.array(shape, np.int64)
-        return rewrite.add_constant(self.where, array, f"{of.name}_shape")
+    It must fit, see :func:`fit`.
+    """
+    have, want = graph.static_shape(new), graph.static_shape(old)
+    padded = have and want and stretched(have, want)
+    if not padded or not want:
+        return new
+    shaped = call.view(new, padded)
+    if padded == want:
+        return shaped
+    return call.add("Expand", [shaped, call.integers(want)])
 
 
 def means_of(

@@ -216,7 +216,7 @@ def test_a_longer_value_that_breaks_an_operator_is_named() -> None:
     with pytest.raises(
         PreconditionError,
         match=r"lanes \[1,3,8\] does not fit /planner/attn/Add \(Add\), which reads"
-        r" bev_joined \[1,8,8\], places \[1,5,8\]",
+        r" /planner/attn/Add/Concat_0 \[1,8,8\], places \[1,5,8\]",
     ):
         AblateModules((), edges=(KEYS,)).run(model, context())
 
