@@ -2,19 +2,13 @@
 
 from collections.abc import Sequence
 
-import numpy as np
 import onnx_ir as ir
 
-from me2e_compress.graph import array_of, input_at, is_standard, provenance
+from me2e_compress.graph import array_of, input_at, is_standard, opset_of
 from me2e_compress.graph.nodes import graphs_of, integers_of
-from me2e_compress.graph.rewrite import (
-    add_constant,
-    fresh_name,
-    put,
-    remove_node,
-    value_names,
-)
+from me2e_compress.graph.rewrite import put, remove_node, value_names
 from me2e_compress.graph.shapes import static_shape
+from me2e_compress.operators import FusedCall
 
 
 def unpack_sequences(model: ir.Model, by: str) -> int:
@@ -27,7 +21,7 @@ def unpack_sequences(model: ir.Model, by: str) -> int:
 
     Result:  a, b = Split(x, [2, 4])         ;  y = Identity(b)
     """
-    count, names = 0, value_names(model.graph)
+    count, names, opset = 0, value_names(model.graph), opset_of(model)
     for body in graphs_of(model.graph):
         for node in list(body):
             if node.op_type not in ("SplitToSequence", "SequenceConstruct"):
@@ -38,9 +32,10 @@ def unpack_sequences(model: ir.Model, by: str) -> int:
                 continue
             if not all(_unpacks(reader, size) for reader in readers):
                 continue
-            tensors = _tensors(node, size, names, by)
+            call = FusedCall(node, opset=opset, by=by, names=names)
+            tensors = _tensors(node, size, call)
             for reader in readers:
-                _read(reader, tensors, names, by)
+                _read(FusedCall(reader, opset=opset, by=by, names=names), tensors)
             remove_node(node)
             count += 1 + len(readers)
     return count
@@ -82,66 +77,33 @@ def _unpacks(reader: ir.Node, size: int) -> bool:
     return reader.op_type in ("SequenceLength", "ConcatFromSequence")
 
 
-def _tensors(
-    node: ir.Node, size: int, names: set[str], by: str
-) -> Sequence[ir.Value | None]:
+def _tensors(node: ir.Node, size: int, call: FusedCall) -> Sequence[ir.Value | None]:
     """Return the tensors of a sequence: those of its making, or of a Split."""
     lengths = _lengths(node) if node.op_type == "SplitToSequence" else None
-    graph, source = node.graph, node.inputs[0]
+    source = node.inputs[0]
     if lengths is None or source is None:
         return node.inputs
-    assert isinstance(graph, ir.Graph)
-    stored = np.array(lengths, np.int64)
-    split = add_constant(graph, stored, f"{node.name}_lengths", names)
-    new = _insert(node, "Split", [source, split], size, names, by)
-    new.attributes["axis"] = ir.AttrInt64("axis", node.attributes.get_int("axis", 0))
-    for value in new.outputs:
+    inputs, axis = [source, call.integers(lengths)], node.attributes.get_int("axis", 0)
+    made = call.add("Split", inputs, {"axis": axis}, outputs=size).producer()
+    assert made is not None
+    for value in made.outputs:
         value.type = source.type
-    return new.outputs
+    return made.outputs
 
 
-def _read(
-    reader: ir.Node, tensors: Sequence[ir.Value | None], names: set[str], by: str
-) -> None:
+def _read(call: FusedCall, tensors: Sequence[ir.Value | None]) -> None:
     """Rewrite a reader of a sequence to read its tensors."""
-    graph = reader.graph
-    assert isinstance(graph, ir.Graph)
+    reader, by = call.node, call.by
     if reader.op_type == "SequenceAt":
         (place,) = integers_of(reader.inputs[1]) or (0,)
         put(reader, "Identity", [tensors[place]], by=by)
         return
     if reader.op_type == "SequenceLength":
-        stored = np.array(len(tensors), np.int64)
-        length = add_constant(graph, stored, f"{reader.name}_length", names)
-        put(reader, "Identity", [length], by=by)
+        put(reader, "Identity", [call.integers(len(tensors))], by=by)
         return
     # a new axis is put into each tensor before they are joined along it
     axis = reader.attributes.get_int("axis", 0)
     if reader.attributes.get_int("new_axis", 0):
-        stored = np.array([axis], np.int64)
-        axes = add_constant(graph, stored, f"{reader.name}_axes", names)
-        tensors = [
-            _insert(reader, "Unsqueeze", [tensor, axes], 1, names, by).outputs[0]
-            for tensor in tensors
-        ]
+        axes = call.integers([axis])
+        tensors = [call.add("Unsqueeze", [tensor, axes]) for tensor in tensors]
     put(reader, "Concat", tensors, by=by, attributes={"axis": axis})
-
-
-def _insert(
-    old: ir.Node,
-    op: str,
-    inputs: Sequence[ir.Value | None],
-    outputs: int,
-    names: set[str],
-    by: str,
-) -> ir.Node:
-    """Put a new node in front of an old one."""
-    name = fresh_name(f"{old.name}_{op}", names)
-    new = ir.node(op, inputs, num_outputs=outputs, name=name)
-    for place, value in enumerate(new.outputs):
-        value.name = fresh_name(f"{name}_{place}", names)
-    provenance.inherit(new, [old], by=by)
-    graph = old.graph
-    assert isinstance(graph, ir.Graph)
-    graph.insert_before(old, new)
-    return new
