@@ -51,7 +51,7 @@ def _has_operator(op_type: str) -> bool:
     return bool(onnx.defs.has(op_type, domain=""))
 
 
-def opset_of(imports: ir.Model | ir.Function) -> int:
+def opset_of(imports: ir.Model | ir.Graph | ir.Function) -> int:
     """Return the opset of ONNX's own operators that is imported; 0 if none is."""
     versions = imports.opset_imports
     return next((versions[domain] for domain in STANDARD if domain in versions), 0)

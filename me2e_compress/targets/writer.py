@@ -7,7 +7,9 @@ import numpy as np
 import numpy.typing as npt
 import onnx_ir as ir
 
+from me2e_compress import graph
 from me2e_compress.graph import provenance, rewrite
+from me2e_compress.operators import FusedCall
 
 BY = "quantize-int8"
 
@@ -19,19 +21,26 @@ class Writer:
         self.graph = where
         self._share = share
         self._constants: dict[tuple[str, bytes], ir.Value] = {}
-        self._names = rewrite.value_names(where)
+        self.names = rewrite.value_names(where)
 
     def constant(self, array: npt.NDArray[np.generic], name: str) -> ir.Value:
         """Return the initializer of an array, or add one."""
         if not self._share:
-            return rewrite.add_constant(self.graph, array, name, self._names)
+            return rewrite.add_constant(self.graph, array, name, self.names)
         kind = f"{array.dtype}{array.shape}"
         key = (kind, hashlib.sha256(array.tobytes()).digest())
         if key not in self._constants:
             self._constants[key] = rewrite.add_constant(
-                self.graph, array, name, self._names
+                self.graph, array, name, self.names
             )
         return self._constants[key]
+
+    def call(self, before: ir.Node, sources: Sequence[ir.Node]) -> FusedCall:
+        """Return what inserts nodes in front of one; they stand for the sources."""
+        opset = graph.opset_of(self.graph)
+        call = FusedCall(before, opset=opset, by=BY, names=self.names)
+        call.sources = tuple(sources)
+        return call
 
     def node(
         self,
@@ -42,7 +51,7 @@ class Writer:
         attributes: dict[str, int] | None = None,
     ) -> ir.Node:
         """Build a node with a unique name and the sources' provenance."""
-        unique = rewrite.fresh_name(name, self._names)
+        unique = rewrite.fresh_name(name, self.names)
         node = ir.node(op, inputs, attributes or {}, name=unique)
         node.outputs[0].name = unique
         provenance.inherit(node, sources, by=BY)
@@ -96,7 +105,7 @@ class Writer:
         steps = self.constant(scales, f"{name}_scale")
         # Not shared: with ``session.x64quantprecision``, which processors without VNNI
         # need, onnxruntime (1.31) refuses a zero point that two weights read
-        zero = rewrite.add_constant(self.graph, zeros, f"{name}_zero", self._names)
+        zero = rewrite.add_constant(self.graph, zeros, f"{name}_zero", self.names)
         inputs = [stored, steps, zero]
         axes = None if axis is None else {"axis": axis}
         # Weights may be shared, the name of the reader is not

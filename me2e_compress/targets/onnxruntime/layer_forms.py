@@ -16,6 +16,8 @@ import onnx_ir as ir
 from me2e_compress.errors import PreconditionError
 from me2e_compress.graph import rank_of, rewrite
 from me2e_compress.graph.nodes import sole_reader
+from me2e_compress.operators import FusedCall
+from me2e_compress.operators.call import Size
 from me2e_compress.targets.onnxruntime.region import end_of, reads_one_pixel
 from me2e_compress.targets.quantized import QUANTIZE
 from me2e_compress.targets.weights import (
@@ -27,71 +29,6 @@ from me2e_compress.targets.weights import (
     with_room,
 )
 from me2e_compress.targets.writer import Writer
-
-# Insert nodes at one place of a graph: shapes changed and restored.
-
-
-class Place:
-    """Inserts new nodes at one place, with the provenance of the old ones."""
-
-    def __init__(
-        self, writer: Writer, before: ir.Node, sources: Sequence[ir.Node]
-    ) -> None:
-        self._writer = writer
-        self._before = before
-        self._sources = sources
-
-    def node(
-        self,
-        op: str,
-        inputs: Sequence[ir.Value],
-        name: str,
-        attributes: dict[str, int] | None = None,
-    ) -> ir.Node:
-        """Insert a node; its output has the type of its first input."""
-        node = self._writer.node(op, inputs, name, self._sources, attributes)
-        if (kind := inputs[0].dtype) is not None:
-            node.outputs[0].dtype = kind
-        self._writer.graph.insert_before(self._before, node)
-        return node
-
-    def reshaped(self, value: ir.Value, shape: Sequence[int], name: str) -> ir.Value:
-        """Reshape a value to a constant shape, of which one number may be -1."""
-        target = self._writer.constant(np.array(shape, np.int64), f"{name}_shape")
-        return self.node("Reshape", [value, target], name).outputs[0]
-
-    def turned(self, value: ir.Value, axes: Sequence[int], name: str) -> ir.Value:
-        """Transpose a value."""
-        node = self.node("Transpose", [value], name)
-        node.attributes.add(ir.AttrInt64s("perm", axes))
-        return node.outputs[0]
-
-    def restored(
-        self,
-        rows: ir.Value,
-        like: ir.Value,
-        leading: Sequence[int | ir.SymbolicDim],
-        columns: int,
-        name: str,
-    ) -> ir.Value:
-        """Reshape [rows, columns] to the leading dimensions of another value."""
-        # At most one open dimension: a constant shape suffices.
-        known = [dim if isinstance(dim, int) else -1 for dim in leading]
-        if known.count(-1) <= 1:
-            return self.reshaped(rows, [*known, columns], f"{name}_ranked")
-        # Several open dimensions must be read at run time.
-        numbers = [
-            self._writer.constant(np.array([number], np.int64), f"{name}_end")
-            for number in (0, -1, columns)
-        ]
-        whole = self.node("Shape", [like], f"{name}_dims").outputs[0]
-        front = self.node("Slice", [whole, *numbers[:2]], f"{name}_leading").outputs[0]
-        target = self.node("Concat", [front, numbers[2]], f"{name}_target", {"axis": 0})
-        for value in (whole, front, target.outputs[0]):
-            value.dtype = ir.DataType.INT64
-        inputs = [rows, target.outputs[0]]
-        return self.node("Reshape", inputs, f"{name}_ranked").outputs[0]
-
 
 CHANNELS_SECOND, CHANNELS_LAST = (0, 3, 1, 2), (0, 2, 3, 1)
 
@@ -181,21 +118,36 @@ def _write_gemm(writer: Writer, product: ir.Node, size: Sequence[int]) -> ir.Nod
     if addition is None or left is None or left.shape is None or right is None:
         raise PreconditionError(f"{product.name} is not a MatMul with a bias")
     old = addition.outputs[0]
-    name = str(old.name)
-    place = Place(writer, addition, [product, addition])
+    call = writer.call(addition, [product, addition])
     # Flatten the leading dimensions, and restore them afterwards.
-    leading = list(left.shape)[:-1]
-    rows = left
-    if len(leading) > 1:
-        rows = place.reshaped(left, [-1, size[0]], f"{name}_rows")
-    gemm = place.node("Gemm", [rows, right, right], f"{name}_gemm")
+    ranked = len(left.shape) > 2
+    rows = call.reshape(left, [-1, size[0]]) if ranked else left
+    gemm = _layer(call, "Gemm", [rows, right, right])
     answer = gemm.outputs[0]
-    if len(leading) > 1:
-        answer = place.restored(answer, left, leading, size[1], name)
+    if ranked:
+        answer = call.reshape(answer, [*_leading(call, left), size[1]])
     # The result replaces that of the Add.
     answer.shape, answer.type = old.shape, old.type
     rewrite.replace_value(old, answer)
     return gemm
+
+
+def _layer(
+    call: FusedCall,
+    op_type: str,
+    inputs: Sequence[ir.Value],
+    attributes: dict[str, int] | None = None,
+) -> ir.Node:
+    """Insert a layer whose weight and bias are still to be written."""
+    made = call.add(op_type, inputs, attributes)
+    made.type, node = inputs[0].type, made.producer()
+    assert node is not None
+    return node
+
+
+def _leading(call: FusedCall, value: ir.Value) -> list[Size]:
+    """Return all dimensions of a value but the last."""
+    return [call.size(value, axis) for axis in range((rank_of(value) or 1) - 1)]
 
 
 def _write_row(writer: Writer, node: ir.Node, size: Sequence[int]) -> ir.Node:
@@ -210,13 +162,10 @@ def _write_row(writer: Writer, node: ir.Node, size: Sequence[int]) -> ir.Node:
     old, (image, weight) = node.outputs[0], node.inputs[:2]
     if image is None or weight is None:
         raise PreconditionError(f"{node.name} is not a convolution")
-    name, ones = str(old.name), [1] * (rank_of(image) or 4)
-    place = Place(writer, node, [node])
-    row = place.reshaped(image, [-1, size[1]], f"{name}_row")
-    inputs = [row, weight, weight]
-    gemm = place.node("Gemm", inputs, f"{name}_gemm", {"transB": 1})
-    shape = [-1, size[0], *ones[2:]]
-    answer = place.reshaped(gemm.outputs[0], shape, f"{name}_pixel")
+    ones, call = [1] * (rank_of(image) or 4), writer.call(node, [node])
+    row = call.reshape(image, [-1, size[1]])
+    gemm = _layer(call, "Gemm", [row, weight, weight], {"transB": 1})
+    answer = call.reshape(gemm.outputs[0], [-1, size[0], *ones[2:]])
     answer.shape, answer.type = old.shape, old.type
     rewrite.replace_value(old, answer)
     return gemm
@@ -244,15 +193,13 @@ def _write_convolution(
     assert dequantize is not None
     integers, *grid = [each for each in dequantize.inputs if each is not None]
     old, leading = last.outputs[0], list(left.shape)[:-1]
-    name, (columns, depth) = str(old.name), size[:2]
+    columns, depth = size[:2]
     # Every row becomes a pixel, while it is uint8.
-    place = Place(writer, last, [product, last])
-    pixels = place.reshaped(integers, [1, -1, 1, depth], f"{name}_pixels")
-    image = place.turned(pixels, CHANNELS_SECOND, f"{name}_image")
-    inputs = [image, *grid]
-    numbers = place.node("DequantizeLinear", inputs, f"{name}_image_float").outputs[0]
-    numbers.dtype = ir.DataType.FLOAT
-    node = place.node("Conv", [numbers, weight, weight], f"{name}_conv")
+    call = writer.call(last, [product, last])
+    pixels = call.reshape(integers, [1, -1, 1, depth])
+    image = call.transpose(pixels, CHANNELS_SECOND)
+    numbers = call.add("DequantizeLinear", [image, *grid])
+    node = _layer(call, "Conv", [numbers, weight, weight])
     rewrite.replace_value(old, node.outputs[0])
     # All up to the QuantizeLinear has the shape of an image now.
     known = [dim for dim in leading if isinstance(dim, int)]
@@ -262,9 +209,9 @@ def _write_convolution(
         value.shape = ir.Shape([1, columns, rows, 1])
     # The pixels become rows again behind it.
     answer, uses = quantize.outputs[0], list(quantize.outputs[0].uses())
-    place = Place(writer, uses[0].node, [product, last])
-    turned = place.turned(answer, CHANNELS_LAST, f"{name}_turned")
-    restored = place.restored(turned, left, leading, columns, name)
+    call = writer.call(uses[0].node, [product, last])
+    turned = call.transpose(answer, CHANNELS_LAST)
+    restored = call.reshape(turned, [*_leading(call, left), columns])
     restored.shape = ir.Shape([*leading, columns])
     for use in uses:
         use.node.replace_input_with(use.idx, restored)
