@@ -11,9 +11,8 @@ from me2e_compress.display import counted
 from me2e_compress.graph import graphs_of, provenance
 from me2e_compress.graph.modules.assign import assign
 from me2e_compress.graph.nodes import array_of, is_plugin, nodes_in, nodes_of, opset_of
-from me2e_compress.graph.opset import OLDEST_OPSET
 from me2e_compress.graph.rewrite import add_constant, lift_constants
-from me2e_compress.graph.rewrite.raise_opset import raise_opset
+from me2e_compress.graph.rewrite.raise_opset import OLDEST_OPSET, raise_opset
 from me2e_compress.graph.shapes import static_shape
 from me2e_compress.graph.validity import ORIGINAL_DOMAIN, PLUGIN_DOMAIN
 from me2e_compress.passes.base import Context, Pass, PassResult

@@ -74,7 +74,7 @@ def test_names_and_metadata_of_a_node_that_is_converted_stay(tmp_path: Path) -> 
 @pytest.mark.parametrize(
     ("body", "reason"),
     [
-        ('["n"] y = SwiGLU(x, x)', "SwiGLU 'n' cannot be written in that: No Previous"),
+        ('["n"] y = SwiGLU(x, x)', "SwiGLU 'n' cannot be written in 2.: No Previous"),
         ('["n"] y = Mod(x, x)', "Mod 'n' cannot be .* cannot be downgraded"),
         (
             '["n"] s = BitShift<direction="LEFT">(i, i) y = Relu(x)',

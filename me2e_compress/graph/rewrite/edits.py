@@ -7,8 +7,15 @@ import onnx_ir as ir
 import onnx_ir.passes.common as common
 
 from me2e_compress.errors import GraphError
-from me2e_compress.graph import graphs_of, provenance
-from me2e_compress.graph.nodes import Array, bodies_of, is_read, nodes_in, producer_of
+from me2e_compress.graph import provenance
+from me2e_compress.graph.nodes import (
+    Array,
+    bodies_of,
+    graphs_of,
+    is_read,
+    nodes_in,
+    producer_of,
+)
 
 
 def value_names(graph: ir.Graph) -> set[str]:

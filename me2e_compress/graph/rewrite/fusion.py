@@ -7,8 +7,16 @@ from collections.abc import Callable, Mapping, Sequence
 import numpy as np
 import onnx_ir as ir
 
-from me2e_compress.graph import graphs_of, input_at, is_standard, opset_of, provenance
-from me2e_compress.graph.nodes import Array, is_read, sole_reader
+from me2e_compress.graph import provenance
+from me2e_compress.graph.nodes import (
+    Array,
+    graphs_of,
+    input_at,
+    is_read,
+    is_standard,
+    opset_of,
+    sole_reader,
+)
 from me2e_compress.graph.rewrite.edits import (
     add_constant,
     fresh_name,

@@ -21,13 +21,14 @@ import numpy as np
 import onnx_ir as ir
 
 from me2e_compress.errors import GraphError
-from me2e_compress.graph import array_of, is_standard
 from me2e_compress.graph.nodes import (
     FLOATS,
     Array,
     Numbers,
+    array_of,
     is_close,
     is_read,
+    is_standard,
     maker,
     scalar_of,
     sole_maker,

@@ -1,14 +1,19 @@
 """Graphs of an older opset, written in a newer one node by node."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import onnx
 import onnx.version_converter
 import onnx_ir as ir
 
 from me2e_compress.graph import provenance
-from me2e_compress.graph.nodes import STANDARD, array_of, has_subgraph, opset_of
-from me2e_compress.graph.opset import alone, bodies, changed_since, why_not
+from me2e_compress.graph.nodes import (
+    STANDARD,
+    array_of,
+    has_subgraph,
+    is_standard,
+    opset_of,
+)
 from me2e_compress.graph.rewrite.edits import (
     add_constant,
     fresh_name,
@@ -16,6 +21,7 @@ from me2e_compress.graph.rewrite.edits import (
     replace_value,
     value_names,
 )
+from me2e_compress.graph.runtime_operators import since
 from me2e_compress.graph.shapes import infer_shapes
 
 _SCAN_AS_IS = 9
@@ -27,53 +33,114 @@ onnx 1.23 does not write; onnxruntime takes the left neighbour where it enlarges
 right one where it shrinks (GetNearestPixelFromOriginal, ``SIMPLE``)."""
 
 
+OLDEST_OPSET = 13
+"""The oldest opset that a graph is written in, as *import-normalize* does."""
+
+
 def raise_opset(model: ir.Model, opset: int, by: str) -> tuple[int, str]:
     """Write a graph in a newer opset; return the changes, and why it stays if it does.
+
+    See :func:`write_in`.
+    """
+    if opset > (known := onnx.defs.onnx_opset_version()):
+        return 0, f"onnx {onnx.__version__} converts to {known} at most"
+    before = min(opset, opset_of(model))
+    return write_in(model, before, opset, by)
+
+
+def write_in(model: ir.Model, before: int, opset: int, by: str) -> tuple[int, str]:
+    """Write a graph in another opset; return the changes, and why it stays if it does.
 
     Operators that did not change in between stay, others are converted by ONNX's
     version converter, one by one, so that names, metadata and plugins stay. Functions
     are taken along, as they are. Nothing changes unless every node can be written, and
-    those of functions stay the same.
+    those of functions stay the same. ``before`` is the newest opset that is imported.
     """
-    before, known = opset_of(model), onnx.defs.onnx_opset_version()
-    if opset > known:
-        return 0, f"onnx {onnx.__version__} converts to {known} at most"
     changed = [
-        (node, own, body is not model.graph)
+        (node, own, after, body is not model.graph)
         for body, own in bodies(model)
         for node in body.all_nodes()
-        if own < opset and changed_since(node, own, opset) and _converts(node, own)
+        if _changes(node, own, after := written(own, before, opset))
     ]
     if changed:
         infer_shapes(model)
-    # Convert all of them before the first is replaced
-    written = dict[ir.Node, ir.Graph]()
-    for node, own, in_function in changed:
-        reason = _not_converted(node, own)
-        if reason:
-            return 0, f"{node.op_type} {node.name!r} stays as it is: {reason}"
+    # Convert all of them before the first is replaced, equal ones once
+    made, known = dict[ir.Node, ir.Graph](), dict[bytes, onnx.ModelProto]()
+    for node, own, after, in_function in changed:
+        called, old = f"{node.op_type} {node.name!r}", alone(node, own)
+        if reason := _not_converted(node, own):
+            return 0, f"{called} stays as it is: {reason}"
+        key = old.SerializeToString() + bytes([after])
         try:
-            proto = onnx.version_converter.convert_version(alone(node, own), opset)
+            if key not in known:
+                known[key] = onnx.version_converter.convert_version(old, after)
         except (onnx.version_converter.ConvertError, RuntimeError) as error:
-            called = f"{node.op_type} {node.name!r}"
-            return 0, f"{called} cannot be written in {opset}: {why_not(error)}"
+            reason = " ".join(str(error).split()).rpartition("failed: ")[2]
+            return 0, f"{called} cannot be written in {after}: {reason}"
         if not in_function:
-            written[node] = ir.serde.deserialize_model(proto).graph
-        elif not _is_same(proto.graph, alone(node, own).graph):
-            return 0, f"{node.op_type} {node.name!r} of a function is another there"
-    names = value_names(model.graph)
-    for node, instead in written.items():
-        _replace(node, instead, before, names, by)
+            made[node] = ir.serde.deserialize_model(known[key]).graph
+        elif not _is_same(known[key].graph, old.graph):
+            return 0, f"{called} of a function is another there"
+    own, names = opset_of(model), value_names(model.graph)
+    for node, instead in made.items():
+        _replace(node, instead, own, names, by)
     for body, _ in bodies(model):
         for domain in STANDARD:
-            if 0 < body.opset_imports.get(domain, 0) < opset:
-                body.opset_imports[domain] = opset
-    return len(written) + 1, ""
+            if imported := body.opset_imports.get(domain, 0):
+                body.opset_imports[domain] = written(imported, before, opset)
+    return len(made) + 1, ""
 
 
-def _converts(node: ir.Node, before: int) -> bool:
-    """Return whether a node is another one in a newer opset: If and Loop take more."""
-    return not has_subgraph(node) or (node.op_type == "Scan" and before < _SCAN_AS_IS)
+def bodies(model: ir.Model) -> Iterator[tuple[ir.Graph | ir.Function, int]]:
+    """List the graph and the functions, each with its opset."""
+    main = opset_of(model)
+    yield model.graph, main
+    for function in model.functions.values():
+        yield function, opset_of(function) or main
+
+
+def written(own: int, before: int, wanted: int) -> int:
+    """Return the opset of a body once the newest of its graph is another."""
+    return min(own, wanted) if wanted < before else max(own, wanted)
+
+
+def _changes(node: ir.Node, own: int, after: int) -> bool:
+    """Return whether a standard operator is another one in another opset.
+
+    If and Loop take more types, and Scan had an axis of batches.
+    """
+    if has_subgraph(node) and (node.op_type != "Scan" or own >= _SCAN_AS_IS):
+        return False
+    before = since(node.op_type, own) if is_standard(node) else 0
+    return bool(before) and before != since(node.op_type, after)
+
+
+def alone(node: ir.Node, opset: int) -> onnx.ModelProto:
+    """Build a model of one node without names; unknown types are taken for float32.
+
+    Its values are called after their place, ``i0`` and ``o0`` first.
+    """
+    inputs = list(dict.fromkeys(value for value in node.inputs if value is not None))
+    outputs = _named(node.outputs)
+    names = {value: f"i{place}" for place, value in enumerate(inputs)}
+    names |= {value: f"o{place}" for place, value in enumerate(outputs)}
+
+    def info(value: ir.Value) -> onnx.ValueInfoProto:
+        typed = ir.Value(name=names[value], type=value.type, shape=value.shape)
+        typed.type = typed.type or ir.TensorType(ir.DataType.FLOAT)
+        return ir.serde.serialize_value(typed)
+
+    proto = ir.serde.serialize_node(node)
+    proto.name, proto.doc_string = "", ""
+    del proto.metadata_props[:]
+    for ends, values in ((proto.input, node.inputs), (proto.output, node.outputs)):
+        ends[:] = [names.get(value, "") if value else "" for value in values]
+    ports = [info(value) for value in inputs], [info(value) for value in outputs]
+    body = onnx.helper.make_graph([proto], "alone", *ports)
+    imports = [onnx.helper.make_opsetid("", opset)]
+    return onnx.helper.make_model(
+        body, opset_imports=imports, ir_version=onnx.IR_VERSION
+    )
 
 
 def _is_same(new: onnx.GraphProto, old: onnx.GraphProto) -> bool:
@@ -114,9 +181,9 @@ def _replace(
     graph = node.graph
     if not isinstance(graph, ir.Graph):
         raise TypeError(f"{node.name} is not in a graph")
-    outer = {value.name: value for value in node.inputs if value is not None}
-    for inner in instead.inputs:
-        inner.replace_all_uses_with(outer[inner.name])
+    outer = dict.fromkeys(value for value in node.inputs if value is not None)
+    for inner, value in zip(list(instead.inputs), outer, strict=True):
+        inner.replace_all_uses_with(value)
     for inner in list(instead.initializers.values()):
         if inner.const_value is not None:
             array = inner.const_value.numpy()
@@ -136,11 +203,13 @@ def _replace(
         for value in new.outputs:
             if value not in results and value.name:
                 value.name = fresh_name(f"{node.name}_{value.name}", names)
+        new.metadata_props.update(node.metadata_props)
         provenance.inherit(new, [node], by=by)
     graph.insert_before(node, nodes)
     for old, new_value in zip(_named(node.outputs), results, strict=True):
-        new_value.shape, new_value.type = old.shape, old.type
-        replace_value(old, new_value)
+        new_value.shape, new_value.type, name = old.shape, old.type, old.name
+        replace_value(old, new_value, names)
+        new_value.name = name
     remove_node(node)
 
 
