@@ -18,7 +18,7 @@ from me2e_compress.metrics.episode import COLLISIONS, InfractionKind
 from me2e_compress.metrics.route_summary import RouteSummary
 from me2e_compress.registry import documents, drafts
 from me2e_compress.runtime.atomic import write_json
-from me2e_compress.simulator.pictures.route import Moment
+from me2e_compress.simulator.pictures import Moment
 from me2e_compress.simulator.routes import Route
 from me2e_compress.simulator.scene import Actor, Ego
 from me2e_compress.simulator.world import World

@@ -16,7 +16,7 @@ from benchmarks.paper.weigh import weigh, weighed
 from me2e_compress.errors import StudyError
 from me2e_compress.evaluators.highway import runner
 from me2e_compress.evaluators.highway.engine import LocalEngine
-from me2e_compress.simulator.pictures.route import Moment
+from me2e_compress.simulator.pictures import Moment
 from me2e_compress.simulator.routes import Route
 from me2e_compress.study import Listener, Study
 from me2e_compress.study.drive_record import DriveRecord

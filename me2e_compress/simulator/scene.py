@@ -121,6 +121,11 @@ class Ego:
         return np.asarray(points @ turn + (self.x, self.y))
 
 
+def box_of(body: Actor | Ego) -> tuple[float, float, float, float, float]:
+    """Return x, y, heading, length and width."""
+    return body.x, body.y, body.heading, body.length, body.width
+
+
 @dataclass(frozen=True, slots=True)
 class Signal:
     """A light or a sign with the line at which it must be obeyed."""

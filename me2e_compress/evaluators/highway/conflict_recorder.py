@@ -6,7 +6,6 @@ driving it takes.
 
 import math
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -20,89 +19,16 @@ from me2e_compress.metrics.episode import (
     Contact,
     Encounter,
 )
-from me2e_compress.simulator.plane_geometry import Roadmap
-from me2e_compress.simulator.scene import Actor, ActorKind, Ego, Scene
+from me2e_compress.simulator.plane_geometry import (
+    Roadmap,
+    contact_times,
+    corners,
+    gaps,
+    overlaps,
+)
+from me2e_compress.simulator.scene import Actor, ActorKind, Ego, Scene, box_of
 
 Floats = npt.NDArray[np.float64]
-
-
-def corners(boxes: Floats) -> Floats:
-    """Return [..., 4, 2] corners: front left and right, rear right and left."""
-    signs = np.array([[1.0, 1.0], [1.0, -1.0], [-1.0, -1.0], [-1.0, 1.0]])
-    along = signs[:, 0] * boxes[..., 3:4] / 2
-    left = signs[:, 1] * boxes[..., 4:5] / 2
-    cos, sin = np.cos(boxes[..., 2:3]), np.sin(boxes[..., 2:3])
-    x = boxes[..., 0:1] + along * cos - left * sin
-    y = boxes[..., 1:2] + along * sin + left * cos
-    return np.stack([x, y], axis=-1)
-
-
-def overlaps(one: Floats, other: Floats) -> npt.NDArray[np.bool_]:
-    """Return [...] whether two boxes touch or overlap (separating axes)."""
-    apart = _along_axes(one, other, other[..., :2] - one[..., :2])
-    return np.asarray((np.abs(apart) <= _room(one, other)).all(axis=-1))
-
-
-def gaps(one: Floats, other: Floats) -> Floats:
-    """Return [...] metres between the outlines of two boxes, 0 where they overlap.
-
-    Between disjoint convex outlines, a corner of one is the nearest point.
-    """
-    nearest = np.minimum(_from_corners(one, other), _from_corners(other, one))
-    return np.where(overlaps(one, other), 0.0, nearest)
-
-
-def contact_times(one: Floats, other: Floats, approach: Floats) -> Floats:
-    """Return [...] seconds until two boxes touch, infinite if they never do.
-
-    Both keep their heading and velocity; ``approach`` [..., 2] is the velocity of the
-    other minus that of the first, m/s. The answer is exact: the boxes touch while their
-    projections on all four axes overlap.
-    """
-    # interval of contact on each axis
-    apart = _along_axes(one, other, other[..., :2] - one[..., :2])
-    speed, room = _along_axes(one, other, approach), _room(one, other)
-    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-        edges = np.stack([(-room - apart) / speed, (room - apart) / speed])
-    begins, ends = edges.min(axis=0), edges.max(axis=0)
-    # on an axis without motion, contact is always or never
-    still, inside = speed == 0.0, np.abs(apart) <= room
-    begins = np.where(still, np.where(inside, -np.inf, np.inf), begins).max(axis=-1)
-    ends = np.where(still, np.where(inside, np.inf, -np.inf), ends).min(axis=-1)
-    touches = (begins <= ends) & (ends >= 0.0)
-    return np.where(touches, np.maximum(begins, 0.0), np.inf)
-
-
-def _along_axes(one: Floats, other: Floats, vectors: Floats) -> Floats:
-    """Return [..., 4] vectors along and across the first box and the other."""
-    columns: list[Any] = []
-    for box in (one, other):
-        cos, sin = np.cos(box[..., 2]), np.sin(box[..., 2])
-        columns.append(vectors[..., 0] * cos + vectors[..., 1] * sin)
-        columns.append(vectors[..., 1] * cos - vectors[..., 0] * sin)
-    return np.stack(columns, axis=-1)
-
-
-def _room(one: Floats, other: Floats) -> Floats:
-    """Return [..., 4] centre distances at contact, on each axis."""
-    turn = other[..., 2] - one[..., 2]
-    cos, sin = np.abs(np.cos(turn)), np.abs(np.sin(turn))
-    columns = []
-    for box, second in ((one, other), (other, one)):
-        length, width = second[..., 3], second[..., 4]
-        columns.append((box[..., 3] + length * cos + width * sin) / 2)
-        columns.append((box[..., 4] + length * sin + width * cos) / 2)
-    return np.stack(columns, axis=-1)
-
-
-def _from_corners(one: Floats, other: Floats) -> Floats:
-    """Return [...] the smallest distance of the first's corners to the other box."""
-    away = corners(one) - other[..., None, :2]
-    cos, sin = np.cos(other[..., 2:3]), np.sin(other[..., 2:3])
-    along = np.abs(away[..., 0] * cos + away[..., 1] * sin) - other[..., 3:4] / 2
-    across = np.abs(away[..., 1] * cos - away[..., 0] * sin) - other[..., 4:5] / 2
-    outside = np.hypot(np.maximum(along, 0.0), np.maximum(across, 0.0))
-    return np.asarray(outside.min(axis=-1))
 
 
 LATEST = round(PET_HORIZON_S * 1e6 / FRAME_US)
@@ -120,8 +46,6 @@ AT_FAULT = (Contact.STANDING_PARTNER, Contact.FRONT)
 CHUNK = 256
 """Number of ego frames that are compared at once."""
 
-Box = tuple[float, float, float, float, float]
-
 
 @dataclass
 class ConflictRecorder:
@@ -133,11 +57,11 @@ class ConflictRecorder:
 
     def record(self, scene: Scene) -> None:
         """Keep one frame."""
-        self._egos.append((*_box(scene.ego), scene.ego.speed_mps))
+        self._egos.append((*box_of(scene.ego), scene.ego.speed_mps))
         rows = list[tuple[float, ...]]()
         for actor in scene.actors:
             self._kinds[actor.id] = actor.kind
-            rows.append((*_box(actor), actor.speed_mps, actor.id))
+            rows.append((*box_of(actor), actor.speed_mps, actor.id))
         self._actors.append(rows)
 
     def result(self) -> ConflictRecord:
@@ -190,7 +114,7 @@ def contact_of(ego: Ego, actor: Actor) -> Contact:
     front = ego.length / 2
     x, y = ego.x + front * math.cos(ego.heading), ego.y + front * math.sin(ego.heading)
     bumper = np.array((x, y, ego.heading, 0.0, ego.width))
-    return Contact.FRONT if overlaps(bumper, np.array(_box(actor))) else Contact.SIDE
+    return Contact.FRONT if overlaps(bumper, np.array(box_of(actor))) else Contact.SIDE
 
 
 def at_fault(contact: Contact, ego: Ego, roadmap: Roadmap) -> bool:
@@ -202,7 +126,7 @@ def at_fault(contact: Contact, ego: Ego, roadmap: Roadmap) -> bool:
     """
     if contact is not Contact.SIDE:
         return contact in AT_FAULT
-    four = corners(np.array(_box(ego)))
+    four = corners(np.array(box_of(ego)))
     driven = [lane for lane in roadmap.lanes if not lane.shoulder]
     for lane in driven:
         end = lane.centre[-1]
@@ -247,10 +171,6 @@ def _same_place(
                 pair = abs(at[0] - at[1]), *at, float(turn[k])
                 best[crossing] = min(best.get(crossing, pair), pair)
     return [pair[1:] for pair in best.values()]
-
-
-def _box(one: Ego | Actor) -> Box:
-    return one.x, one.y, one.heading, one.length, one.width
 
 
 def _velocity(rows: Floats) -> Floats:

@@ -6,11 +6,10 @@ from me2e_compress.driving.policies import Driver
 from me2e_compress.evaluators.contract import Drive
 from me2e_compress.evaluators.highway import runner
 from me2e_compress.simulator.cameras.ground import paint_texture
-from me2e_compress.simulator.pictures.route import (
+from me2e_compress.simulator.pictures import (
     Moment,
     RoutePicture,
-    write_gif,
-    write_png,
+    write_picture,
 )
 from me2e_compress.simulator.routes import Route
 from me2e_compress.simulator.world import World
@@ -39,9 +38,9 @@ def render(
     runner.drive(route, policy.open(), drive, runner.Listeners(on_moment=see))
     picture = _picture(f"{route.scenario} {route.id} {policy.label}", route, moments)
     gif, png = folder / f"{route.id}.gif", folder / f"{route.id}.png"
-    write_gif(gif, picture.frames(), EVERY_US)
+    write_picture(gif, picture.frames(), EVERY_US)
     chosen = [i * (len(moments) - 1) // (STRIP - 1) for i in range(STRIP)]
-    write_png(png, picture.strip(chosen))
+    write_picture(png, [picture.strip(chosen)])
     return gif, png
 
 

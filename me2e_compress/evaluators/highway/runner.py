@@ -30,7 +30,7 @@ from me2e_compress.metrics.route_scores import BLOCKED_SPEED_MPS, BLOCKED_US
 from me2e_compress.simulator.camera_rig import CLEAR, CameraRig
 from me2e_compress.simulator.cameras.ground import paint_texture
 from me2e_compress.simulator.cameras.renderer import Cameras
-from me2e_compress.simulator.pictures.route import Moment
+from me2e_compress.simulator.pictures import Moment
 from me2e_compress.simulator.routes import Route
 from me2e_compress.simulator.scene import Control, Ego, Scene
 from me2e_compress.simulator.world import EndReason, World

@@ -39,6 +39,11 @@ class _Body:
         x, y = self.position
         return Pose(float(x), -float(y), -float(self.heading))
 
+    @property
+    def box(self) -> tuple[float, float, float, float, float]:
+        """Its x, y, heading, length and width in highway-env's plane."""
+        return (*self.position, self.heading, self.LENGTH, self.WIDTH)
+
     def become(
         self, id: int, kind: ActorKind, size: tuple[float, float, float] | None = None
     ) -> None:

@@ -13,7 +13,7 @@ import numpy as np
 from highway_env.road.road import Road
 from highway_env.vehicle.objects import RoadObject
 
-from me2e_compress.simulator.plane_geometry import Floats
+from me2e_compress.simulator.plane_geometry import Floats, overlaps
 from me2e_compress.simulator.traffic.bodies import LOOK_AHEAD_M, Car, Walker
 from me2e_compress.simulator.traffic.network import LaneIndex, LaneTable, Network
 from me2e_compress.simulator.traffic.right_of_way import RightOfWay
@@ -254,36 +254,20 @@ class TrafficRoad(Road):  # type: ignore[misc]  # highway-env is untyped
         bodies = [*self.vehicles, *self.objects]
         if not any(body.speed > 0 for body in self.vehicles):
             return []
-        x, y = np.array([body.position for body in bodies]).T
+        boxes = np.array([body.box for body in bodies], np.float64)
+        x, y = boxes[:, 0], boxes[:, 1]
         reach = np.array([body.diagonal / 2 for body in bodies])
         moves = np.array([body.speed > 0 for body in bodies])
         dx, dy, room = x[:, None] - x, y[:, None] - y, reach[:, None] + reach
         # pairs close enough by their diagonals, then the exact test
         near = dx * dx + dy * dy < room * room
         near &= moves[:, None] | moves[None]
+        first, second = np.nonzero(np.triu(near, 1))
+        hit = overlaps(boxes[first], boxes[second])
         pairs = list[tuple[RoadObject, RoadObject]]()
-        first, second = (side.tolist() for side in np.nonzero(np.triu(near, 1)))
-        for i, j in zip(first, second, strict=True):
+        for i, j in zip(first[hit].tolist(), second[hit].tolist(), strict=True):
+            # people step aside for each other, and round things
             people = [isinstance(each, Walker) for each in (bodies[i], bodies[j])]
-            aside = all(people) or (any(people) and bodies[j] in self.objects)
-            if aside:
-                continue  # people step aside for each other, and round things
-            if overlap(bodies[i], bodies[j]):
+            if not (all(people) or (any(people) and bodies[j] in self.objects)):
                 pairs.append((bodies[i], bodies[j]))
         return pairs
-
-
-def overlap(a: RoadObject, b: RoadObject) -> bool:
-    """Return whether two rectangles overlap (separating axes)."""
-    dx = float(b.position[0] - a.position[0])
-    dy = float(b.position[1] - a.position[1])
-    turn = float(b.heading - a.heading)
-    c, s = abs(math.cos(turn)), abs(math.sin(turn))
-    for one, other in ((a, b), (b, a)):
-        ch, sh = math.cos(one.heading), math.sin(one.heading)
-        along, across = abs(dx * ch + dy * sh), abs(dy * ch - dx * sh)
-        if along > (one.LENGTH + other.LENGTH * c + other.WIDTH * s) / 2:
-            return False
-        if across > (one.WIDTH + other.LENGTH * s + other.WIDTH * c) / 2:
-            return False
-    return True

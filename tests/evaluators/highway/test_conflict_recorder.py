@@ -13,10 +13,6 @@ from me2e_compress.evaluators.highway.conflict_recorder import (
     ConflictRecorder,
     at_fault,
     contact_of,
-    contact_times,
-    corners,
-    gaps,
-    overlaps,
 )
 from me2e_compress.evaluators.highway.episode_recorder import (
     EpisodeRecorder,
@@ -29,6 +25,10 @@ from me2e_compress.simulator.plane_geometry import (
     LaneMarking,
     Roadmap,
     RoutePath,
+    contact_times,
+    corners,
+    gaps,
+    overlaps,
 )
 from me2e_compress.simulator.routes import Route
 from me2e_compress.simulator.scene import Actor, ActorKind, Ego, Event, EventKind, Scene

@@ -18,7 +18,7 @@ from me2e_compress.evaluators.highway.runner import EndingRules, Listeners, driv
 from me2e_compress.metrics.episode import Ending, InfractionKind
 from me2e_compress.metrics.route_scores import route_score
 from me2e_compress.shipped.drivers import shipped
-from me2e_compress.simulator.pictures.route import Moment
+from me2e_compress.simulator.pictures import Moment
 from me2e_compress.simulator.routes import load_routes, pick_routes
 from me2e_compress.simulator.scene import ActorKind, Ego
 from me2e_compress.simulator.world import EndReason, World

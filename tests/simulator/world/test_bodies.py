@@ -7,6 +7,7 @@ from highway_env.vehicle.behavior import IDMVehicle
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
+from me2e_compress.simulator.plane_geometry import overlaps
 from me2e_compress.simulator.scene import ActorKind, Control
 from me2e_compress.simulator.traffic.bodies import (
     DRY_GRIP_MPS2,
@@ -24,7 +25,7 @@ from me2e_compress.simulator.traffic.network import (
     flip,
 )
 from me2e_compress.simulator.traffic.right_of_way import RightOfWay
-from me2e_compress.simulator.traffic.traffic_road import TrafficRoad, overlap
+from me2e_compress.simulator.traffic.traffic_road import TrafficRoad
 
 
 def driven(control: Control, seconds: float, dt: float, speed: float) -> EgoVehicle:
@@ -132,7 +133,7 @@ def test_a_car_stops_behind_what_stands_around_the_corner() -> None:
 
     assert car.speed < 0.5
     assert car.leg == 2
-    assert not overlap(car, parked)
+    assert not overlaps(np.array(car.box), np.array(parked.box))
 
 
 def test_a_car_keeps_to_its_lane_through_a_bend() -> None:
@@ -198,7 +199,7 @@ def test_overlap_agrees_with_highway_env(
 
     expected, _, _ = are_polygons_intersecting(a.polygon(), b.polygon(), still, still)
 
-    assert overlap(a, b) == expected
+    assert overlaps(np.array(a.box), np.array(b.box)) == expected
 
 
 angles = st.floats(-3.0, 3.0)

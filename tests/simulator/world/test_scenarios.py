@@ -4,7 +4,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from me2e_compress.metrics.bench2drive import ABILITIES
-from me2e_compress.simulator.plane_geometry import Command, Lane, LaneMarking, Roadmap
+from me2e_compress.simulator.plane_geometry import (
+    Command,
+    Lane,
+    LaneMarking,
+    Roadmap,
+    overlaps,
+)
 from me2e_compress.simulator.routes import (
     EXPERT_S,
     SCENARIO_ABILITIES,
@@ -12,7 +18,6 @@ from me2e_compress.simulator.routes import (
     load_routes,
 )
 from me2e_compress.simulator.scenarios.builders import SCENARIOS, stage_of
-from me2e_compress.simulator.traffic.traffic_road import overlap
 from me2e_compress.simulator.world import World
 from tests.simulator.world.driving import drive_blind, route_of
 
@@ -51,9 +56,8 @@ def test_its_route_is_drivable_and_nobody_overlaps_at_the_start(name: str) -> No
         assert bends.max() < 0.12  # a radius of 8.3 m: the ego can turn in 7.6 m
         assert 0.98 < steps.min() <= steps.max() < 1.001
         assert world.roadmap.outside_all(path.points).max() == 0
-        assert not any(
-            overlap(a, b) for i, a in enumerate(bodies) for b in bodies[i + 1 :]
-        )
+        boxes = np.array([body.box for body in bodies])
+        assert not np.triu(overlaps(boxes[:, None], boxes), 1).any()
 
 
 @pytest.mark.parametrize("name", ["AccidentTwoWays", "Accident", "ParkingExit"])

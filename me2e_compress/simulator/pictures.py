@@ -1,0 +1,407 @@
+"""Pictures of a driven route: six cameras and the view from above, as PNG and GIF."""
+
+import io
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+from PIL import Image, ImageDraw, ImageFont
+
+from me2e_compress.errors import EvaluationError
+from me2e_compress.runtime.atomic import write_bytes
+from me2e_compress.simulator.camera_rig import CAMERA_NAMES
+from me2e_compress.simulator.cameras.ground import RESOLUTION_M, GroundTexture
+from me2e_compress.simulator.plane_geometry import corners
+from me2e_compress.simulator.scene import (
+    INFRACTIONS,
+    Actor,
+    ActorKind,
+    Ego,
+    Event,
+    PixelClass,
+    Scene,
+    Signal,
+    SignalKind,
+    SignalState,
+    box_of,
+)
+
+Bytes = npt.NDArray[np.uint8]
+Floats = npt.NDArray[np.float64]
+Colour = tuple[int, int, int]
+
+MONTAGE = (("FRONT_LEFT", "FRONT", "FRONT_RIGHT"), ("BACK_LEFT", "BACK", "BACK_RIGHT"))
+"""As in nuScenes' figures. Rear images are not mirrored: in BACK, what is to the left
+of the car is to the right of the image."""
+GAP, CAPTION = 4, 30
+"""Pixels between two pictures, and height of a line of text."""
+COLOURS = 256
+"""Colours of an animation's palette."""
+FINE = 2
+"""The view from above is drawn so much larger, then reduced: smooth edges."""
+AHEAD_M, BEHIND_M = 50.0, 22.0
+SCALE_BAR_M = 10.0
+# the colours of a paper figure: light, few
+GROUND: dict[PixelClass, Colour] = {
+    PixelClass.TERRAIN: (237, 240, 231),
+    PixelClass.SHOULDER: (221, 219, 212),
+    PixelClass.DRIVABLE: (201, 204, 209),
+    PixelClass.LANE_MARKING: (255, 255, 255),
+    PixelClass.STOP_LINE: (255, 255, 255),
+    PixelClass.CROSSWALK: (250, 250, 250),
+}
+ACTORS: dict[ActorKind, Colour] = {
+    ActorKind.PEDESTRIAN: (162, 52, 150),
+    ActorKind.BICYCLE: (0, 134, 139),
+    ActorKind.CONE: (240, 120, 32),
+    ActorKind.BARRIER: (240, 120, 32),
+    ActorKind.EMERGENCY: (196, 60, 60),
+    ActorKind.PARKED: (146, 150, 158),
+}
+VEHICLE: Colour = (96, 104, 118)
+SCREEN: Colour = (198, 212, 230)
+EGO: Colour = (24, 92, 190)
+TRAIL: Colour = (112, 158, 222)
+ROUTE: Colour = (176, 196, 224)
+PLAN: Colour = (226, 88, 22)
+BRAKE: Colour = (220, 32, 36)
+INFRACTION: Colour = (208, 16, 32)
+INK: Colour = (40, 44, 52)
+PAPER: Colour = (255, 255, 255)
+STATES: dict[SignalState, Colour] = {
+    SignalState.RED: (220, 32, 36),
+    SignalState.YELLOW: (232, 172, 16),
+    SignalState.GREEN: (28, 164, 84),
+}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Moment:
+    """The record of one frame.
+
+    Attributes:
+        scene: The whole scene.
+        images: The six cameras, uint8 [6, H, W, 3] RGB.
+        plan: [n, 2] metres in the ego frame: the plan in force; None before the first,
+            and for a policy that answers controls.
+        events: Events, at least since the moment before; a repeated event is drawn
+            once.
+    """
+
+    scene: Scene
+    images: Bytes
+    plan: Floats | None = None
+    events: tuple[Event, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class RoutePicture:
+    """Draws a route from its recorded moments.
+
+    Args:
+        title: First words of the caption: the scenario, the route, the driver.
+        texture: The ground the route was driven on.
+        route: [N, 2] world points of the route.
+        moments: In order of time, at least one.
+        tile_width: Width of a camera's tile in pixels.
+    """
+
+    title: str
+    texture: GroundTexture
+    route: Floats
+    moments: Sequence[Moment]
+    tile_width: int = 320
+
+    def __post_init__(self) -> None:
+        if not self.moments:
+            raise EvaluationError(f"{self.title}: no moments to draw")
+
+    def frame(self, index: int) -> Image.Image:
+        """Draw the six cameras, the view from above and a caption."""
+        tiles = [[self.tile(index, name) for name in names] for names in MONTAGE]
+        wide, tall = (side + GAP for side in tiles[0][0].size)
+        above = self._from_above(index, (round(0.82 * 2 * tall), 2 * tall - GAP))
+        size = 3 * wide + above.width, 2 * tall + CAPTION
+        picture = Image.new("RGB", size, PAPER)
+        for row, column in np.ndindex(2, 3):
+            picture.paste(tiles[row][column], (column * wide, row * tall))
+        picture.paste(above, (3 * wide, 0))
+        # title, time and speed, and the infractions so far in red
+        caption = f"{self.title}   {_state(self.moments[index])}"
+        left = write(picture, (6, 2 * tall + 7), caption, INK, 15)
+        names = dict.fromkeys(map(_name, self.infractions(index)))
+        write(picture, (left + 16, 2 * tall + 7), ", ".join(names), INFRACTION, 15)
+        return picture
+
+    def frames(self) -> Iterable[Image.Image]:
+        """Yield all moments."""
+        return map(self.frame, range(len(self.moments)))
+
+    def strip(self, indices: Sequence[int]) -> Image.Image:
+        """Draw moments side by side, the front camera above the view from above."""
+        side, tiles = self.tile_width, [self.tile(i, "FRONT") for i in indices]
+        below = CAPTION + GAP + tiles[0].height + GAP
+        size = len(tiles) * (side + GAP) - GAP, below + side
+        picture = Image.new("RGB", size, PAPER)
+        for column, (index, tile) in enumerate(zip(indices, tiles, strict=True)):
+            left = column * (side + GAP)
+            write(picture, (left + 4, 7), _state(self.moments[index]), INK, 14)
+            picture.paste(tile, (left, CAPTION + GAP))
+            picture.paste(self._from_above(index, (side, side)), (left, below))
+        return picture
+
+    def tile(self, index: int, name: str) -> Image.Image:
+        """Draw one camera's image, with its name."""
+        image = self.moments[index].images[CAMERA_NAMES.index(name)]
+        height = round(self.tile_width * image.shape[0] / image.shape[1])
+        size, how = (self.tile_width, height), Image.Resampling.BILINEAR
+        tile = Image.fromarray(image).resize(size, how)
+        write(tile, (5, 3), name, PAPER, 12, INK)
+        return tile
+
+    def infractions(self, index: int) -> tuple[Event, ...]:
+        """Return the infractions up to a moment, each once, in order."""
+        events = (e for moment in self.moments[: index + 1] for e in moment.events)
+        return tuple(dict.fromkeys(e for e in events if e.kind in INFRACTIONS))
+
+    @cached_property
+    def trail(self) -> Floats:
+        """[N, 2] positions of the ego, world metres."""
+        return np.array([(m.scene.ego.x, m.scene.ego.y) for m in self.moments])
+
+    @cached_property
+    def _map(self) -> Image.Image:
+        """The class raster in the figure's colours, at half its resolution."""
+        palette = np.zeros((256, 3), np.uint8)
+        for kind, colour in GROUND.items():
+            palette[kind] = colour
+        return Image.fromarray(palette[self.texture.classes]).reduce(2)
+
+    def _from_above(self, index: int, size: tuple[int, int]) -> Image.Image:
+        """Draw 72 m from top to bottom, the ego heading up; ``size`` is (w, h)."""
+        moment, ego = self.moments[index], self.moments[index].scene.ego
+        scale = size[1] * FINE / (AHEAD_M + BEHIND_M)
+        view = View(ego, scale, (size[0] * FINE / 2, AHEAD_M * scale))
+        large = size[0] * FINE, size[1] * FINE
+        # the ground: from pixels to metres east and north, then to its texels
+        texel = 2 * RESOLUTION_M
+        corner = view.to_world((0.0, 0.0)) - (self.texture.west_m, self.texture.north_m)
+        turn = np.column_stack([np.linalg.inv(view.axes), corner]) / texel
+        turn[1] *= -1.0
+        coefficients = turn.ravel().tolist()
+        picture = self._map.transform(
+            large,
+            Image.Transform.AFFINE,
+            coefficients,
+            Image.Resampling.BILINEAR,
+            fillcolor=GROUND[PixelClass.TERRAIN],
+        )
+        # layers, what matters most last
+        pen = Pen(ImageDraw.Draw(picture), view)
+        pen.line(self.route, ROUTE, 2)
+        pen.line(self.trail[: index + 1], TRAIL, 3)
+        for signal in moment.scene.signals:
+            pen.signal(signal)
+        for actor in moment.scene.actors:
+            pen.actor(actor)
+        pen.vehicle(ego, EGO)
+        if moment.plan is not None:
+            waypoints = ego.placed(moment.plan)
+            pen.line(np.vstack([[(ego.x, ego.y)], waypoints]), PLAN, 2)
+            for point in waypoints:
+                pen.disc(point, PLAN, 3.0)
+        for event in self.infractions(index):
+            pen.cross(event)
+        reduced = picture.reduce(FINE)
+        self._label(reduced, index, view)
+        return reduced
+
+    def _label(self, picture: Image.Image, index: int, view: "View") -> None:
+        """Name the infractions beside their places, each once; and draw a scale."""
+        named = dict[tuple[int, str], None]()
+        for event in self.infractions(index):
+            column, row = (view.to_pixels((event.x, event.y)) / FINE).tolist()
+            inside = 0 <= column < picture.width and 0 <= row < picture.height
+            if inside and (key := (round(row / 40), _name(event))) not in named:
+                below = 16 * sum(place == key[0] for place, _ in named)
+                left = min(column + 12, picture.width - 4 - text_width(key[1], 14))
+                write(picture, (left, row - 7 + below), key[1], INFRACTION, 14, PAPER)
+                named[key] = None
+        bottom, length = picture.height - 12, round(SCALE_BAR_M * view.scale / FINE)
+        ends = (10, bottom, 10 + length, bottom)
+        ImageDraw.Draw(picture).line(ends, INK, 2)
+        write(picture, (12, bottom - 18), f"{SCALE_BAR_M:g} m", INK, 13, PAPER)
+
+
+@dataclass(frozen=True)
+class View:
+    """The map from the world to the pixels of a view whose ego heads up.
+
+    Attributes:
+        scale: Pixels per metre.
+        anchor: (column, row) of the ego.
+    """
+
+    ego: Ego
+    scale: float
+    anchor: tuple[float, float]
+
+    @property
+    def axes(self) -> Floats:
+        """[2, 2] rows: pixels right and pixels down for metres east and north."""
+        cos, sin = math.cos(self.ego.heading), math.sin(self.ego.heading)
+        return self.scale * np.array([(sin, -cos), (-cos, -sin)])
+
+    def to_pixels(self, points: npt.ArrayLike) -> Floats:
+        """Convert world points [..., 2] to pixels (column, row)."""
+        offset = np.asarray(points, float) - (self.ego.x, self.ego.y)
+        return np.asarray(offset @ self.axes.T + self.anchor)
+
+    def to_world(self, pixel: tuple[float, float]) -> Floats:
+        """Convert a pixel to a world point."""
+        away = np.linalg.solve(self.axes, np.subtract(pixel, self.anchor))
+        return np.add(away, (self.ego.x, self.ego.y))
+
+
+@dataclass(frozen=True)
+class Pen:
+    """Draws things of the world, in metres, into a view; widths are of the picture."""
+
+    drawing: ImageDraw.ImageDraw
+    view: View
+
+    def line(self, points: npt.ArrayLike, colour: Colour, width_px: int) -> None:
+        """Draw a polyline of world points [N, 2]."""
+        pixels = self.view.to_pixels(points).ravel().tolist()
+        self.drawing.line(pixels, colour, width_px * FINE, joint="curve")
+
+    def polygon(self, points: Floats, colour: Colour) -> None:
+        """Fill a polygon of world points [N, 2]."""
+        self.drawing.polygon(self.view.to_pixels(points).ravel().tolist(), colour)
+
+    def disc(self, point: npt.ArrayLike, colour: Colour, radius_px: float) -> None:
+        """Fill a disc with a white rim around a world point."""
+        centre = self.view.to_pixels(point).tolist()
+        self.drawing.circle(centre, (radius_px + 1.0) * FINE, PAPER)
+        self.drawing.circle(centre, radius_px * FINE, colour)
+
+    def vehicle(self, body: Actor | Ego, colour: Colour) -> None:
+        """Draw a box with a lighter windscreen that shows its heading."""
+        box = corners(np.array(box_of(body)))
+        self.polygon(box, colour)
+        front_left, front_right, rear_right, rear_left = box
+        left, right = rear_left - front_left, rear_right - front_right
+        screen = [front_left + 0.22 * left, front_right + 0.22 * right]
+        screen += [front_right + 0.36 * right, front_left + 0.36 * left]
+        middle = np.mean(screen, axis=0)
+        self.polygon(middle + (np.array(screen) - middle) * 0.8, SCREEN)
+
+    def actor(self, actor: Actor) -> None:
+        """Draw a road user or an obstacle; brake lights are a red edge."""
+        colour = ACTORS.get(actor.kind, VEHICLE)
+        if actor.kind is ActorKind.PEDESTRIAN:
+            self.disc((actor.x, actor.y), colour, 3.5)
+        elif actor.length < 2.5:
+            self.polygon(corners(np.array(box_of(actor))), colour)
+        else:
+            self.vehicle(actor, colour)
+            if actor.braking:
+                self.line(corners(np.array(box_of(actor)))[2:], BRAKE, 3)
+
+    def signal(self, signal: Signal) -> None:
+        """Draw a stop line and, beside it, a lamp, an octagon or a triangle."""
+        colour = BRAKE if signal.state is None else STATES[signal.state]
+        self.line(signal.stop_line, colour, 3)
+        self.disc((signal.x, signal.y), PAPER, 6.0)
+        if signal.kind is SignalKind.TRAFFIC_LIGHT:
+            self.disc((signal.x, signal.y), colour, 5.0)
+            return
+        sides = 8 if signal.kind is SignalKind.STOP_SIGN else 3
+        centre = self.view.to_pixels((signal.x, signal.y)).tolist()
+        turned = 180 if sides == 3 else 0  # a give-way sign stands on its point
+        self.drawing.regular_polygon((centre, 6.0 * FINE), sides, turned, colour)
+
+    def cross(self, event: Event) -> None:
+        """Draw a red cross where the ego was."""
+        x, y = self.view.to_pixels((event.x, event.y)).tolist()
+        arm = 7.0 * FINE
+        for colour, width in ((PAPER, 7), (INFRACTION, 3)):
+            for slant in (arm, -arm):
+                ends = (x - arm, y - slant, x + arm, y + slant)
+                self.drawing.line(ends, colour, width * FINE)
+
+
+def write(
+    picture: Image.Image,
+    place: tuple[float, float],
+    text: str,
+    colour: Colour,
+    size_px: int,
+    halo: Colour | None = None,
+) -> float:
+    """Draw a text, its upper left corner at (column, row); return where it ends."""
+    ImageDraw.Draw(picture).text(
+        place,
+        text,
+        colour,
+        ImageFont.load_default(size_px),
+        stroke_width=0 if halo is None else 2,
+        stroke_fill=halo,
+    )
+    return place[0] + text_width(text, size_px)
+
+
+def text_width(text: str, size_px: int) -> float:
+    """Return the width of a text in pixels."""
+    return float(ImageFont.load_default(size_px).getlength(text))
+
+
+def _name(event: Event) -> str:
+    return event.kind.replace("_", " ")
+
+
+def _state(moment: Moment) -> str:
+    scene = moment.scene
+    return f"t = {scene.time_us / 1e6:.2f} s   {scene.ego.speed_mps:.1f} m/s"
+
+
+def write_picture(
+    path: Path, pictures: Iterable[Image.Image], frame_us: int = 0
+) -> None:
+    """Write one picture as PNG, or several as a GIF that loops, with one palette.
+
+    The name says which; ``frame_us`` is rounded to hundredths of a second, as GIF has
+    them.
+
+    Raises:
+        EvaluationError: The file cannot be written.
+    """
+    content, images = io.BytesIO(), list(pictures)
+    if path.suffix == ".png":
+        images[0].save(content, "PNG")
+    else:
+        # the 256 colours of a few frames from the whole animation
+        chosen = images[:: max(1, len(images) // 6)]
+        sheet = Image.fromarray(np.concatenate([np.asarray(image) for image in chosen]))
+        palette, none = sheet.quantize(COLOURS), Image.Dither.NONE
+        first, *others = (e.quantize(palette=palette, dither=none) for e in images)
+        duration = max(20, round(frame_us / 10_000) * 10)
+        first.save(
+            content,
+            "GIF",
+            save_all=True,
+            append_images=others,
+            duration=duration,
+            loop=0,
+            optimize=False,
+        )
+    try:
+        write_bytes(path, content.getvalue())
+    except OSError as error:
+        raise EvaluationError(
+            f"{path}: the picture cannot be written: {error.strerror or error}"
+        ) from error
