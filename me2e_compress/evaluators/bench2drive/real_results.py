@@ -17,10 +17,10 @@ from me2e_compress.evaluators.bench2drive.recordings import (
     read_recording,
 )
 from me2e_compress.evaluators.bench2drive.result_files import (
-    DriveRecordings,
-    FoundFiles,
     RouteRecord,
+    RunFiles,
     find_files,
+    recordings_of,
 )
 from me2e_compress.evaluators.contract import Drive, Evaluator, Listener
 from me2e_compress.metrics.episode import EgoFrame, Episode, InferenceRecord
@@ -87,17 +87,14 @@ class CollectedResults:
     notes: list[str] = field(default_factory=list)
 
     @classmethod
-    def of(cls, files: FoundFiles, routes: Path | None = None) -> Self:
+    def of(cls, files: RunFiles, routes: Path | None = None) -> Self:
         """Choose one record of each route, and read the recordings that belong to it.
 
         One of the files must hold a record. `routes` names the set; None finds it.
         """
         # what the results files are, whole or not
-        made, by_route = cls(), dict[str, list[RouteRecord]]()
-        made.broken = {str(path): why for path, why in files.broken.items()}
+        made, by_route = cls(broken=files.broken), dict[str, list[RouteRecord]]()
         for file in files.results:
-            for place, why in file.broken.items():
-                made.broken[f"{file.path}, record {place}"] = why
             for record in file.records:
                 by_route.setdefault(record.episode.route, []).append(record)
             if not file.records and not file.broken:
@@ -109,14 +106,15 @@ class CollectedResults:
         records.sort(key=lambda each: (_by_number(each.number), each.content))
         made.crashed = [each.episode.route for each in records if each.crashed]
         # episodes with frames and decisions
-        recorded = DriveRecordings(files.recordings, files.results)
-        logs = DriveRecordings(files.decisions, files.results)
+        others = list(files.recordings)
         for record in records:
-            frames = made._frames(record, recorded.of(record))
-            decisions = made._decisions(logs.of(record))
+            paths = recordings_of(record, files.recordings, files.results)
+            logs = recordings_of(record, files.decisions, files.results)
+            others = [path for path in others if path not in paths]
+            frames, decisions = made._frames(record, paths), made._decisions(logs)
             episode = replace(record.episode, frames=frames, decisions=decisions)
             made.episodes.append(episode)
-        if others := recorded.of_none:
+        if others:
             more = f" and {len(others) - 1} others" if len(others) > 1 else ""
             made.notes.insert(0, f"{others[0]}{more}: of no record")
         # which routes of the set are missing, and which are foreign
@@ -170,10 +168,7 @@ class CollectedResults:
             try:
                 raw = documents.from_json(documents.content(path), finite=False)
                 recording = read_recording(raw)
-            except OSError as error:
-                self.broken[str(path)] = str(error.strerror)
-                continue
-            except (documents.MalformedError, BrokenRecordingError) as error:
+            except (OSError, documents.MalformedError, BrokenRecordingError) as error:
                 self.broken[str(path)] = str(error)
                 continue
             if len(paths) > 1:
@@ -201,8 +196,8 @@ class Bench2DriveResults(Evaluator):
     """Read the results of real Bench2Drive or CARLA leaderboard runs.
 
     Attributes:
-        folder: Results files and recordings are found below it by what they hold; or
-            one results file.
+        folder: Results files, recordings and logs are found below it; or one results
+            file.
         metrics: Recordings (``metric_info.json``) are found below it too; None has
             none apart.
         route_file: A leaderboard's routes file, whose routes are the whole set; None
@@ -236,19 +231,13 @@ class Bench2DriveResults(Evaluator):
             apart = find_files(self.metrics)
             files.recordings += apart.recordings
             files.decisions += apart.decisions
-        # links may lead to the same file twice
+        # one folder may lie in the other
         for paths in (files.recordings, files.decisions):
             paths[:] = {path.resolve(): path for path in paths}.values()
         if not any(file.records for file in files.results):
-            # the first of what could be the cause
-            none = "no results of a leaderboard"
-            whys = [f"{none}: {path.name}: {why}" for path, why in files.broken.items()]
-            for file in files.results:
-                for place, why in file.broken.items():
-                    record = f"{file.path.name}: record {place}"
-                    whys.append(f"no whole record: {record}: {why}")
-            whys += (f"no record: {e.path.name} holds none" for e in files.results)
-            raise EvaluationError(f"{self.folder}: {[*whys, f'{none} below it'][0]}")
+            whys = (f": {place}: {why}" for place, why in files.broken.items())
+            none = f"{self.folder}: no whole record of a leaderboard below it"
+            raise EvaluationError(f"{none}{next(whys, '')}")
         return CollectedResults.of(files, self.route_file)
 
 

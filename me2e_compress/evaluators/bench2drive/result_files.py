@@ -1,10 +1,8 @@
-"""Results of a leaderboard: its records, and files found by content, not by name."""
+"""Results of a leaderboard: its files and their records."""
 
-import codecs
-import os
 import re
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import MappingProxyType
@@ -208,19 +206,9 @@ def _infractions(record: _Record) -> list[Infraction]:
 
 
 _CHECKPOINT = b'"_checkpoint"'
-_STEP = re.compile(rb'\s*\{\s*"-?\d+"\s*:\s*\{\s*"\w+"\s*:\s*\[')
-_PARTS = (b'"angular_velocity"', b'"forward_vector"')
-_BEGUN, _UTF_16 = b"begun", b"UTF-16"
-_UNREADABLE = {
-    _BEGUN: "it ends before it says what it is",
-    _UTF_16: "not UTF-8 but UTF-16, as PowerShell writes it",
-}
-_RECORDING = "metric_info.json"
-"""Name that Bench2Drive's agents use; needed if the content is ambiguous."""
-_DECISIONS = "decisions.jsonl"
-"""Name of the log of decisions: a line each, `frame` and `latency_us`."""
-_HEAD_BYTES = 4096
-_PICTURES = {".png", ".jpg", ".jpeg", ".gif", ".mp4", ".npz", ".npy", ".laz", ".bin"}
+_RECORDING, _DECISIONS = "metric_info.json", "decisions.jsonl"
+"""Names of a drive's recording, as Bench2Drive's agents have it, and of the log of its
+decisions: a line each, `frame` and `latency_us`."""
 
 
 @dataclass
@@ -236,90 +224,59 @@ class ResultFile:
 
 
 @dataclass
-class FoundFiles:
-    """Files found below a folder, ordered by path; ``broken`` ones with the reason."""
+class RunFiles:
+    """Files of a run below a folder, ordered by path.
+
+    ``broken`` says why files, and records in files, could not be read.
+    """
 
     results: list[ResultFile] = field(default_factory=list)
     recordings: list[Path] = field(default_factory=list)
     decisions: list[Path] = field(default_factory=list)
-    broken: dict[Path, str] = field(default_factory=dict)
+    broken: dict[str, str] = field(default_factory=dict)
 
 
 def holds_records(folder: Path) -> bool:
     """Return whether there is any leaderboard results file below a folder."""
-    return any(kind == _CHECKPOINT for _, kind in _kinds(folder))
+    return any(map(_is_checkpoint, _files(folder)))
 
 
-def find_files(folder: Path) -> FoundFiles:
+def find_files(folder: Path) -> RunFiles:
     """Find and read the results files below a folder, and find its recordings."""
     if not folder.exists():
         raise EvaluationError(f"{folder}: no such folder")
-    files = FoundFiles()
-    for path, kind in _kinds(folder):
+    files = RunFiles()
+    for path in _files(folder):
         if path.name == _DECISIONS:
             files.decisions.append(path)
-        # incomplete files are reported, recordings are only listed
-        if kind is None:
-            continue
-        if kind in _UNREADABLE:
-            files.broken[path] = _UNREADABLE[kind]
-            continue
-        if kind != _CHECKPOINT:
+        elif path.name == _RECORDING:
             files.recordings.append(path)
-            continue
-        try:
-            files.results.append(_read(path))
-        except documents.MalformedError as error:
-            files.broken[path] = f"not JSON: {error}"
-        except (OSError, BrokenRecordError) as error:
-            files.broken[path] = str(getattr(error, "strerror", None) or error)
+        elif _is_checkpoint(path):
+            try:
+                file = _read(path)
+            except documents.MalformedError as error:
+                files.broken[str(path)] = f"not JSON: {error}"
+            except BrokenRecordError as error:
+                files.broken[str(path)] = str(error)
+            else:
+                files.results.append(file)
+                for place, why in file.broken.items():
+                    files.broken[f"{path}, record {place}"] = why
     return files
 
 
-def _kinds(folder: Path) -> Iterator[tuple[Path, bytes | None]]:
-    """Yield every file with the bytes that identify its kind, None for others."""
+def _files(folder: Path) -> Iterable[Path]:
     if folder.is_file():
-        yield folder, _kind(folder)
-    seen = set[str]()
-    for where, folders, names in os.walk(folder, followlinks=True):
-        if (place := os.path.realpath(where)) in seen:  # links may go round in circles
-            folders.clear()
-            continue
-        seen.add(place)
-        folders.sort()
-        for name in sorted(names):
-            path = Path(where, name)
-            if path.suffix.lower() not in _PICTURES and os.path.isfile(path):
-                yield path, _kind(path)
+        return [folder]
+    return sorted(path for path in folder.rglob("*.json*") if path.is_file())
 
 
-def _kind(path: Path) -> bytes | None:
-    """Look at the beginning of a file, and at the rest if that is inconclusive."""
+def _is_checkpoint(path: Path) -> bool:
+    """Return whether a file holds results, whole or not."""
     try:
-        with path.open("rb") as file:
-            head = file.read(_HEAD_BYTES).removeprefix(codecs.BOM_UTF8)
-            # files that their name or first bytes identify
-            if path.name == _RECORDING:
-                return _PARTS[0]
-            if path.suffix == ".json":
-                if head.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
-                    return _UTF_16
-                # it ends before its first key, as after a kill
-                if b'{"_checkpoint"'.startswith(b"".join(head.split())):
-                    return _BEGUN
-            if not head.lstrip().startswith(b"{"):
-                return None
-            # the key of a checkpoint or of recorded steps in the first 4 KiB
-            if _CHECKPOINT in head:
-                return _CHECKPOINT
-            if _STEP.match(head):
-                return _PARTS[0] if all(part in head for part in _PARTS) else None
-            if path.stat().st_size > documents.LARGEST_BYTES:
-                return None
-            rest = head[-len(_CHECKPOINT) :] + file.read()
-            return _CHECKPOINT if _CHECKPOINT in rest else None
-    except OSError:
-        return None
+        return path.suffix == ".json" and _CHECKPOINT in documents.content(path)
+    except (OSError, documents.MalformedError):
+        return False  # it cannot be read, or is too large
 
 
 def _read(path: Path) -> ResultFile:
@@ -346,42 +303,28 @@ class _Document(BaseModel):
     checkpoint: _Checkpoint = Field(alias="_checkpoint")
 
 
-class DriveRecordings:
-    """Finds the recording (or log) of a record, and those that match no record.
+def recordings_of(
+    record: RouteRecord, paths: Sequence[Path], results: Sequence[ResultFile]
+) -> tuple[Path, ...]:
+    """Return the recordings (or logs) of a record, best match first; usually one.
 
     A drive's name ends in its start time, so repeated drives of a route differ. The
-    recording's folder or file has that name, sometimes with the name of the routes file
-    as a prefix. A recording next to the only record of a folder belongs to that record.
+    folder of a recording, or one above it, has that name, sometimes with the name of
+    the routes file as a prefix. A recording next to the only record of a folder belongs
+    to that record.
     """
-
-    def __init__(self, paths: Sequence[Path], results: Sequence[ResultFile]) -> None:
-        self._names = {path: (*path.parent.parts, path.stem) for path in paths}
-        self._taken = set[Path]()
-        alone = Counter(file.path.parent for file in results)
-        self._beside = {
-            record.content: file.path.parent
-            for file in results
-            if alone[file.path.parent] == 1 and len(file.records) == 1
-            for record in file.records
-        }
-
-    def of(self, record: RouteRecord) -> tuple[Path, ...]:
-        """Return the recordings of a record, best match first; usually one."""
-        exact, prefixed = list[Path](), list[Path]()
-        for path, names in self._names.items() if record.recording else ():
-            if record.recording in names:
-                exact.append(path)
-            elif any(each.endswith(f"_{record.recording}") for each in names):
-                prefixed.append(path)
-        matches = (*exact, *prefixed)
-        if not matches:
-            where = self._beside.get(record.content)
-            matches = tuple(path for path in self._names if path.parent == where)
-            matches = matches if len(matches) == 1 else ()
-        self._taken.update(matches)
-        return matches
-
-    @property
-    def of_none(self) -> list[Path]:
-        """Recordings that matched no record asked for so far."""
-        return [path for path in self._names if path not in self._taken]
+    exact, prefixed = list[Path](), list[Path]()
+    for path in paths if record.recording else ():
+        if record.recording in path.parent.parts:
+            exact.append(path)
+        elif any(each.endswith(f"_{record.recording}") for each in path.parent.parts):
+            prefixed.append(path)
+    if exact or prefixed:
+        return (*exact, *prefixed)
+    # the only record of its folder
+    holders = [file for file in results if record in file.records]
+    folders = {file.path.parent for file in holders if len(file.records) == 1}
+    alone = Counter(file.path.parent for file in results)
+    beside = [path for path in paths if alone[path.parent] == 1]
+    beside = [path for path in beside if path.parent in folders]
+    return tuple(beside) if len(beside) == 1 else ()
