@@ -8,6 +8,7 @@ import socket
 import threading
 import time
 from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import dataclass, field
 from multiprocessing.connection import Connection
 from multiprocessing.context import SpawnProcess
@@ -171,53 +172,30 @@ class LocalEngine:
         self, policy: Driver, drive: Drive, routes: Sequence[Route]
     ) -> Iterator[Driven]:
         """Yield each route as it finishes; closing the iterator ends the processes."""
-        # queues between the threads and this one
-        waiting: queue.SimpleQueue[Route] = queue.SimpleQueue()
-        finished: queue.SimpleQueue[Driven | Exception] = queue.SimpleQueue()
-        for route in routes:
-            waiting.put(route)
-        stop = threading.Event()
-        threads = [
-            threading.Thread(
-                target=_watch,
-                args=(RouteWorker(policy, drive), waiting, finished, stop),
-            )
-            for _ in range(min(self.workers, len(routes)))
-        ]
+        count = max(1, min(self.workers, len(routes)))
+        workers = [RouteWorker(policy, drive) for _ in range(count)]
+        stop, idle = threading.Event(), queue.SimpleQueue[RouteWorker]()
+        for worker in workers:
+            idle.put(worker)
+
+        def drive_route(route: Route) -> Driven | None:
+            worker = idle.get()
+            try:
+                return worker.drive(route, stop)
+            finally:
+                idle.put(worker)
+
+        threads = ThreadPoolExecutor(count)
         try:
-            for thread in threads:
-                thread.start()
-            # an error of any thread ends the evaluation
-            for _ in routes:
-                driven = finished.get()
-                if isinstance(driven, Exception):
-                    raise driven
-                yield driven
+            # an error of any route ends the evaluation
+            for future in as_completed(threads.submit(drive_route, e) for e in routes):
+                if (driven := future.result()) is not None:
+                    yield driven
         finally:
             stop.set()
-            for thread in threads:
-                thread.join()
-
-
-def _watch(
-    worker: RouteWorker,
-    waiting: queue.SimpleQueue[Route],
-    finished: queue.SimpleQueue[Driven | Exception],
-    stop: threading.Event,
-) -> None:
-    """Drive waiting routes in one process; errors go to the main thread."""
-    try:
-        while not stop.is_set():
-            driven = worker.drive(waiting.get_nowait(), stop)
-            if driven is None:
-                return
-            finished.put(driven)
-    except queue.Empty:
-        return
-    except Exception as error:
-        finished.put(error)
-    finally:
-        worker.close()
+            threads.shutdown(cancel_futures=True)
+            for worker in workers:
+                worker.close()
 
 
 CONNECT_TIMEOUT_S = 5.0
