@@ -23,10 +23,11 @@ in `me2e_compress.driving.realtime`, what a decision costs in
 """
 
 from dataclasses import dataclass
-from typing import NamedTuple, Protocol, TypeAlias, runtime_checkable
+from typing import Annotated, NamedTuple, Protocol, TypeAlias, runtime_checkable
 
 import numpy as np
 import numpy.typing as npt
+from pydantic import Field
 
 from me2e_compress.errors import EvaluationError
 from me2e_compress.runtime.frames import Array
@@ -74,6 +75,9 @@ def fits(shape: Shape, wanted: Shape) -> bool:
 
 
 Triple = tuple[float, float, float]
+Positive: TypeAlias = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
+"""An option that is a finite number above 0."""
+Count: TypeAlias = Annotated[int, Field(ge=0)]
 
 
 @dataclass(frozen=True, slots=True)

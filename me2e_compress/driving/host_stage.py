@@ -7,13 +7,14 @@ import abc
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import ClassVar, Literal
+from typing import Annotated, ClassVar, Literal
 
 import numpy as np
 import numpy.typing as npt
-from pydantic import GetCoreSchemaHandler
+from pydantic import Field, GetCoreSchemaHandler
 from pydantic_core import CoreSchema
 
+from me2e_compress.driving.contract import Positive
 from me2e_compress.errors import EvaluationError
 from me2e_compress.registry import Registry
 
@@ -121,24 +122,12 @@ class CollisionOptimizer(HostStage):
     output: str = "occupancy"
     front_m: float = 48.0
     left_m: float = 24.0
-    cell_m: float = 1.0
-    threshold: float = 0.5
-    radius_m: float = 5.0
-    sigma_m: float = 1.0
-    weight: float = 5.0
+    cell_m: Positive = 1.0
+    threshold: Annotated[float, Field(ge=0.0, lt=1.0)] = 0.5
+    radius_m: Positive = 5.0
+    sigma_m: Positive = 1.0
+    weight: Positive = 5.0
     solver: Literal["SLSQP", "L-BFGS-B"] = "SLSQP"
-
-    def __post_init__(self) -> None:
-        for option in ("cell_m", "radius_m", "sigma_m", "weight"):
-            value = getattr(self, option)
-            if not 0.0 < value < math.inf:
-                raise EvaluationError(
-                    f"{self.name}: {option} {value:g} is not a positive number"
-                )
-        if not 0.0 <= self.threshold < 1.0:
-            raise EvaluationError(
-                f"{self.name}: threshold {self.threshold:g}: from 0 to below 1"
-            )
 
     def work(
         self, plan: Floats, outputs: Mapping[str, npt.NDArray[np.generic]]

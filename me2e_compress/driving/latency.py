@@ -18,6 +18,7 @@ import numpy.typing as npt
 from pydantic import GetCoreSchemaHandler
 from pydantic_core import CoreSchema
 
+from me2e_compress.driving.contract import Count, Positive
 from me2e_compress.errors import EvaluationError
 from me2e_compress.registry import Registry
 from me2e_compress.runtime.latency_trace import LatencyTrace
@@ -127,12 +128,6 @@ LATENCY_SOURCES: Registry[LatencySource] = Registry(
 )
 
 
-def check_positive(what: str, value: float) -> None:
-    """Check an option of a latency source."""
-    if not 0.0 < value < float("inf"):
-        raise EvaluationError(f"latency {what} {value:g} is not a positive number")
-
-
 @dataclass(frozen=True)
 class FixedLatency(LatencySource):
     """The same time for every decision.
@@ -142,13 +137,7 @@ class FixedLatency(LatencySource):
     """
 
     name: ClassVar[str] = "fixed"
-    latency_us: int = 0
-
-    def __post_init__(self) -> None:
-        if self.latency_us < 0:
-            raise EvaluationError(
-                f"latency fixed: {self.latency_us} us: must be 0 or more"
-            )
+    latency_us: Count = 0
 
     def on_route(self, route: str) -> Charge:
         """Charge the same on every route."""
@@ -177,10 +166,9 @@ class FrameRate(FixedLatency):
 
     name: ClassVar[str] = "fps"
     latency_us: int = field(default=0, init=False)
-    fps: float
+    fps: Positive
 
     def __post_init__(self) -> None:
-        check_positive("fps", self.fps)
         object.__setattr__(self, "latency_us", round(1e6 / self.fps))
 
 
@@ -201,14 +189,11 @@ class TraceLatency(LatencySource):
     name: ClassVar[str] = "trace"
     trace: Path | tuple[int, ...] | None = None
     in_order: bool = False
-    scale: float = 1.0
-    seed: int = 0
+    scale: Positive = 1.0
+    seed: Count = 0
 
     def __post_init__(self) -> None:
-        """Check the options before anything drives."""
-        check_positive("trace: scale", self.scale)
-        if self.seed < 0:
-            raise EvaluationError(f"latency: seed {self.seed}: must be 0 or more")
+        """Read the trace before anything drives."""
         if not self.lacks_trace and not self.samples_us:
             raise EvaluationError("latency trace: there are no samples")
 
@@ -267,10 +252,7 @@ class MeasuredLatency(LatencySource):
 
     name: ClassVar[str] = "measured"
     measures: ClassVar[bool] = True
-    scale: float = 1.0
-
-    def __post_init__(self) -> None:
-        check_positive("measured: scale", self.scale)
+    scale: Positive = 1.0
 
     def on_route(self, route: str) -> Charge:
         """Charge the measured time."""
@@ -363,10 +345,7 @@ class LimitedLatency(LayeredLatency):
     """
 
     name: ClassVar[str] = "limited"
-    fps: float
-
-    def __post_init__(self) -> None:
-        check_positive("limited: fps", self.fps)
+    fps: Positive
 
     def layered(self, latency_us: int, facts: DecisionFacts) -> int:
         """Charge no less than the period."""
@@ -393,16 +372,9 @@ class HostStageLatency(LayeredLatency):
     """
 
     name: ClassVar[str] = "host-stage"
-    per_iteration_us: int
-    per_cell_us: int = 0
-    per_call_us: int = 0
-
-    def __post_init__(self) -> None:
-        costs = self.per_iteration_us, self.per_cell_us, self.per_call_us
-        if min(costs) < 0:
-            raise EvaluationError(
-                f"latency host-stage: a cost of {min(costs)} us: must be 0 or more"
-            )
+    per_iteration_us: Count
+    per_cell_us: Count = 0
+    per_call_us: Count = 0
 
     def layered(self, latency_us: int, facts: DecisionFacts) -> int:
         """Charge for iterations, cells and the call."""

@@ -9,7 +9,7 @@ import re
 import sys
 from collections.abc import Iterable, Mapping
 from importlib.metadata import EntryPoint
-from typing import Any, ClassVar, Generic, Protocol, TypeVar
+from typing import Any, ClassVar, Generic, Protocol, TypeVar, get_type_hints
 
 import pydantic
 from pydantic_core import CoreSchema, core_schema
@@ -355,8 +355,8 @@ def options_of(cls: type) -> tuple[Option, ...]:
     docs, options = _docs(cls), list[Option]()
     for field in fields_of(cls):
         default, kind = default_of(field), field.type
-        if not isinstance(kind, str):
-            kind = inspect.formatannotation(kind)
+        if not isinstance(kind, str):  # bounds of pydantic's are left out
+            kind = inspect.formatannotation(get_type_hints(cls)[field.name])
         given = default is dataclasses.MISSING
         text = None if given else write_value(default)
         doc = docs.get(field.name, "")

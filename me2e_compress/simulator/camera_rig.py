@@ -8,9 +8,11 @@ centre is at (c + 0.5, r + 0.5).
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Annotated, Literal
 
 import numpy as np
 import numpy.typing as npt
+from pydantic import Field
 
 from me2e_compress.errors import EvaluationError
 
@@ -25,6 +27,11 @@ road than sky. The cameras look along the horizon (no pitch, no roll)."""
 SMALLEST_SIDE_PX, LARGEST_SIDE_PX = 16, 4096
 
 
+CameraName = Literal[
+    "FRONT", "FRONT_LEFT", "FRONT_RIGHT", "BACK", "BACK_LEFT", "BACK_RIGHT"
+]
+
+
 @dataclass(frozen=True, slots=True)
 class Camera:
     """One pinhole camera, named as in nuScenes and Bench2Drive, without ``CAM_``.
@@ -34,7 +41,7 @@ class Camera:
     centre.
     """
 
-    name: str
+    name: CameraName
     yaw_deg: float
     fov_deg: float
     x_m: float
@@ -130,9 +137,12 @@ def fixed_point(pixels: Floats) -> npt.NDArray[np.int32]:
 # Weather and sensor faults that a route can be driven in.
 
 
+Share = Annotated[float, Field(ge=0.0, le=1.0)]
+
+
 @dataclass(frozen=True, slots=True)
 class Weather:
-    """Weather and sensor faults. The default is a clear day.
+    """Weather and sensor faults, read from words. The default is a clear day.
 
     Args:
         fog_m: Meteorological visibility in metres (contrast 5 %); None for no fog.
@@ -142,45 +152,15 @@ class Weather:
         noise: Standard deviation of the sensor's noise in grey levels, 0 to 64.
         dropped: Names of cameras that fail: their images are black.
         seed: Seed of rain and noise.
-
-    Raises:
-        EvaluationError: An option is out of range or a camera is unknown.
     """
 
-    fog_m: float | None = None
-    night: float = 0.0
-    rain: float = 0.0
-    brightness: float = 1.0
-    noise: float = 0.0
-    dropped: tuple[str, ...] = ()
-    seed: int = 0
-
-    def __post_init__(self) -> None:
-        if self.fog_m is not None and not 1.0 <= self.fog_m <= 100_000.0:
-            raise EvaluationError(
-                f"weather option fog_m = {self.fog_m} is out of range: "
-                "1 to 100000 metres, or None"
-            )
-        for name, value, most in (
-            ("night", self.night, 1.0),
-            ("rain", self.rain, 1.0),
-            ("brightness", self.brightness, 4.0),
-            ("noise", self.noise, 64.0),
-        ):
-            if not 0.0 <= value <= most:
-                raise EvaluationError(
-                    f"weather option {name} = {value} is out of range: 0 to {most:g}"
-                )
-        for camera in self.dropped:
-            if camera not in CAMERA_NAMES:
-                raise EvaluationError(
-                    f"weather option dropped: no camera {camera!r}; there are "
-                    f"{', '.join(CAMERA_NAMES)}"
-                )
-        if self.seed < 0:
-            raise EvaluationError(
-                f"weather option seed = {self.seed} is out of range: 0 or more"
-            )
+    fog_m: Annotated[float, Field(ge=1.0, le=100_000.0)] | None = None
+    night: Share = 0.0
+    rain: Share = 0.0
+    brightness: Annotated[float, Field(ge=0.0, le=4.0)] = 1.0
+    noise: Annotated[float, Field(ge=0.0, le=64.0)] = 0.0
+    dropped: tuple[CameraName, ...] = ()
+    seed: Annotated[int, Field(ge=0)] = 0
 
 
 CLEAR = Weather()

@@ -20,7 +20,7 @@ from pydantic import (
 from pydantic_core import PydanticCustomError
 
 from me2e_compress.calibration.dataset import CalibrationSet
-from me2e_compress.driving.contract import RouteInfo
+from me2e_compress.driving.contract import Count, Positive, RouteInfo
 from me2e_compress.driving.policies import POLICIES, driver_named
 from me2e_compress.driving.shipped_adapters import adapter_file, shipped_adapters
 from me2e_compress.errors import EvaluationError, FramesError, StudyError
@@ -92,6 +92,7 @@ def _passes(given: object) -> tuple[Pass, ...]:
 File = Annotated[Path, BeforeValidator(_beside)]
 Name = Annotated[str, AfterValidator(_file_or_name)]
 PolicyText = Annotated[str, AfterValidator(_policy)]
+AtLeastOne = Annotated[int, Field(ge=1)]
 
 
 @with_config(FORM)
@@ -159,43 +160,21 @@ class Timing:
         threads: Threads of onnxruntime.
         baseline_median_s: Median latency of the baseline on the target device; it sets
             one scale for all models. None takes this machine as it is.
-
-    Raises:
-        StudyError: A number is not positive.
     """
 
-    samples: int = 200
-    threads: int = 1
-    baseline_median_s: float | None = None
-
-    def __post_init__(self) -> None:
-        median_s = self.baseline_median_s
-        if self.samples < 1 or self.threads < 1:
-            raise StudyError(
-                f"latency: {self.samples} samples on {self.threads} threads: both must "
-                "be 1 or more"
-            )
-        if median_s is not None and not 0.0 < median_s < float("inf"):
-            raise StudyError(f"latency: a median of {median_s} s is not positive")
+    samples: AtLeastOne = 200
+    threads: AtLeastOne = 1
+    baseline_median_s: Positive | None = None
 
 
 @with_config(FORM)
 @dataclass(frozen=True)
 class StudyBlock:
-    """Some variants under some conditions, named in the order of the block's tables.
-
-    Raises:
-        StudyError: A name is invalid, or there is nothing to drive.
-    """
+    """Some variants under some conditions, named in the order of the block's tables."""
 
     name: str
-    variants: tuple[str, ...]
-    conditions: tuple[str, ...]
-
-    def __post_init__(self) -> None:
-        check_name("block", self.name)
-        if not self.variants or not self.conditions:
-            raise StudyError(f"block {self.name}: there is nothing to drive")
+    variants: Annotated[tuple[str, ...], Field(min_length=1)]
+    conditions: Annotated[tuple[str, ...], Field(min_length=1)]
 
 
 @with_config(FORM)
@@ -207,23 +186,11 @@ class FramesToRecord:
         frames: Number of frames to calibrate on.
         held_out: Number of frames to measure fidelity and latency on, of the next seed.
         seed: Seed of the routes.
-
-    Raises:
-        StudyError: There are none at all, or the seed is negative.
     """
 
-    frames: int
-    held_out: int
-    seed: int = 0
-
-    def __post_init__(self) -> None:
-        if min(self.frames, self.held_out) < 1:
-            raise StudyError(
-                f"record: {self.frames} frames and {self.held_out} held out: both must"
-                " be 1 or more"
-            )
-        if self.seed < 0:
-            raise StudyError(f"record: seed {self.seed}: must be 0 or more")
+    frames: AtLeastOne
+    held_out: AtLeastOne
+    seed: Count = 0
 
 
 class Pair(NamedTuple):
@@ -259,8 +226,8 @@ class Study:
         plugins: Libraries of operators for the provider.
 
     Raises:
-        StudyError: There is nothing to drive, a name is repeated or unknown, the seed
-            is negative, or passes or a trace lack frames.
+        StudyError: There is nothing to drive, a name is repeated or unknown, or passes
+            or a trace lack frames.
         EvaluationError: The evaluator or its routes are unknown.
     """
 
@@ -273,7 +240,7 @@ class Study:
     frames: File | None = None
     held_out: File | None = None
     timing: Annotated[Timing, Field(alias="latency")] = field(default_factory=Timing)
-    seed: int = 0
+    seed: Count = 0
     provider: Provider = CPU
     to_record: Annotated[FramesToRecord | None, Field(alias="record")] = None
     blocks: Annotated[tuple[StudyBlock, ...], Field(alias="block")] = ()
@@ -294,8 +261,6 @@ class Study:
             )
         self._check_conditions(names)
         self._check_blocks_and_pairs(names)
-        if self.seed < 0:
-            raise StudyError(f"seed {self.seed}: must be 0 or more")
         # variants that name no policy take the study's
         for each in self.variants:
             if not (each.policy or self.policy):

@@ -75,8 +75,8 @@ def test_the_gradient_is_that_of_the_cost() -> None:
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("collision-optimizer{radius_m=0}", "radius_m 0 is not a positive number"),
-        ("collision-optimizer{threshold=1}", "threshold 1: from 0 to below 1"),
+        ("collision-optimizer{radius_m=0}", "radius_m: Input should be greater than 0"),
+        ("collision-optimizer{threshold=1}", "threshold: Input should be less than 1"),
         ("collision-optimizer{solver=IPOPT}", "solver: Input should be 'SLSQP'"),
     ],
 )

@@ -11,7 +11,7 @@ from me2e_compress.errors import Me2eError, StudyError
 from me2e_compress.manager import recipe
 from me2e_compress.passes import Pass
 from me2e_compress.study import Condition, Study, Timing, Variant, run_study
-from me2e_compress.study.definition import FramesToRecord, StudyBlock
+from me2e_compress.study.definition import StudyBlock
 from me2e_compress.study.drive_record import DriveRecord
 from me2e_compress.study.workload import held_frames, workload
 from tests.docs.pages import EXAMPLE
@@ -27,7 +27,6 @@ from tests.study.conftest import BLIND, FASTER, IDEAL, ROUTES, SLOW, Here, Make
         ({"conditions": (IDEAL, IDEAL)}, "2 conditions are named ideal"),
         ({"baseline": "quick"}, "'quick' is not a variant; there are blind, slow"),
         ({"routes": ()}, "no route to drive"),
-        ({"seed": -1}, "seed -1: must be 0 or more"),
         ({"pairs": (("slow.ideal", "slow.fog"),)}, r"pair: 'slow.fog' is no VARIANT.C"),
         (
             {"conditions": (Condition("device", "trace"),), "held_out": None},
@@ -92,14 +91,6 @@ def test_a_driver_that_is_no_model_takes_nothing(options: dict[str, object]) -> 
 
 
 @pytest.mark.parametrize(
-    "numbers", [(0, 1, None), (1, 0, None), (1, 1, 0.0), (1, 1, float("nan"))]
-)
-def test_a_timing_that_measures_nothing(numbers: tuple[int, int, float | None]) -> None:
-    with pytest.raises(Me2eError, match="latency: "):
-        Timing(*numbers)
-
-
-@pytest.mark.parametrize(
     ("options", "words"),
     [
         ({}, "give a latency or mean_of"),
@@ -107,7 +98,7 @@ def test_a_timing_that_measures_nothing(numbers: tuple[int, int, float | None]) 
         ({"latency": "none", "dt_ms": 30.0}, "a step of 30 ms: it must divide 50 ms"),
         ({"latency": "none", "weather": "hail=1"}, "weather option 'hail'"),
         ({"latency": "none", "latency_model": "lifo"}, "there are drop, fifo"),
-        ({"latency": "trace{seed=-1}"}, "seed -1: must be 0 or more"),
+        ({"latency": "trace{seed=-1}"}, "seed: Input should be greater"),
         (
             {"latency": "host-stage{source=trace:t.json, per_iteration_us=1}"},
             "is a variant's",
@@ -117,7 +108,7 @@ def test_a_timing_that_measures_nothing(numbers: tuple[int, int, float | None]) 
         ({"latency": "trace:t.json"}, "none, fps:F and trace"),
         ({"latency": "traces"}, "none, fps:F and trace"),
         ({"latency": "fast"}, "no latency source 'fast'"),
-        ({"latency": "fps:0"}, "fps 0 is not a positive number"),
+        ({"latency": "fps:0"}, "fps: Input should be greater than 0"),
         ({"latency": "fps:x"}, "fps: fps: Input should be"),
     ],
 )
@@ -221,13 +212,9 @@ def test_the_blocks_of_a_study_can_be_chosen() -> None:
         ASKED.of_blocks(["4"])
 
 
-def test_what_a_block_or_a_recording_cannot_be() -> None:
+def test_a_block_names_variants_that_there_are() -> None:
     with pytest.raises(StudyError, match="block table-9: no variant gone; there are b"):
         replace(ASKED, blocks=(StudyBlock("table-9", ("gone",), ("ideal",)),))
-    with pytest.raises(StudyError, match="block a: there is nothing to drive"):
-        StudyBlock("a", (), ("ideal",))
-    with pytest.raises(StudyError, match="record: 0 frames and 4 held out"):
-        FramesToRecord(0, 4)
 
 
 def test_a_mean_is_that_of_the_drive_that_it_names(

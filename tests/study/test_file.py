@@ -170,6 +170,24 @@ def test_provider_and_routes_of_the_command_line_win(models: Path) -> None:
         ("[latency]", "[timing]", StudyError, "no key timing"),
         ("samples", "sample", StudyError, r"no key latency\.sample"),
         (
+            "routes = 3",
+            "seed = -1",
+            StudyError,
+            "seed: Input should be greater than or",
+        ),
+        (
+            "[latency]",
+            "[latency]\nbaseline_median_s = 0.0",
+            StudyError,
+            r"latency\.baseline_median_s: Input should be greater than 0",
+        ),
+        (
+            "[latency]",
+            "[record]\nframes = 0\nheld_out = 4\n[latency]",
+            StudyError,
+            r"record\.frames: Input should be greater than or equal to 1",
+        ),
+        (
             'name = "small"',
             'name = "small"\nrecip = "exact"',
             StudyError,

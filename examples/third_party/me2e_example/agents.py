@@ -1,16 +1,16 @@
 """A latency that grows with the road users in view."""
 
 from dataclasses import dataclass, field
-from typing import ClassVar
+from typing import Annotated, ClassVar
 
 import numpy as np
+from pydantic import Field
 
 from me2e_compress.driving.latency import (
     DecisionFacts,
     LatencySource,
     LayeredLatency,
     NoLatency,
-    check_positive,
 )
 from me2e_compress.errors import EvaluationError
 
@@ -29,26 +29,14 @@ class AgentsLatency(LayeredLatency):
             round, as six cameras look.
 
     Raises:
-        EvaluationError: An option is out of its range; in a drive, the simulator does
-            not tell where others are.
+        EvaluationError: In a drive, the simulator does not tell where others are.
     """
 
     name: ClassVar[str] = "agents"
     source: LatencySource = field(default_factory=NoLatency)
-    per_agent_us: int = 3000
-    range_m: float = 50.0
-    fov_deg: float = 360.0
-
-    def __post_init__(self) -> None:
-        if self.per_agent_us < 0:
-            raise EvaluationError(
-                f"latency agents: per_agent_us {self.per_agent_us}: must be 0 or more"
-            )
-        check_positive("agents: range_m", self.range_m)
-        if not 0.0 < self.fov_deg <= 360.0:
-            raise EvaluationError(
-                f"latency agents: fov_deg {self.fov_deg:g}: above 0, at most 360"
-            )
+    per_agent_us: Annotated[int, Field(ge=0)] = 3000
+    range_m: Annotated[float, Field(gt=0.0, allow_inf_nan=False)] = 50.0
+    fov_deg: Annotated[float, Field(gt=0.0, le=360.0)] = 360.0
 
     def layered(self, latency_us: int, facts: DecisionFacts) -> int:
         """Charge for the road users in view."""

@@ -2,11 +2,13 @@
 
 import math
 from dataclasses import dataclass
-from typing import ClassVar, Literal
+from typing import Annotated, ClassVar, Literal
 
 import numpy as np
 import numpy.typing as npt
+from pydantic import Field
 
+from me2e_compress.driving.contract import Count, Positive
 from me2e_compress.driving.input_sources import InputSource, Observed
 from me2e_compress.errors import EvaluationError
 from me2e_compress.runtime.frames import Array
@@ -84,18 +86,11 @@ class Past(InputSource):
     """
 
     name: ClassVar[str] = "past"
-    steps: int
-    spacing_s: float = 0.5
+    steps: Annotated[int, Field(ge=1, le=MOST)]
+    spacing_s: Positive = 0.5
     quantities: tuple[Quantity, ...] = ("x", "y")
     deltas: bool = False
     newest_first: bool = False
-
-    def __post_init__(self) -> None:
-        if not 1 <= self.steps <= MOST or not 0.0 < self.spacing_s < float("inf"):
-            apart = f"{self.steps} steps {self.spacing_s:g} s apart"
-            raise EvaluationError(
-                f"past: {apart}: both are positive, steps up to {MOST}"
-            )
 
     def value(self, seen: Observed) -> Array:
         """Return float64 [steps, quantities]."""
@@ -290,14 +285,12 @@ class ConstantInput(InputSource):
     """
 
     name: ClassVar[str] = "constant"
-    values: tuple[float, ...]
-    shape: tuple[int, ...] = ()
+    values: tuple[Annotated[float, Field(ge=-LARGEST, le=LARGEST)], ...]
+    shape: tuple[Count, ...] = ()
 
     def __post_init__(self) -> None:
-        if not all(abs(each) <= LARGEST for each in self.values):
-            raise EvaluationError(f"constant: values must be finite, up to {LARGEST:g}")
         sides = self.shape or (len(self.values),)
-        if min(sides) < 0 or math.prod(sides) != len(self.values):
+        if math.prod(sides) != len(self.values):
             raise EvaluationError(
                 f"constant: {len(self.values)} values have no shape {list(self.shape)}"
             )
