@@ -195,13 +195,12 @@ class Event:
     actor_kind: ActorKind | None = None
 
 
-# Classes of pixels in the label rasters.
+# Classes of what lies on the ground.
 
 
 class PixelClass(IntEnum):
-    """Values of the uint8 class rasters, of a camera and of the bird's-eye view."""
+    """Values of the uint8 class rasters seen from above."""
 
-    SKY = 0
     TERRAIN = 1
     SHOULDER = 2
     """Paved but no lane."""
@@ -218,19 +217,3 @@ class PixelClass(IntEnum):
     TRAFFIC_LIGHT = 11
     TRAFFIC_SIGN = 12
     EGO = 13
-    """Only in the bird's-eye view."""
-
-
-ACTOR_CLASSES = {
-    ActorKind.CAR: PixelClass.VEHICLE,
-    ActorKind.VAN: PixelClass.VEHICLE,
-    ActorKind.TRUCK: PixelClass.VEHICLE,
-    ActorKind.EMERGENCY: PixelClass.VEHICLE,
-    ActorKind.PARKED: PixelClass.VEHICLE,
-    ActorKind.DOOR: PixelClass.VEHICLE,
-    ActorKind.BICYCLE: PixelClass.BICYCLE,
-    ActorKind.PEDESTRIAN: PixelClass.PEDESTRIAN,
-    ActorKind.CONE: PixelClass.STATIC,
-    ActorKind.BARRIER: PixelClass.STATIC,
-}
-"""The class of an actor's pixels."""

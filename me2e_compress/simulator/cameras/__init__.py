@@ -1,1 +1,1 @@
-"""Six pinhole cameras over the painted road: images, and what each pixel shows."""
+"""Six pinhole cameras over the painted road."""

@@ -4,7 +4,7 @@ Two rasters of the same grid, north up: colours with mip levels, and classes. Th
 classes are painted beside the colours, stroke by stroke, never read off them.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import cv2
@@ -308,17 +308,6 @@ class GroundSampler:
                 ]
             stacked[group.rows] = cv2.cvtColor(means[0], cv2.COLOR_RGBA2RGB)
 
-    def label(self, labels: Bytes, texture: GroundTexture, ego: Ego) -> None:
-        """Fill the ground rows of class images uint8 [6, H, W]."""
-        u, v = self._coordinates(self._label_rows, texture, ego)
-        labels.reshape(-1, labels.shape[2])[self._label_rows.rows] = cv2.remap(
-            texture.classes,
-            u[:, 0],
-            v[:, 0],
-            cv2.INTER_NEAREST,
-            borderMode=cv2.BORDER_REPLICATE,
-        )
-
     @cached_property
     def places(self) -> Floats:
         """[6, H, W, 2] ground points of all pixels, ego frame; sky far off."""
@@ -364,12 +353,6 @@ class GroundSampler:
             if len(row):
                 groups.append(self._group(camera, row, taps))
         return tuple(groups)
-
-    @cached_property
-    def _label_rows(self) -> RowGroup:
-        camera, row = np.nonzero(np.isfinite(row_depths(self.rig, 1)[0]))
-        group = self._group(camera, row, taps=1)
-        return replace(group, levels=np.zeros_like(group.levels))
 
     def _group(
         self, camera: npt.NDArray[np.intp], row: npt.NDArray[np.intp], taps: int

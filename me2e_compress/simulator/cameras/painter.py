@@ -136,9 +136,8 @@ class Faces:
     """Visible polygons of all cameras, in painting order.
 
     ``polygons`` are int32 [N, 1 or 4.., 2], fixed-point pixels for cv2; ``colours`` [M,
-    3] RGB, ``kinds`` of `PixelClass`; ``lamps`` emit light, ``details`` lie on another
-    face; ``places`` [M, 2] is where its solid is, metres in the ego frame,
-    ``distances`` metres from the camera to it.
+    3] RGB; ``lamps`` emit light, ``details`` lie on another face; ``places`` [M, 2] is
+    where its solid is, metres in the ego frame, ``distances`` metres from the camera.
     """
 
     cameras: Ints
@@ -146,7 +145,6 @@ class Faces:
     colours: Floats
     lamps: Flags
     details: Flags
-    kinds: Ints
     places: Floats
     distances: Floats
 
@@ -157,7 +155,6 @@ NO_FACES = Faces(
     colours=np.zeros((0, 3)),
     lamps=np.zeros(0, np.bool_),
     details=np.zeros(0, np.bool_),
-    kinds=np.zeros(0, np.intp),
     places=np.zeros((0, 2)),
     distances=np.zeros(0),
 )
@@ -201,7 +198,6 @@ class Painter:
             colours=np.concatenate([s.colours for s in solids])[face],
             lamps=lamps[keep],
             details=details[keep],
-            kinds=np.array([s.kind for s in solids], np.intp)[solid],
             places=poses[solid, :2],
             distances=np.hypot(away[:, 0], away[:, 1]),
         )
@@ -272,13 +268,6 @@ def draw(images: Bytes, faces: Faces, colours: Bytes) -> None:
     rows = zip(faces.cameras.tolist(), faces.polygons, colours.tolist(), strict=True)
     for camera, polygon, colour in rows:
         fill(planes[camera], polygon, colour, cv2.LINE_AA, SUBPIXEL_BITS)
-
-
-def label(labels: Bytes, faces: Faces) -> None:
-    """Paint the classes of faces, without details, into uint8 [6, H, W]."""
-    for i in np.flatnonzero(~faces.details).tolist():
-        plane, kind = labels[faces.cameras[i]], (int(faces.kinds[i]),)
-        cv2.fillConvexPoly(plane, faces.polygons[i], kind, cv2.LINE_8, SUBPIXEL_BITS)
 
 
 def _place(solids: list[Solid], poses: Floats) -> tuple[Floats, Floats]:

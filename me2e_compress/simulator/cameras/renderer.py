@@ -15,9 +15,9 @@ from me2e_compress.simulator.camera_rig import (
     Weather,
 )
 from me2e_compress.simulator.cameras.ground import SKY_M, GroundSampler, GroundTexture
-from me2e_compress.simulator.cameras.painter import Faces, Painter, draw, label
+from me2e_compress.simulator.cameras.painter import Faces, Painter, draw
 from me2e_compress.simulator.cameras.solids import solids_of
-from me2e_compress.simulator.scene import PixelClass, Scene
+from me2e_compress.simulator.scene import Scene
 
 # The effects of weather and sensor faults on the images.
 
@@ -260,13 +260,3 @@ class Cameras:
         # rain on the lens, exposure, noise and failed cameras
         self._sensor.expose(images, scene.time_us)
         return images
-
-    def classes(self, scene: Scene) -> Bytes:
-        """Return the `PixelClass` of each pixel in clear weather, uint8 [6, H, W].
-
-        A pixel has the class of what its centre sees, edges of solids rounded out.
-        """
-        labels = np.full(self._shape, PixelClass.SKY, np.uint8)
-        self._ground.label(labels, self.texture, scene.ego)
-        label(labels, self._painter.faces(solids_of(scene), scene.ego))
-        return labels

@@ -19,10 +19,8 @@ from me2e_compress.simulator.cameras.template import (
     template,
 )
 from me2e_compress.simulator.scene import (
-    ACTOR_CLASSES,
     Actor,
     ActorKind,
-    PixelClass,
     Scene,
     SignalKind,
     SignalState,
@@ -338,10 +336,10 @@ TEMPLATES: dict[ActorKind, tuple[Template, ...]] = {
     ActorKind.BARRIER: (barrier(),),
     ActorKind.DOOR: (door(),),
 }
-SIGNS: dict[SignalKind, tuple[Template, PixelClass]] = {
-    SignalKind.TRAFFIC_LIGHT: (traffic_light(), PixelClass.TRAFFIC_LIGHT),
-    SignalKind.STOP_SIGN: (stop_sign(), PixelClass.TRAFFIC_SIGN),
-    SignalKind.GIVE_WAY: (give_way_sign(), PixelClass.TRAFFIC_SIGN),
+SIGNS: dict[SignalKind, Template] = {
+    SignalKind.TRAFFIC_LIGHT: traffic_light(),
+    SignalKind.STOP_SIGN: stop_sign(),
+    SignalKind.GIVE_WAY: give_way_sign(),
 }
 SIGN_RED: Colour = (204, 24, 34)
 STATE_LAMPS = {
@@ -359,14 +357,12 @@ class Solid:
         colours: float64 [Q, 3] RGB of its faces, shading applied.
         pose: x, y, heading in the world; metres and radians.
         size: Length, width, height in metres.
-        kind: Class of its pixels.
     """
 
     template: Template
     colours: npt.NDArray[np.float64]
     pose: tuple[float, float, float]
     size: tuple[float, float, float]
-    kind: PixelClass
 
 
 def solids_of(scene: Scene) -> list[Solid]:
@@ -377,11 +373,11 @@ def solids_of(scene: Scene) -> list[Solid]:
             solids += _actor_solids(actor, scene.time_us)
     for signal in scene.signals:
         if math.hypot(signal.x - ego.x, signal.y - ego.y) < FARTHEST_M:
-            template, kind = SIGNS[signal.kind]
+            template = SIGNS[signal.kind]
             lit = () if signal.state is None else (STATE_LAMPS[signal.state],)
             colours = _colours(template, SIGN_RED, DIM[Slot.STRIPE], lit)
             pose = (signal.x, signal.y, signal.heading)
-            solids.append(Solid(template, colours, pose, (1.0, 1.0, 1.0), kind))
+            solids.append(Solid(template, colours, pose, (1.0, 1.0, 1.0)))
     return solids
 
 
@@ -407,7 +403,6 @@ def _actor_solids(actor: Actor, time_us: int) -> list[Solid]:
             _colours(template, paint, stripe, tuple(lit)),
             (actor.x, actor.y, actor.heading),
             (actor.length, actor.width, actor.height),
-            ACTOR_CLASSES[actor.kind],
         )
         for template in TEMPLATES[actor.kind]
     ]

@@ -7,8 +7,8 @@ import numpy as np
 import numpy.typing as npt
 
 from me2e_compress.simulator.plane_geometry import Floats
-from me2e_compress.simulator.scene import ACTOR_CLASSES, Actor, Ego, PixelClass, Scene
-from models.driver.episodes.birdseye import BirdseyeGrid, covered
+from me2e_compress.simulator.scene import Actor, Ego, PixelClass, Scene
+from models.driver.episodes.birdseye import ACTOR_CLASSES, BirdseyeGrid, covered
 
 AGENTS = 24
 AGENT_COLUMNS = 10

@@ -10,11 +10,25 @@ import numpy.typing as npt
 from me2e_compress.errors import EvaluationError
 from me2e_compress.simulator.camera_rig import SUBPIXEL_BITS, fixed_point
 from me2e_compress.simulator.cameras.ground import RESOLUTION_M, GroundTexture
-from me2e_compress.simulator.scene import ACTOR_CLASSES, Actor, Ego, PixelClass, Scene
+from me2e_compress.simulator.scene import Actor, ActorKind, Ego, PixelClass, Scene
 
 Bytes = npt.NDArray[np.uint8]
 Floats = npt.NDArray[np.float64]
 Flags = npt.NDArray[np.bool_]
+
+ACTOR_CLASSES = {
+    ActorKind.CAR: PixelClass.VEHICLE,
+    ActorKind.VAN: PixelClass.VEHICLE,
+    ActorKind.TRUCK: PixelClass.VEHICLE,
+    ActorKind.EMERGENCY: PixelClass.VEHICLE,
+    ActorKind.PARKED: PixelClass.VEHICLE,
+    ActorKind.DOOR: PixelClass.VEHICLE,
+    ActorKind.BICYCLE: PixelClass.BICYCLE,
+    ActorKind.PEDESTRIAN: PixelClass.PEDESTRIAN,
+    ActorKind.CONE: PixelClass.STATIC,
+    ActorKind.BARRIER: PixelClass.STATIC,
+}
+"""The class of the ground under an actor."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -2,9 +2,14 @@
 
 import math
 
+import cv2
 import numpy as np
+import numpy.typing as npt
 
+from me2e_compress.simulator.camera_rig import SUBPIXEL_BITS, CameraRig
 from me2e_compress.simulator.cameras.ground import GroundTexture, paint_texture
+from me2e_compress.simulator.cameras.painter import Painter
+from me2e_compress.simulator.cameras.solids import solids_of
 from me2e_compress.simulator.plane_geometry import Lane, LaneMarking, Roadmap
 from me2e_compress.simulator.scene import (
     DIMENSIONS,
@@ -67,6 +72,16 @@ def scene(*actors: Actor, time_us: int = 0, seen_from: Ego | None = None) -> Sce
 def light(state: SignalState, x: float = 15.0, y: float = -3.0) -> Scene:
     signal = Signal(1, SignalKind.TRAFFIC_LIGHT, x, y, 0.0, state, STOP_LINE)
     return Scene(0, ego(), (), (signal,))
+
+
+def covered(rig: CameraRig, scene: Scene) -> npt.NDArray[np.bool_]:
+    """Whether a solid, without its shadow and details, covers each pixel: [6, H, W]."""
+    mask = np.zeros((6, rig.height, rig.width), np.uint8)
+    faces = Painter(rig).faces(solids_of(scene), scene.ego)
+    for i in np.flatnonzero(~faces.details).tolist():
+        plane, polygon = mask[faces.cameras[i]], faces.polygons[i]
+        cv2.fillConvexPoly(plane, polygon, (1,), cv2.LINE_8, SUBPIXEL_BITS)
+    return mask.astype(np.bool_)
 
 
 def busy() -> Scene:
