@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Self
 
-from me2e_compress.driving.adapter import Adapter, ImageNormalization
+from me2e_compress.driving.adapter import Adapter
 from me2e_compress.driving.adapter.adapter import ZEROS, RecurrentEntry
 from me2e_compress.driving.adapter.inputs import ModelInputs, contract_names
 from me2e_compress.driving.adapter.outputs import ModelOutputs
@@ -21,30 +21,9 @@ from me2e_compress.driving.host_stage import HostStage, HostWork
 from me2e_compress.errors import EvaluationError, FramesError, GraphError
 from me2e_compress.runtime.frames import Array
 from me2e_compress.runtime.providers import CPU, Provider
-from me2e_compress.runtime.session import Session, SessionPort, zeros
+from me2e_compress.runtime.session import Session, zeros
 
 Entries = Mapping[str, RecurrentEntry] | None
-
-
-def answers_by_input(
-    session: Session, entries: Entries, fed_otherwise: set[str]
-) -> dict[str, str]:
-    """Return each recurrent input with the output that answers it.
-
-    The pairs of the model's own metadata are added to the adapter's entries, except for
-    inputs in ``fed_otherwise``, which the adapter feeds.
-    """
-    own = {k: v for k, v in session.recurrent.items() if k not in fed_otherwise}
-    answers: dict[str, str] = {}
-    for name, entry in (entries or {}).items():
-        answer = entry.answer or own.get(name)
-        if answer is None:
-            raise EvaluationError(
-                f"recurrent input {name}: no output answers it by its name; say from ="
-                f" one of {', '.join(session.outputs)}"
-            )
-        answers[name] = answer
-    return {**own, **answers}
 
 
 @dataclass(frozen=True)
@@ -66,9 +45,22 @@ class FirstValues:
         given: dict[str, str] = {}
         ports = session.inputs
         for name, entry in (entries or {}).items():
-            where = f"first value of {name}: {entry.first}"
-            if entry.first != ZEROS:
-                given[name] = _input(entry.first, ports[name], ports, recurrent, where)
+            if (source := entry.first) == ZEROS:
+                continue
+            where = f"first value of {name}: {source}"
+            if source not in ports or source in recurrent:
+                there = ", ".join(each for each in ports if each not in recurrent)
+                raise EvaluationError(
+                    f"{where} is neither {ZEROS} nor an input that is not recurrent;"
+                    f" those are {there or 'none'}"
+                )
+            port, other = ports[name], ports[source]
+            if other.type != port.type or not fits(other.shape, port.shape):
+                raise EvaluationError(
+                    f"{where} is {other.type} {list(other.shape)}, the input takes"
+                    f" {port.type} {list(port.shape)}"
+                )
+            given[name] = source
         # all others start from zeros
         known = {*given, *session.recurrent}
         others = [name for name in recurrent if name not in known]
@@ -77,28 +69,6 @@ class FirstValues:
     def at(self, feeds: Mapping[str, Array]) -> dict[str, Array]:
         """Return those that are not zeros, given the feeds of the first decision."""
         return {to: feeds[name] for to, name in self.given.items()}
-
-
-def _input(
-    source: str,
-    port: SessionPort,
-    ports: Mapping[str, SessionPort],
-    recurrent: Mapping[str, str],
-    where: str,
-) -> str:
-    if source not in ports or source in recurrent:
-        plain = ", ".join(name for name in ports if name not in recurrent)
-        raise EvaluationError(
-            f"{where} is neither {ZEROS} nor an input that is not recurrent; those are"
-            f" {plain or 'none'}"
-        )
-    other = ports[source]
-    if other.type != port.type or not fits(other.shape, port.shape):
-        raise EvaluationError(
-            f"{where} is {other.type} {list(other.shape)}, the input takes {port.type}"
-            f" {list(port.shape)}"
-        )
-    return source
 
 
 @dataclass
@@ -179,11 +149,6 @@ class OnnxPolicy:
         return bool(self.inputs.images)
 
     @property
-    def normalization(self) -> ImageNormalization | None:
-        """How the images are normalised; None if they are not."""
-        return self.inputs.normalization
-
-    @property
     def image_size(self) -> tuple[int, int]:
         """Rows and columns in which the cameras are rendered."""
         return self.inputs.image_size
@@ -199,7 +164,7 @@ class OnnxPolicy:
     def plan(self, observation: Observation) -> Trajectory:
         """Run the model once."""
         # run the model, with first values where a route begins
-        feeds = self.feeds(observation)
+        feeds = self.inputs.feeds(observation)
         if self._begins:
             self._state |= self.first.at(feeds)
         outputs = self.session.run({**self._state, **feeds})
@@ -218,14 +183,24 @@ class OnnxPolicy:
             plan = Trajectory(work.plan, PLAN_TIMES_S)
         return plan
 
-    def feeds(self, observation: Observation) -> dict[str, Array]:
-        """Convert an observation to the graph's inputs, without recurrent ones."""
-        return self.inputs.feeds(observation)
-
 
 def recurrent_of(session: Session, adapter: Adapter) -> dict[str, str]:
-    """Return each recurrent input with the output that answers it."""
-    fed_otherwise = {*adapter.feeds, *adapter.images}
-    if adapter.recurrent is not None:
+    """Return each recurrent input with the output that answers it.
+
+    The pairs of the model's own metadata are added to the adapter's entries, except for
+    inputs that the adapter feeds.
+    """
+    fed_otherwise, entries = {*adapter.feeds, *adapter.images}, adapter.recurrent
+    if entries is not None:
         fed_otherwise |= set(contract_names(adapter).values())
-    return answers_by_input(session, adapter.recurrent, fed_otherwise)
+    own = {k: v for k, v in session.recurrent.items() if k not in fed_otherwise}
+    answers: dict[str, str] = {}
+    for name, entry in (entries or {}).items():
+        answer = entry.answer or own.get(name)
+        if answer is None:
+            raise EvaluationError(
+                f"recurrent input {name}: no output answers it by its name; say from ="
+                f" one of {', '.join(session.outputs)}"
+            )
+        answers[name] = answer
+    return {**own, **answers}

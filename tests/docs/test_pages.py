@@ -209,7 +209,10 @@ def test_a_stack_that_is_cut_and_joined_decides_as_the_whole(
     ):
         assert joined["plan"].tolist() == one["plan"].tolist()
     policies = map(OnnxPolicy.open, (made.output, whole))
-    read, shown = ((p.recurrent, p.normalization, p.image_size) for p in policies)
+    read, shown = (
+        (p.recurrent, *((e.normalization, e.size) for e in p.inputs.images.values()))
+        for p in policies
+    )
     assert read == shown
 
 

@@ -171,17 +171,20 @@ def test_what_does_not_fit_the_graph_is_one_line(
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("[feeds.v]\nsource = 'velocities'", "feeds.v: no input source 'velocities'"),
-        ("[feeds.v]\nspeed = 1", "feeds.v: no source is named; there are speed"),
+        (
+            "[feeds.v]\nsource = 'velocities'",
+            "parts.0: no input source 'velocities'",
+        ),
+        ("[feeds.v]\nspeed = 1", "feeds.v.parts.0: no source is named; there are s"),
         ("[feeds.v]\nsource = 'speed'\nunit = 'm'", "speed has no option 'unit'"),
         ("[feeds.v]\nsource = 'speed'\nstd = 0", "speed: std is zero"),
-        ("[feeds.v]\nsource = 'speed'\nmean = 'x'", "mean must be a finite number"),
-        ("[feeds.v]\nsource = 'speed'\nstd = nan", "std must be a finite number"),
+        ("[feeds.v]\nsource = 'speed'\nmean = 'x'", "feeds.v.parts.0.mean"),
+        ("[feeds.v]\nsource = 'speed'\nstd = nan", "feeds.v.parts.0.std"),
         ("[image]\nmean = [nan, 0, 0]\nstd = [1, 1, 1]\norder = 'rgb'", "image.mean.0"),
         ("[image]\nmean = [0, 0, 0]\nstd = [1, 0, 1]\norder = 'rgb'", "std is zero"),
-        ("[feeds.v]\nparts = []", "parts must be a list of tables"),
-        ("[feeds.v]\nparts = ['speed']", "each of parts must be a table"),
-        ("[feeds]\nv = 'speed'", "feeds.v: it must be a table"),
+        ("[feeds.v]\nparts = []", "feeds.v.parts: Tuple should have at least 1 item"),
+        ("[feeds.v]\nparts = ['speed']", "feeds.v.parts.0: no source is named"),
+        ("[feeds]\nv = 'speed'", "feeds.v.parts.0: no source is named"),
         ("[images.v]\ncameras = ['TOP']", "images.v.cameras.0: Input should be 'F"),
     ],
 )

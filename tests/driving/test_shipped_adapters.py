@@ -86,7 +86,7 @@ def test_vad_tiny_is_fed_as_nuscenes_feeds_it(tmp_path: Path) -> None:
     assert isinstance(policy, OnnxPolicy)
     assert policy.image_size == (360, 640)
     assert policy.recurrent == dict(VAD_TINY.recurrent)
-    norm = policy.normalization
+    norm = policy.inputs.images["img"].normalization
     assert norm is not None
     assert (norm.mean, norm.std) == (VAD_TINY.image.mean, VAD_TINY.image.std)
     assert policy.inputs.images["img"].indices == (0, 2, 1, 3, 4, 5)

@@ -2,9 +2,8 @@
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, Self, TypeAlias
+from typing import Annotated, Any, Literal, Self, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -60,40 +59,43 @@ class RecurrentEntry(BaseModel):
 # One input of a graph, made of input sources.
 
 
-Levels = float | tuple[float, ...]
-
 LARGEST = 1e30
 """The largest mean or std: within float32."""
+Level = Annotated[float, Field(ge=-LARGEST, le=LARGEST)]
+Levels = Level | Annotated[tuple[Level, ...], Field(min_length=1)]
 
 
-@dataclass(frozen=True)
-class FeedPart:
+class FeedPart(BaseModel):
     """A source, normalised: (value - mean) / std.
 
-    ``mean`` and ``std`` are one number, or as many as the last dimension has.
+    As a table: ``source``, its own options, ``mean`` and ``std``, which are one number,
+    or as many as the last dimension has.
     """
+
+    model_config = ConfigDict(frozen=True, arbitrary_types_allowed=True)
 
     source: InputSource
     mean: Levels = 0.0
     std: Levels = 1.0
 
+    @model_validator(mode="before")
     @classmethod
-    def read(cls, table: dict[str, Any]) -> Self:
-        """Read a table: source, mean, std, and the source's own options."""
-        options = dict(table)
-        name = options.pop("source", None)
-        if not isinstance(name, str):
+    def _of_table(cls, table: Any) -> Any:
+        if not isinstance(table, dict) or not isinstance(table.get("source"), str):
             names = ", ".join(INPUT_SOURCES.names())
             raise ValueError(f"no source is named; there are {names}")
-        # what is left of the table are the source's options
-        mean = _levels("mean", options.pop("mean", 0.0))
-        std = _levels("std", options.pop("std", 1.0))
-        if not np.all(std):
-            raise ValueError(f"{name}: std is zero")
+        own = {key: table[key] for key in ("mean", "std") if key in table}
+        options = {k: v for k, v in table.items() if k != "source" and k not in own}
         try:
-            return cls(INPUT_SOURCES.build(name, options), mean, std)
+            return {"source": INPUT_SOURCES.build(table["source"], options), **own}
         except EvaluationError as error:
             raise ValueError(str(error)) from error
+
+    @model_validator(mode="after")
+    def _divides(self) -> Self:
+        if not np.all(self.std):
+            raise ValueError(f"{self.source.name}: std is zero")
+        return self
 
     def value(self, seen: Observed) -> Array:
         """Return the normalised value, of the source's shape."""
@@ -118,34 +120,27 @@ class FeedPart:
 class Feed(BaseModel):
     """How one input is made: of a source, or of parts in a row.
 
-    As a table: ``source`` and its options, ``mean``, ``std``; or ``parts``, a list of
-    such tables, whose numbers are flattened and concatenated (``joined``).
+    As a table: that of one part; or ``parts``, a list of such tables, whose numbers are
+    flattened and concatenated (``joined``).
     """
 
-    model_config = ConfigDict(frozen=True, arbitrary_types_allowed=True)
+    model_config = ConfigDict(frozen=True, extra="forbid")
 
-    parts: tuple[FeedPart, ...]
+    parts: Annotated[tuple[FeedPart, ...], Field(min_length=1)]
     joined: bool = False
 
     @model_validator(mode="before")
     @classmethod
     def _of_table(cls, table: Any) -> Any:
-        if not isinstance(table, dict):
-            raise ValueError("it must be a table with a source, or with parts")
-        if "parts" not in table:
-            return {"parts": (FeedPart.read(table),)}
-        # parts, each a table of its own
-        listed = table["parts"]
-        if not (isinstance(listed, list) and listed) or len(table) > 1:
-            raise ValueError("parts must be a list of tables, and stand alone")
-        if not all(isinstance(each, dict) for each in listed):
-            raise ValueError("each of parts must be a table with a source")
-        return {"parts": tuple(map(FeedPart.read, listed)), "joined": True}
+        if isinstance(table, dict) and "parts" in table:
+            return {**table, "joined": True}
+        return {"parts": (table,)}
 
     @classmethod
     def by(cls, source: InputSource) -> Self:
         """Return the feed of one source without normalisation."""
-        return cls.model_construct(parts=(FeedPart(source),))
+        part = FeedPart.model_construct(source=source)
+        return cls.model_construct(parts=(part,))
 
     def value(self, seen: Observed) -> Array:
         """Return the input's value, without a batch dimension."""
@@ -166,18 +161,6 @@ class Feed(BaseModel):
         if len(self.parts) > 1 or not isinstance(source, NavigationCommand):
             return None
         return source
-
-
-def _levels(name: str, value: Any) -> Levels:
-    numbers = value if isinstance(value, list) else [value]
-    if not numbers or not all(
-        isinstance(each, int | float)
-        and not isinstance(each, bool)
-        and abs(each) <= LARGEST
-        for each in numbers
-    ):
-        raise ValueError(f"{name} must be a finite number, or a list of such")
-    return tuple(map(float, value)) if isinstance(value, list) else float(value)
 
 
 Contract: TypeAlias = Literal["img", "lidar2img", "can_bus", "command", "timestamp"]

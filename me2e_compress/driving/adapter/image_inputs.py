@@ -7,11 +7,11 @@ from typing import Annotated, Literal, Self, TypeAlias, get_args
 import numpy as np
 import numpy.typing as npt
 from pydantic import (
+    AfterValidator,
     BaseModel,
     ConfigDict,
     Field,
     ValidationError,
-    field_validator,
     model_validator,
 )
 
@@ -25,6 +25,15 @@ IMAGE = "me2e.image"
 """Metadata key: JSON of `ImageNormalization`."""
 
 Triple: TypeAlias = tuple[float, float, float]
+
+
+def _divides(std: Triple) -> Triple:
+    if not all(std):
+        raise ValueError("std is zero")
+    return std
+
+
+Divisors: TypeAlias = Annotated[Triple, AfterValidator(_divides)]
 
 
 class ImageNormalization(BaseModel):
@@ -42,16 +51,9 @@ class ImageNormalization(BaseModel):
 
     input: str = "img"
     mean: Triple
-    std: Triple
+    std: Divisors
     order: Literal["rgb", "bgr"]
     scale: float = Field(default=1.0, gt=0.0)
-
-    @field_validator("std")
-    @classmethod
-    def _divides(cls, std: Triple) -> Triple:
-        if not all(std):
-            raise ValueError("std is zero")
-        return std
 
     @classmethod
     def of(cls, metadata: Mapping[str, str]) -> Self:
@@ -124,7 +126,7 @@ class ImageInput(BaseModel):
     size: Size | None = None
     layout: str | None = None
     mean: Triple | None = None
-    std: Triple | None = None
+    std: Divisors | None = None
     scale: float = Field(default=1.0, gt=0.0)
     order: Literal["rgb", "bgr"] | None = None
 
@@ -132,8 +134,6 @@ class ImageInput(BaseModel):
     def _fits_together(self) -> Self:
         if (self.mean is None) != (self.std is None):
             raise ValueError("mean and std belong together")
-        if self.std is not None and not all(self.std):
-            raise ValueError("std is zero")
         # c, h and w, each letter once
         letters = self.layout
         if letters is not None and (

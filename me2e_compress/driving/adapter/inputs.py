@@ -100,12 +100,6 @@ class ModelInputs:
         return opened, {**problems, **faults, **opened.faults()}
 
     @property
-    def normalization(self) -> ImageNormalization | None:
-        """How the first image input is normalised; None if it is not."""
-        normalizations = (each.normalization for each in self.images.values())
-        return next(normalizations, None)
-
-    @property
     def cameras(self) -> tuple[int, ...]:
         """Indices among the six cameras of those that the model sees, ascending."""
         return tuple(

@@ -124,7 +124,9 @@ def _look(
     while count and rules.ending(world, scene.ego.speed_mps) is None:
         since_us = scene.time_us - begin_us
         if since_us >= 0 and since_us % STEP_US == 0:
-            feeds = policy.feeds(replace(watching.observe(scene), time_us=since_us))
+            feeds = policy.inputs.feeds(
+                replace(watching.observe(scene), time_us=since_us)
+            )
             first = policy.first.at(feeds) if count == wanted else {}
             yield {**feeds, **first}
             count -= 1
