@@ -1,6 +1,6 @@
 """Share of decisions that exceed their latency budget."""
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from statistics import fmean
 from typing import Any
@@ -11,7 +11,8 @@ from me2e_compress.metrics.episode import FRAME_US, Episode
 from me2e_compress.metrics.measure import Measure, percentile, too_few
 from me2e_compress.metrics.route_scores import TTC_CRITICAL_S
 
-PERCENTILES = (50.0, 99.0, 99.9)
+PERCENTILES = {f"p{percent:g}_ms": percent for percent in (50.0, 99.0, 99.9)}
+CRITICAL, OTHER = "critical_mean_ms", "other_mean_ms"
 UNSEEN = Measure(None, "ms", "nobody looked at the road")
 
 
@@ -20,34 +21,20 @@ class Deadlines:
     """Latencies compared with a budget.
 
     Attributes:
-        percentiles_ms: By percent; no value if too few samples were measured for it.
-        critical_ms: Mean over the decisions on frames with a time to collision below
-            1.5 s.
-        other_ms: Mean over the decisions on the other frames.
+        measures: By name: the percentiles, which have no value if too few samples were
+            measured for them, ``mean_ms``, ``max_ms``, ``over_budget_percent``, and the
+            means over decisions on frames with a time to collision below 1.5 s, and on
+            other frames.
     """
 
     budget_ms: float
     count: int
-    percentiles_ms: dict[float, Measure]
-    mean_ms: Measure
-    worst_ms: Measure
-    over_percent: Measure
-    critical_ms: Measure = UNSEEN
-    other_ms: Measure = UNSEEN
+    measures: Mapping[str, Measure]
 
     def to_json(self) -> dict[str, Any]:
         """Return plain numbers, null for what was not measured."""
-        named = {f"p{p:g}_ms": each.value for p, each in self.percentiles_ms.items()}
-        return {
-            "budget_ms": self.budget_ms,
-            "decisions": self.count,
-            **named,
-            "mean_ms": self.mean_ms.value,
-            "max_ms": self.worst_ms.value,
-            "over_budget_percent": self.over_percent.value,
-            "critical_mean_ms": self.critical_ms.value,
-            "other_mean_ms": self.other_ms.value,
-        }
+        values = {name: each.value for name, each in self.measures.items()}
+        return {"budget_ms": self.budget_ms, "decisions": self.count, **values}
 
 
 def deadlines(
@@ -60,28 +47,23 @@ def deadlines(
     ``measured`` is the number of samples in the trace that the latencies were drawn
     from; None if each was measured on its own.
     """
-    if not latencies_us:
-        none = Measure(None, "ms", "no decision was taken")
-        share = Measure(None, "%", none.reason)
-        return Deadlines(
-            budget_ms, 0, dict.fromkeys(PERCENTILES, none), none, none, share
-        )
-    count = len(latencies_us)
+    count, none = len(latencies_us), "no decision was taken"
+    if not count:
+        unknown, share = Measure(None, "ms", none), Measure(None, "%", none)
+        names = (*PERCENTILES, "mean_ms", "max_ms")
+        named = dict.fromkeys(names, unknown) | {"over_budget_percent": share}
+        return Deadlines(budget_ms, 0, named | {CRITICAL: UNSEEN, OTHER: UNSEEN})
     samples = count if measured is None else min(count, measured)
     late = sum(each > 1e3 * budget_ms for each in latencies_us)
-    percentiles = dict[float, Measure]()
-    for p in PERCENTILES:
-        why = too_few(p, samples)
-        value = None if why else percentile(latencies_us, p) / 1e3
-        percentiles[p] = Measure(value, "ms", why)
-    return Deadlines(
-        budget_ms,
-        count,
-        percentiles,
-        Measure(fmean(latencies_us) / 1e3, "ms"),
-        Measure(max(latencies_us) / 1e3, "ms"),
-        Measure(100.0 * late / count, "%"),
-    )
+    measures = dict[str, Measure]()
+    for name, percent in PERCENTILES.items():
+        why = too_few(percent, samples)
+        value = None if why else percentile(latencies_us, percent) / 1e3
+        measures[name] = Measure(value, "ms", why)
+    measures["mean_ms"] = _mean(latencies_us, none)
+    measures["max_ms"] = Measure(max(latencies_us) / 1e3, "ms")
+    measures["over_budget_percent"] = Measure(100.0 * late / count, "%")
+    return Deadlines(budget_ms, count, {**measures, CRITICAL: UNSEEN, OTHER: UNSEEN})
 
 
 def charged(
@@ -107,11 +89,12 @@ def charged(
                 seconds = ttc_s[frame]
                 near = seconds is not None and seconds < TTC_CRITICAL_S
                 (critical if near else other).append(decision.latency_us)
-    return replace(
-        deadlines(taken, budget_ms, measured),
-        critical_ms=_mean(critical, "no decision on a frame with TTC below 1.5 s"),
-        other_ms=_mean(other, "no decision on another frame"),
-    )
+    compared = deadlines(taken, budget_ms, measured)
+    by_frame = {
+        CRITICAL: _mean(critical, "no decision on a frame with TTC below 1.5 s"),
+        OTHER: _mean(other, "no decision on another frame"),
+    }
+    return replace(compared, measures={**compared.measures, **by_frame})
 
 
 def _mean(latencies_us: Sequence[int], why: str) -> Measure:
@@ -122,21 +105,16 @@ def _mean(latencies_us: Sequence[int], why: str) -> Measure:
 
 def deadlines_table(title: str, deadlines: Deadlines) -> Table:
     """Return percentiles, and how many decisions took longer than the budget."""
-    rows = [(n, number(each.value, ".2f"), each.unit) for n, each in _each(deadlines)]
-    why = {name: each.reason for name, each in _each(deadlines) if each.value is None}
+    names = {name: f"p{percent:g}" for name, percent in PERCENTILES.items()}
+    names |= {"max_ms": "max", "mean_ms": "mean"}
+    names["over_budget_percent"] = f"over {deadlines.budget_ms:g} ms"
+    if deadlines.measures[CRITICAL].value is not None:
+        names |= {CRITICAL: "mean, TTC below 1.5 s", OTHER: "mean, other frames"}
+    shown = {words: deadlines.measures[name] for name, words in names.items()}
+    why = {words: each.reason for words, each in shown.items() if each.value is None}
     return table(
         f"{title}: {counted(deadlines.count, 'decision')}",
         ("latency", "", "unit"),
-        rows,
+        [(words, number(e.value, ".2f"), e.unit) for words, e in shown.items()],
         not_measured(why),
     )
-
-
-def _each(deadlines: Deadlines) -> Iterator[tuple[str, Measure]]:
-    yield from ((f"p{p:g}", each) for p, each in deadlines.percentiles_ms.items())
-    yield "max", deadlines.worst_ms
-    yield "mean", deadlines.mean_ms
-    yield f"over {deadlines.budget_ms:g} ms", deadlines.over_percent
-    if deadlines.critical_ms.value is not None:
-        yield "mean, TTC below 1.5 s", deadlines.critical_ms
-        yield "mean, other frames", deadlines.other_ms

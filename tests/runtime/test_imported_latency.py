@@ -56,7 +56,7 @@ def test_what_was_measured_elsewhere_becomes_a_trace(
     assert trace == found.trace
     assert trace.samples_us == (50_123, 80_000)
     assert trace.machine == "times of trtexec"
-    assert found.deadlines.over_percent.value == 100.0
+    assert found.deadlines.measures["over_budget_percent"].value == 100.0
     again = import_profile(model, output, tmp_path / "copy.json")
     assert again.trace == trace
     layers = import_profile(model, files["layers"])

@@ -47,7 +47,7 @@ def test_a_plug_in_drives_with_routes_adapter_latency_and_progress(
     assert (result.scores.routes, result.scores.expected) == (2, 3)
     assert result.scores.driving_score.value == 50.0
     assert result.deadlines is not None
-    assert result.deadlines.worst_ms.value == 250.0
+    assert result.deadlines.measures["max_ms"].value == 250.0
     driving = [report for report in reports if report[0] == "evaluate"]
     assert [report[1:3] for report in driving] == [(0, 2), (1, 2), (2, 2)]
     assert driving[-1][3] == "DS 50.0  SR 0.0 %"

@@ -26,9 +26,9 @@ def test_a_folder_keeps_how_many_samples_its_latencies_are_of(tmp_path: Path) ->
 
     late = score(drawn, own).late
 
-    why = late[drawn].percentiles_ms[99.0].reason
+    why = late[drawn].measures["p99_ms"].reason
     assert why == "needs 100 samples, has 16"
-    assert late[own].percentiles_ms[99.9].value == 40.0
+    assert late[own].measures["p99.9_ms"].value == 40.0
 
 
 def test_that_number_makes_no_other_evaluation(tmp_path: Path) -> None:
