@@ -1,9 +1,9 @@
 """One route, stepped frame by frame."""
 
 import math
-from enum import StrEnum
 
 from me2e_compress.errors import EvaluationError
+from me2e_compress.metrics.episode import Ending
 from me2e_compress.simulator.plane_geometry import Roadmap, RoutePath
 from me2e_compress.simulator.routes import Route
 from me2e_compress.simulator.scenarios.builders import Builder, stage_of
@@ -30,13 +30,6 @@ STANDING_MPS = 0.1
 goes on: CollisionTest in Bench2Drive's atomic_criteria.py."""
 
 
-class EndReason(StrEnum):
-    """Why the world ended by itself; a runner may stop earlier for other reasons."""
-
-    GOAL = "goal"
-    COLLISION = "collision"
-
-
 class World:
     """A route of highway-env's roads and vehicles, driven by `Control`.
 
@@ -57,7 +50,8 @@ class World:
         parameters: Every parameter of the scenario with its value.
         outside_m: Metres between the ego's centre and the nearest lane, 0 inside.
         outside_distance_m: Metres driven while that exceeded `TOLERANCE_M`.
-        reason: Why the world has ended; None before that.
+        reason: Why the world has ended by itself, at the goal or by a collision; None
+            before that. A runner may stop earlier for other reasons.
         collided: Scenes of the ego's collisions, by time in microseconds.
         weather: What the route says.
     """
@@ -91,7 +85,7 @@ class World:
         self._was_outside = False
         self._met = set[tuple[int, int]]()
         self._next_decision_us = 0
-        self.reason: EndReason | None = None
+        self.reason: Ending | None = None
         # collisions
         self.collided: dict[int, Scene] = {}
         self.weather = stage.weather
@@ -177,7 +171,7 @@ class World:
                 stage.events.append(stage.event(kind, f"signal {sign.id}"))
         self._check_collisions()
         if not self.done and self._furthest_m >= self.path.goal_m:
-            self.reason = EndReason.GOAL
+            self.reason = Ending.COMPLETED
             at_goal = (judge() for judge in stage.at_goal)
             stage.events += [event for event in at_goal if event is not None]
 
@@ -213,7 +207,7 @@ class World:
             elif a.id == 0:
                 event = self.stage.event(EventKind.COLLISION, "the ego", b)
                 self.collided.setdefault(self.time_us, self.scene())
-                self.reason = EndReason.COLLISION
+                self.reason = Ending.COLLISION
             else:
                 words = f"actor {a.id}"
                 event = self.stage.event(EventKind.ACTOR_COLLISION, words, b)

@@ -176,8 +176,8 @@ def test_provider_and_routes_of_the_command_line_win(models: Path) -> None:
             "seed: Input should be greater than or",
         ),
         (
-            "[latency]",
-            "[latency]\nbaseline_median_s = 0.0",
+            "baseline_median_s = 0.43",
+            "baseline_median_s = 0.0",
             StudyError,
             r"latency\.baseline_median_s: Input should be greater than 0",
         ),

@@ -33,7 +33,7 @@ from me2e_compress.simulator.cameras.renderer import Cameras
 from me2e_compress.simulator.pictures import Moment
 from me2e_compress.simulator.routes import Route
 from me2e_compress.simulator.scene import Control, Ego, Scene
-from me2e_compress.simulator.world import EndReason, World
+from me2e_compress.simulator.world import World
 
 TIMEOUT_US = 200_000_000
 """4000 ticks of 50 ms; the leaderboard's own limits are longer."""
@@ -61,8 +61,7 @@ class EndingRules:
     def ending(self, world: World, speed_mps: float) -> Ending | None:
         """Return why the route is over, or None; call it after every step."""
         if world.reason is not None:
-            reached = world.reason is EndReason.GOAL
-            return Ending.COMPLETED if reached else Ending.COLLISION
+            return world.reason
         # far from the route, or for long
         away_m, now_us = abs(world.lateral_m), world.time_us
         if away_m >= ASTRAY_M:

@@ -34,56 +34,6 @@ from me2e_compress.simulator.traffic.network import (
 )
 from me2e_compress.simulator.traffic.right_of_way import Regulator, SignalPlan
 
-# Parameters of a route, drawn by name.
-
-
-class Draws:
-    """Draws the parameters of a route, each by its name.
-
-    A value depends on the route's seed and the name alone, not on what was drawn
-    before, and a value in the route's manifest wins. A manifest's values are those that
-    were drawn: its digest says so.
-    """
-
-    def __init__(self, route: Route) -> None:
-        self.route = route
-        self.parameters: dict[str, Parameter] = {}
-        self.lead_m = 0.0
-        """Metres of route before the places of a scenario."""
-        self._traffic = 0
-
-    def place(self, name: str, low: float, high: float) -> float:
-        """Draw an arc length of the route, after the metres that come before."""
-        return self.uniform(name, low + self.lead_m, high + self.lead_m)
-
-    def random(self, name: str) -> np.random.Generator:
-        """Return a generator of traffic: another ``traffic`` gives other numbers."""
-        key = [self.route.seed, self._traffic, zlib.crc32(name.encode())]
-        return np.random.default_rng(key)
-
-    def uniform(self, name: str, low: float, high: float) -> float:
-        """Draw a parameter between two bounds, to the millimetre."""
-        drawn = round(float(self._random(name).uniform(low, high)), 3)
-        return float(self._given(name, drawn))
-
-    def integer(self, name: str, low: int, high: int) -> int:
-        """Draw an integer parameter between two bounds, both included."""
-        return int(self._given(name, int(self._random(name).integers(low, high + 1))))
-
-    def choice(self, name: str, options: Sequence[str]) -> str:
-        """Draw one of several words."""
-        drawn = options[int(self._random(name).integers(len(options)))]
-        return str(self._given(name, drawn))
-
-    def _given(self, name: str, drawn: Parameter) -> Parameter:
-        value = self.route.parameters.get(name, drawn)
-        self.parameters[name] = value
-        return value
-
-    def _random(self, name: str) -> np.random.Generator:
-        return np.random.default_rng([self.route.seed, zlib.crc32(name.encode())])
-
-
 Body = Car | Walker | StaticObject | EgoVehicle
 HORIZON_S = 200.0
 """Arrivals are drawn for as long as a route may last (the leaderboard's 4000 ticks)."""
@@ -178,15 +128,20 @@ TRAFFIC = "traffic"
 """The parameter that, with the seed, decides all arrivals."""
 
 
-class Stage(Draws):
+class Stage:
     """Everything a scenario is made of.
 
     Layouts lay out the network and the route, scripts put actors on it; both do so
     before the first frame. Afterwards scripts are resumed at every decision.
+
+    Parameters are drawn by their names: a value depends on the route's seed and the
+    name alone, and a value in the route's manifest wins. A manifest's values are those
+    that were drawn: its digest says so.
     """
 
     def __init__(self, route: Route) -> None:
-        super().__init__(route)
+        self.route = route
+        self.parameters: dict[str, Parameter] = {}
         # set by layouts and scripts
         self.path: RoutePath
         self.ego: EgoVehicle
@@ -209,7 +164,7 @@ class Stage(Draws):
         self.schedule = Schedule()
         self.light_across_m = (0.0, 0.0)
         """Where people who cross at a light begin and end, metres left of the route."""
-        self.lead_m = self.uniform("lead_m", *LEAD_M)
+        self.lead_m: float = self.uniform("lead_m", *LEAD_M)
         low, high = AFTER_M
         spread = self.uniform("after_share", 0.0, 1.0)
         after_m = round(low + (high - low) * spread**4, 3)
@@ -219,6 +174,37 @@ class Stage(Draws):
         if kind != "clear":
             strength = self.uniform("weather_strength", 0.2, 1.0)
         self.weather = drawn_weather(kind, strength, route.seed % 2**31)
+
+    def place(self, name: str, low: float, high: float) -> float:
+        """Draw an arc length of the route, after the metres that come before."""
+        return self.uniform(name, low + self.lead_m, high + self.lead_m)
+
+    def random(self, name: str) -> np.random.Generator:
+        """Return a generator of traffic: another ``traffic`` gives other numbers."""
+        key = [self.route.seed, self._traffic, zlib.crc32(name.encode())]
+        return np.random.default_rng(key)
+
+    def uniform(self, name: str, low: float, high: float) -> float:
+        """Draw a parameter between two bounds, to the millimetre."""
+        drawn = round(float(self._random(name).uniform(low, high)), 3)
+        return float(self._given(name, drawn))
+
+    def integer(self, name: str, low: int, high: int) -> int:
+        """Draw an integer parameter between two bounds, both included."""
+        return int(self._given(name, int(self._random(name).integers(low, high + 1))))
+
+    def choice(self, name: str, options: Sequence[str]) -> str:
+        """Draw one of several words."""
+        drawn = options[int(self._random(name).integers(len(options)))]
+        return str(self._given(name, drawn))
+
+    def _given(self, name: str, drawn: Parameter) -> Parameter:
+        value = self.route.parameters.get(name, drawn)
+        self.parameters[name] = value
+        return value
+
+    def _random(self, name: str) -> np.random.Generator:
+        return np.random.default_rng([self.route.seed, zlib.crc32(name.encode())])
 
     @property
     def time_s(self) -> float:

@@ -21,7 +21,7 @@ from me2e_compress.shipped.drivers import shipped
 from me2e_compress.simulator.pictures import Moment
 from me2e_compress.simulator.routes import load_routes, pick_routes
 from me2e_compress.simulator.scene import ActorKind, Ego
-from me2e_compress.simulator.world import EndReason, World
+from me2e_compress.simulator.world import World
 from models.driver.expert.blind import Blind
 from tests.evaluators.highway.drivers import CROSSING, EXIT, GREEN, PARKED, Misbehaving
 
@@ -255,7 +255,7 @@ class Track:
     speed_mps: float = 5.0
     lateral_m: float = 0.0
     time_us: int = 0
-    reason: EndReason | None = None
+    reason: Ending | None = None
     path: SimpleNamespace = field(default_factory=lambda: SimpleNamespace(goal_m=200.0))
 
 
@@ -280,8 +280,8 @@ def ending_after(track: Track, seconds: float) -> tuple[Ending | None, float]:
         # far from it for 60 m, 30 % of 200 m, at 5 m/s
         ({"lateral_m": 14.9}, 20.0, (None, 20.0)),
         ({"lateral_m": 15.0}, 20.0, (Ending.DEVIATION, 12.05)),
-        ({"reason": EndReason.GOAL}, 1.0, (Ending.COMPLETED, 0.05)),
-        ({"reason": EndReason.COLLISION}, 1.0, (Ending.COLLISION, 0.05)),
+        ({"reason": Ending.COMPLETED}, 1.0, (Ending.COMPLETED, 0.05)),
+        ({"reason": Ending.COLLISION}, 1.0, (Ending.COLLISION, 0.05)),
     ],
 )
 def test_when_a_drive_ends(

@@ -5,11 +5,12 @@ import sys
 import pytest
 
 from me2e_compress.errors import EvaluationError
+from me2e_compress.metrics.episode import Ending
 from me2e_compress.simulator.scenarios.roads import two_way
 from me2e_compress.simulator.scene import ActorKind, Control, EventKind
 from me2e_compress.simulator.traffic.bodies import Behaviour
 from me2e_compress.simulator.traffic.stage import Script, Stage
-from me2e_compress.simulator.world import EndReason, World
+from me2e_compress.simulator.world import World
 from tests.simulator.world.driving import coast, empty_road, route_of, trace
 
 DIGEST = """
@@ -72,7 +73,7 @@ def test_the_goal_ends_a_route() -> None:
     world = World(route_of(), builder=empty_road)
     coast(world, 600, Control(1.0, 0.0))
 
-    assert world.reason is EndReason.GOAL
+    assert world.reason is Ending.COMPLETED
     assert world.progress_m == world.path.goal_m > 200.0
     with pytest.raises(EvaluationError, match="has ended: goal"):
         world.step(Control(0.0, 0.0))
@@ -84,7 +85,7 @@ def test_a_collision_names_the_partner_and_ends_the_route() -> None:
 
     (event,) = [e for e in world.events if e.kind is EventKind.COLLISION]
     trucks = [a for a in world.scene().actors if a.kind is ActorKind.TRUCK]
-    assert world.reason is EndReason.COLLISION
+    assert world.reason is Ending.COLLISION
     assert event.actor_kind is ActorKind.TRUCK
     assert event.actor_id == trucks[0].id
     assert event.ego_speed_mps > 5
@@ -187,4 +188,4 @@ def test_running_a_red_light_does_not_end_a_route() -> None:
     coast(world, 900)
 
     assert [event.kind for event in world.events] == [EventKind.RED_LIGHT]
-    assert world.reason is EndReason.GOAL
+    assert world.reason is Ending.COMPLETED
