@@ -124,6 +124,7 @@ _FORMER = {
         for option in ("-r", "--recipe", "--routes", "--workers", "--provider")
     },
     "--road": "--road is gone since 0.3.0: there is one road, with traffic",
+    "study condition.against": f"against {_NOW} [[pair]]",
     "study condition.in_order": f"in_order {_NOW} latency = 'trace{{in_order=true}}'",
     "study condition.seed": f"a condition's seed {_NOW} latency = 'trace{{seed=3}}'",
     "study condition.limit_fps": f"limit_fps {_NOW} 'limited{{source=trace,fps=10}}'",

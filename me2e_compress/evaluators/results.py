@@ -214,8 +214,6 @@ def drive_routes(
         done = results.episodes()
         for path, reason in results.corrupt.items():
             listener.on_warning(f"{path}: {reason}: driven again")
-    elif policy is not None and (kept := _whole(folder, made_by)):
-        return kept
     # keep and report each route as soon as it is driven
     missing = replace(drive, routes=[e for e in drive.routes if e.id not in done])
     total = len(routes) or evaluator.set_size
@@ -239,18 +237,6 @@ def drive_routes(
         for episode in done.values():
             results.keep(episode)
     return tuple(done[route] for route in routes or done)
-
-
-def _whole(folder: Path, made_by: Mapping[str, Any]) -> tuple[Episode, ...]:
-    """Return all episodes of a folder of the same evaluation, or none."""
-    if not (folder / MANIFEST).is_file():
-        return ()
-    results = ResultsFolder.open(folder)
-    if any(results.made_by.get(key) != value for key, value in made_by.items()):
-        return ()
-    episodes = results.episodes()
-    whole = len(episodes) == len(results.made_by["routes"])
-    return tuple(episodes.values()) if whole else ()
 
 
 def _check_episode(

@@ -44,8 +44,6 @@ class Condition:
             (``limited{source=trace, fps=10}``).
         mean_of: Instead of a latency: every decision takes the mean of this drive,
             ``VARIANT.CONDITION``, whose condition comes earlier.
-        against: Another condition that differs from this one in one thing: drives are
-            compared with those under it, route by route.
         latency_model: As of ``evaluate``, and so ``dt_ms``, ``weather``.
 
     Raises:
@@ -56,7 +54,6 @@ class Condition:
     name: str
     latency: str = ""
     mean_of: str = ""
-    against: str = ""
     latency_model: str = "drop"
     dt_ms: float = 50.0
     weather: str = ""
@@ -127,7 +124,6 @@ class Condition:
             "latency_model": self.latency_model,
             "dt_ms": self.dt_ms,
             "weather": self.weather,
-            "against": self.against or None,
         }
 
     def _refusal(self) -> str:

@@ -44,6 +44,12 @@ def check_unique(kind: str, names: Iterable[str]) -> None:
         raise StudyError(f"{count} {kind}s are named {name}")
 
 
+def check_there(what: str, name: str, names: Sequence[str]) -> None:
+    """Check that a name is one of those that there are."""
+    if name not in names:
+        raise StudyError(f"{what} {name}; there are {', '.join(names) or 'none'}")
+
+
 # What a file names lies beside it: its folder is the context of the validation, which
 # Python's own objects do not go through.
 
@@ -253,14 +259,7 @@ class Study:
         # names must be unique, and refer to something
         check_unique("variant", (variant.name for variant in self.variants))
         check_unique("condition", (condition.name for condition in self.conditions))
-        names = [variant.name for variant in self.variants]
-        if self.baseline not in names:
-            raise StudyError(
-                f"baseline {self.baseline!r} is not a variant; there are"
-                f" {', '.join(names)}"
-            )
-        self._check_conditions(names)
-        self._check_blocks_and_pairs(names)
+        self._check_names()
         # variants that name no policy take the study's
         for each in self.variants:
             if not (each.policy or self.policy):
@@ -288,44 +287,24 @@ class Study:
         partial = 0 < driven < whole
         return f" (preview: {driven} of {whole} routes)" if partial else ""
 
-    def _check_conditions(self, variants: Sequence[str]) -> None:
-        """Check that means refer to earlier drives, and ``against`` to conditions."""
-        before = list[str]()
-        names = [each.name for each in self.conditions]
-        for each in self.conditions:
-            variant, _, condition = each.mean_of.partition(".")
-            if each.mean_of and (variant not in variants or condition not in before):
-                raise StudyError(
-                    f"condition {each.name}: mean_of {each.mean_of!r} is no"
-                    " VARIANT.CONDITION of a condition before it"
-                )
-            if each.against and each.against not in {*names} - {each.name}:
-                raise StudyError(
-                    f"condition {each.name}: against {each.against!r} is not another"
-                    f" condition; there are {', '.join(names)}"
-                )
-            before.append(each.name)
-
-    def _check_blocks_and_pairs(self, variants: Sequence[str]) -> None:
+    def _check_names(self) -> None:
+        """Check that what is named is there; means refer to drives before theirs."""
+        variants = [each.name for each in self.variants]
         conditions = [each.name for each in self.conditions]
+        check_there("baseline: no variant", self.baseline, variants)
         for block in self.blocks:
-            for kind, named, there in (
-                ("variant", block.variants, variants),
-                ("condition", block.conditions, conditions),
-            ):
-                for name in named:
-                    if name not in there:
-                        raise StudyError(
-                            f"block {block.name}: no {kind} {name}; there are "
-                            f"{', '.join(there)}"
-                        )
-        drives = {f"{one}.{other}" for one in variants for other in conditions}
+            for name in block.variants:
+                check_there(f"block {block.name}: no variant", name, variants)
+            for name in block.conditions:
+                check_there(f"block {block.name}: no condition", name, conditions)
+        drives = [f"{one}.{other}" for other in conditions for one in variants]
         for name in (name for pair in self.pairs for name in pair):
-            if name not in drives:
-                raise StudyError(
-                    f"pair: {name!r} is no VARIANT.CONDITION; there are "
-                    f"{', '.join(variants)} and {', '.join(conditions)}"
-                )
+            check_there("pair: no VARIANT.CONDITION", name, drives)
+        for number, each in enumerate(self.conditions):
+            if each.mean_of:
+                what = f"condition {each.name}: mean_of: no VARIANT.CONDITION before it"
+                before = drives[: number * len(variants)]
+                check_there(what, each.mean_of, before)
 
     def _check_evaluator(self) -> None:
         """Check that the evaluator takes all that variants and conditions ask for."""
@@ -407,9 +386,7 @@ class Study:
         """Return the part that some blocks need."""
         there = {each.name: each for each in self.blocks}
         for name in names:
-            if name not in there:
-                known = ", ".join(there) or "none"
-                raise StudyError(f"no block {name}; there are {known}")
+            check_there("no block", name, list(there))
         chosen = [there[name] for name in names]
         drive = {self.baseline, *(name for each in chosen for name in each.variants)}
         under = {name for each in chosen for name in each.conditions}

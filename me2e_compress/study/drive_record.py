@@ -5,7 +5,7 @@ A drive of 220 routes takes 30 MB of episodes and 0.1 MB of these lines.
 
 import json
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Self
 
@@ -26,7 +26,6 @@ from me2e_compress.metrics.route_summary import (
 from me2e_compress.metrics.scores import Scores
 from me2e_compress.registry import documents, drafts
 from me2e_compress.runtime.atomic import write_bytes
-from me2e_compress.study.condition import Condition
 
 
 @dataclass(frozen=True)
@@ -147,81 +146,26 @@ class DriveRecord:
             return cls(head.variant, head.condition, routes, head.made_by)
 
 
-_CHANGED = {"driving_score": DS, "room_kept": ROOM, "success_rate": SR}
-
-
 @dataclass(frozen=True)
-class Change:
-    """One drive (``VARIANT.CONDITION``) minus another over the same routes, in points.
-
-    Attributes:
-        beyond: The change minus the baseline's, by the estimate's name; empty for the
-            baseline itself, and for a pair.
-    """
+class Comparison:
+    """One drive (``VARIANT.CONDITION``) minus another on the same routes, in points."""
 
     drive: str
     against: str
     driving_score: Estimate
     room_kept: Estimate
     success_rate: Estimate
-    beyond: Mapping[str, Estimate] = field(default_factory=dict)
-
-    @classmethod
-    def of(cls, drive: DriveRecord, other: DriveRecord, seed: int) -> Self:
-        """Compare two drives."""
-        score, room, rate = (drive.minus(other, e, seed) for e in _CHANGED.values())
-        return cls(drive.name, other.name, score, room, rate)
-
-    def to_json(self) -> dict[str, Any]:
-        """Return both names and every estimate."""
-        return {
-            "drive": self.drive,
-            "against": self.against,
-            **{name: getattr(self, name) for name in _CHANGED},
-            "beyond_baseline": {name: self.beyond.get(name) for name in _CHANGED},
-        }
 
 
-def changes(
-    conditions: Sequence[Condition],
-    drives: Sequence[DriveRecord],
-    baseline: str,
-    seed: int,
-) -> tuple[Change, ...]:
-    """Compare every drive with the one that its condition changes, if there is one.
-
-    What the change costs a variant beyond what it costs the baseline is a mean of
-    paired differences of differences.
-    """
-    there = {each.name: each for each in drives if each.routes}
-    costs = list[Change]()
-    for condition in (each for each in conditions if each.against):
-        names = condition.name, condition.against
-        theirs, theirs_before = (there.get(f"{baseline}.{name}") for name in names)
-        for drive in (each for each in drives if each.condition == condition.name):
-            ours, before = (there.get(f"{drive.variant}.{name}") for name in names)
-            if not (ours and before and theirs and theirs_before):
-                continue
-            change = Change.of(ours, before, seed)
-            if drive.variant != baseline:
-                columns = _CHANGED.items()
-                own = {n: ours.values(c) - before.values(c) for n, c in columns}
-                its = {
-                    n: theirs.values(c) - theirs_before.values(c) for n, c in columns
-                }
-                beyond = {name: (own[name] - its[name]).mean(seed) for name in own}
-                change = replace(change, beyond=beyond)
-            costs.append(change)
-    return tuple(costs)
-
-
-def held_against(
+def compared(
     pairs: Sequence[tuple[str, str]], drives: Sequence[DriveRecord], seed: int
-) -> tuple[Change, ...]:
+) -> tuple[Comparison, ...]:
     """Compare pairs of drives (``VARIANT.CONDITION``) if both were driven."""
     there = {each.name: each for each in drives if each.routes}
-    return tuple(
-        Change.of(there[one], there[other], seed)
-        for one, other in pairs
-        if one in there and other in there
-    )
+    comparisons = list[Comparison]()
+    for one, other in pairs:
+        if one in there and other in there:
+            ours, theirs = there[one], there[other]
+            gaps = (ours.minus(theirs, column, seed) for column in (DS, ROOM, SR))
+            comparisons.append(Comparison(one, other, *gaps))
+    return tuple(comparisons)

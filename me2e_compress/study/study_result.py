@@ -14,12 +14,7 @@ from me2e_compress.runtime.providers import PROVIDERS
 from me2e_compress.study.cells import MISSING, anew_cell, estimate_cell, measure_cell
 from me2e_compress.study.condition import Condition
 from me2e_compress.study.definition import Study
-from me2e_compress.study.drive_record import (
-    Change,
-    DriveRecord,
-    changes,
-    held_against,
-)
+from me2e_compress.study.drive_record import Comparison, DriveRecord, compared
 from me2e_compress.study.outcome import VariantOutcome
 from me2e_compress.workflows.result import Result, Shown, plain
 
@@ -84,15 +79,9 @@ class StudyResult(Result):
         return tuple(each for each in self.drives if each.condition == condition.name)
 
     @cached_property
-    def changes(self) -> tuple[Change, ...]:
-        """Cost of each change of a condition, by variant."""
-        study = self.study
-        return changes(study.conditions, self.drives, study.baseline, study.seed)
-
-    @cached_property
-    def pairs(self) -> tuple[Change, ...]:
+    def pairs(self) -> tuple[Comparison, ...]:
         """Comparisons of the pairs that the study names."""
-        return held_against(self.study.pairs, self.drives, self.study.seed)
+        return compared(self.study.pairs, self.drives, self.study.seed)
 
     def variant(self, name: str) -> VariantOutcome:
         """Return a variant by its name."""
@@ -130,7 +119,7 @@ class StudyResult(Result):
         sections = {
             "On the road": (scoreboard(self),),
             "Differences": (difference_table(self),) * (len(self.variants) > 1),
-            "One change at a time": change_tables(self),
+            "Pairs of drives": (pair_table(self),) * bool(self.pairs),
             "Route by route": route_tables(self),
             "Near misses": (near_misses(self),),
             "Abilities": (abilities(self),),
@@ -163,7 +152,6 @@ class StudyResult(Result):
             },
             "schemes": self.variants,
             "drives": self.drives,
-            "changes": self.changes,
             "pairs": self.pairs,
             "machine": self.machine,
             "versions": self.versions,
@@ -268,7 +256,7 @@ def _differences_note(gaps: Sequence[PairedDifference]) -> str:
     return note
 
 
-def _gaps(of: Change | PairedDifference) -> tuple[Cell, ...]:
+def _gaps(of: Comparison | PairedDifference) -> tuple[Cell, ...]:
     """Show differences: driving score with both intervals, room kept, success rate."""
     estimates = of.driving_score, of.room_kept, of.success_rate
     score, room, rate = (estimate_cell(each, signed=True) for each in estimates)
@@ -293,42 +281,20 @@ def abilities(result: StudyResult) -> Table:
     return Table(title, columns, rows, note, strong)
 
 
-def change_tables(result: StudyResult) -> tuple[Table, ...]:
-    """Show costs of changed conditions, and pairs of drives, if there are any."""
-    baseline = result.study.baseline
-    note = (
-        "The first drive minus the second, mean over routes with its 95 % interval: one"
-        " that holds zero shows no difference."
-    )
-    further = (
-        f" Beyond: minus {baseline}'s own difference, route by route; below zero where"
-        " the change costs more than it."
+def pair_table(result: StudyResult) -> Table:
+    """Show the pairs of drives that the study names."""
+    rows = tuple(
+        (Cell(each.drive), Cell(each.against), *_gaps(each)) for each in result.pairs
     )
     columns = (
         *("drive", "against", "DS, points", "DS, other types", "room, points"),
         "SR, points",
     )
-    titled = (
-        (
-            f"One change, the same routes and seeds; more than it costs {baseline}?",
-            (*columns, "DS beyond", "room beyond", "SR beyond"),
-            result.changes,
-            note + further,
-        ),
-        ("Pairs of drives on the same routes", columns, result.pairs, note),
+    note = (
+        "The first drive minus the second, mean over routes with its 95 % interval: one"
+        " that holds zero shows no difference."
     )
-    own = Cell(MISSING, reason="the baseline itself")
-    tables = list[Table]()
-    for title, heads, compared, words in titled:
-        rows = list[tuple[Cell, ...]]()
-        for each in compared:
-            beyond = [estimate_cell(e, signed=True) for e in each.beyond.values()]
-            names = Cell(each.drive), Cell(each.against)
-            cells = (*names, *_gaps(each), *(beyond or [own] * 3))
-            rows.append(cells[: len(heads)])
-        if rows:
-            tables.append(Table(title, heads, tuple(rows), words))
-    return tuple(tables)
+    return Table("Pairs of drives on the same routes", columns, rows, note)
 
 
 def route_tables(result: StudyResult) -> tuple[Table, ...]:

@@ -36,7 +36,6 @@ latency = "none"
 [[condition]]
 name = "late"
 latency = "fps:4"
-against = "ideal"
 """
 
 

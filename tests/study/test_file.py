@@ -78,7 +78,6 @@ def test_conditions_blocks_and_pairs_of_a_file(models: Path) -> None:
     latency = "fps:10"
     weather = "fog_m=60"
     dt_ms = 25
-    against = "ideal"
 
     [[condition]]
     name = "even"
@@ -97,7 +96,7 @@ def test_conditions_blocks_and_pairs_of_a_file(models: Path) -> None:
     study = load_study(write(models, GOOD + parts))
 
     _, fog, even = study.conditions
-    rest = {"dt_ms": 25.0, "against": "ideal"}
+    rest = {"dt_ms": 25.0}
     assert fog == Condition("fog", "fps:10", weather="fog_m=60", **rest)  # type: ignore[arg-type]
     assert even == Condition("even", mean_of="float.fog", latency_model="fifo")
     assert study.blocks == (StudyBlock("table-3", ("small",), ("fog", "even")),)

@@ -17,9 +17,7 @@ from me2e_compress.manager import recipe
 from me2e_compress.metrics.route_summary import RouteSummary
 from me2e_compress.metrics.scores import score
 from me2e_compress.study import (
-    Condition,
     Listener,
-    Study,
     StudyResult,
     Timing,
     Variant,
@@ -27,8 +25,8 @@ from me2e_compress.study import (
     run_study,
 )
 from me2e_compress.study.definition import FramesToRecord
-from me2e_compress.study.drive_record import DriveRecord, changes, held_against
-from me2e_compress.study.study_result import change_tables
+from me2e_compress.study.drive_record import DriveRecord, compared
+from me2e_compress.study.study_result import pair_table
 from tests.evaluators.highway.drivers import straight_on
 from tests.study.conftest import BLIND, IDEAL, ROUTES, SLOW, Here, Make
 
@@ -355,10 +353,6 @@ def test_a_spoilt_record_is_named(
         DriveRecord.load(path)
 
 
-FOG = Condition("fog", "none", against="ideal")
-CONDITIONS = (IDEAL, FOG)
-
-
 def summary(route: str, scenario: str, score: float) -> RouteSummary:
     ended = (100.0, score == 100.0, "", (), None, None)
     made = RouteSummary(route, scenario, score, *ended, 1, 0, (), 0)
@@ -380,46 +374,23 @@ DRIVES = (
 )
 
 
-def test_a_change_is_held_against_the_same_routes_without_it() -> None:
-    float_, int8 = changes(CONDITIONS, DRIVES, "float", 0)
-
-    assert (float_.drive, float_.against) == ("float.fog", "float.ideal")
-    assert float_.driving_score.value == pytest.approx(-2.5)
-    assert float_.success_rate.value == pytest.approx(-25.0)
-    assert float_.room_kept.value == pytest.approx(-2.5 / 2)
-    assert float_.beyond == {}
-    assert int8.driving_score.value == pytest.approx((-40 - 10 - 40) / 4)
-    # that int8 loses more is a difference of differences
-    found = int8.beyond["driving_score"]
-    assert found.value == pytest.approx((-40 + 0 + 0 - 40) / 4)
-    assert found.low is not None
-    assert found.high is not None
-    assert found.low < -20.0 < found.high
-    assert found.n == 4
-    assert int8.beyond["room_kept"].value == pytest.approx(-10.0)
-
-
 def test_a_pair_crosses_conditions_and_what_was_not_driven_is_left_out() -> None:
     asked = [("int8.fog", "float.ideal")]
-    [pair] = held_against(asked, DRIVES, 0)
+    [pair] = compared(asked, DRIVES, 0)
     assert pair.driving_score.value == pytest.approx((-40 - 10 - 20 - 40) / 4)
-    assert pair.to_json()["beyond_baseline"]["driving_score"] is None
-    missing = DriveRecord("int8", "fog", reason="it failed")
-    assert len(changes(CONDITIONS, (*DRIVES[:3], missing), "float", 0)) == 1
-    assert held_against(asked, DRIVES[:3], 0) == ()
+    assert pair.driving_score.n == 4
+    assert pair.success_rate.value == pytest.approx(-75.0)
+    assert pair.room_kept.value == pytest.approx((-40 - 10 - 20 - 40) / 8)
+    assert compared(asked, DRIVES[:3], 0) == ()
 
 
-def test_tables_of_changes_and_pairs(make: Make) -> None:
+def test_a_table_of_pairs() -> None:
     class Outcome:
-        """A study's outcome, so far as these tables read it."""
+        """A study's outcome, so far as this table reads it."""
 
-        study: Study = make(conditions=(IDEAL, FOG), baseline="slow")
-        changes = changes(CONDITIONS, DRIVES, "float", 0)
-        pairs = held_against([("int8.fog", "float.ideal")], DRIVES, 0)
+        pairs = compared([("int8.fog", "float.ideal")], DRIVES, 0)
 
-    one, other = change_tables(Outcome())  # type: ignore[arg-type]
+    table = pair_table(Outcome())  # type: ignore[arg-type]
 
-    assert one.columns[-3:] == ("DS beyond", "room beyond", "SR beyond")
-    assert [len(row) for row in one.rows] == [9, 9]
-    assert one.rows[0][6].reason == "the baseline itself"
-    assert [len(row) for row in other.rows] == [6]
+    assert [len(row) for row in table.rows] == [len(table.columns)]
+    assert [cell.text for cell in table.rows[0][:2]] == ["int8.fog", "float.ideal"]
