@@ -23,6 +23,19 @@ from me2e_compress.errors import EvaluationError
 from me2e_compress.registry import Registry
 from me2e_compress.runtime.latency_trace import LatencyTrace
 
+__all__ = [
+    "LATENCY_SOURCES",
+    "Charge",
+    "DecisionFacts",
+    "FixedLatency",
+    "FrameRate",
+    "LatencySource",
+    "MeasuredLatency",
+    "NoLatency",
+    "TraceLatency",
+    "parse_latency",
+]
+
 
 @dataclass(frozen=True, eq=False, slots=True)
 class DecisionFacts:

@@ -17,6 +17,16 @@ from me2e_compress.driving.contract import Policy
 from me2e_compress.errors import EvaluationError
 from me2e_compress.registry import Registry, name_in
 
+__all__ = [
+    "MODEL",
+    "POLICIES",
+    "PYTHON",
+    "Driver",
+    "SizedPolicy",
+    "driver_named",
+    "opened",
+]
+
 
 @runtime_checkable
 class SizedPolicy(Policy, Protocol):

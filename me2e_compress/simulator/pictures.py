@@ -37,8 +37,8 @@ Colour = tuple[int, int, int]
 MONTAGE = (("FRONT_LEFT", "FRONT", "FRONT_RIGHT"), ("BACK_LEFT", "BACK", "BACK_RIGHT"))
 """As in nuScenes' figures. Rear images are not mirrored: in BACK, what is to the left
 of the car is to the right of the image."""
-GAP, CAPTION = 4, 30
-"""Pixels between two pictures, and height of a line of text."""
+TILE, GAP, CAPTION = 320, 4, 30
+"""Pixels: width of a camera's tile, between two pictures, height of a line of text."""
 COLOURS = 256
 """Colours of an animation's palette."""
 FINE = 2
@@ -107,14 +107,12 @@ class RoutePicture:
         texture: The ground the route was driven on.
         route: [N, 2] world points of the route.
         moments: In order of time, at least one.
-        tile_width: Width of a camera's tile in pixels.
     """
 
     title: str
     texture: GroundTexture
     route: Floats
     moments: Sequence[Moment]
-    tile_width: int = 320
 
     def __post_init__(self) -> None:
         if not self.moments:
@@ -143,7 +141,7 @@ class RoutePicture:
 
     def strip(self, indices: Sequence[int]) -> Image.Image:
         """Draw moments side by side, the front camera above the view from above."""
-        side, tiles = self.tile_width, [self.tile(i, "FRONT") for i in indices]
+        side, tiles = TILE, [self.tile(i, "FRONT") for i in indices]
         below = CAPTION + GAP + tiles[0].height + GAP
         size = len(tiles) * (side + GAP) - GAP, below + side
         picture = Image.new("RGB", size, PAPER)
@@ -157,8 +155,8 @@ class RoutePicture:
     def tile(self, index: int, name: str) -> Image.Image:
         """Draw one camera's image, with its name."""
         image = self.moments[index].images[CAMERA_NAMES.index(name)]
-        height = round(self.tile_width * image.shape[0] / image.shape[1])
-        size, how = (self.tile_width, height), Image.Resampling.BILINEAR
+        height = round(TILE * image.shape[0] / image.shape[1])
+        size, how = (TILE, height), Image.Resampling.BILINEAR
         tile = Image.fromarray(image).resize(size, how)
         write(tile, (5, 3), name, PAPER, 12, INK)
         return tile
@@ -184,39 +182,24 @@ class RoutePicture:
     def _from_above(self, index: int, size: tuple[int, int]) -> Image.Image:
         """Draw 72 m from top to bottom, the ego heading up; ``size`` is (w, h)."""
         moment, ego = self.moments[index], self.moments[index].scene.ego
-        scale = size[1] * FINE / (AHEAD_M + BEHIND_M)
-        view = View(ego, scale, (size[0] * FINE / 2, AHEAD_M * scale))
-        large = size[0] * FINE, size[1] * FINE
-        # the ground: from pixels to metres east and north, then to its texels
-        texel = 2 * RESOLUTION_M
-        corner = view.to_world((0.0, 0.0)) - (self.texture.west_m, self.texture.north_m)
-        turn = np.column_stack([np.linalg.inv(view.axes), corner]) / texel
-        turn[1] *= -1.0
-        coefficients = turn.ravel().tolist()
-        picture = self._map.transform(
-            large,
-            Image.Transform.AFFINE,
-            coefficients,
-            Image.Resampling.BILINEAR,
-            fillcolor=GROUND[PixelClass.TERRAIN],
-        )
+        corner = self.texture.west_m, self.texture.north_m
+        view = View(self._map, corner, ego, size)
         # layers, what matters most last
-        pen = Pen(ImageDraw.Draw(picture), view)
-        pen.line(self.route, ROUTE, 2)
-        pen.line(self.trail[: index + 1], TRAIL, 3)
+        view.line(self.route, ROUTE, 2)
+        view.line(self.trail[: index + 1], TRAIL, 3)
         for signal in moment.scene.signals:
-            pen.signal(signal)
+            view.signal(signal)
         for actor in moment.scene.actors:
-            pen.actor(actor)
-        pen.vehicle(ego, EGO)
+            view.actor(actor)
+        view.vehicle(ego, EGO)
         if moment.plan is not None:
             waypoints = ego.placed(moment.plan)
-            pen.line(np.vstack([[(ego.x, ego.y)], waypoints]), PLAN, 2)
+            view.line(np.vstack([[(ego.x, ego.y)], waypoints]), PLAN, 2)
             for point in waypoints:
-                pen.disc(point, PLAN, 3.0)
+                view.disc(point, PLAN, 3.0)
         for event in self.infractions(index):
-            pen.cross(event)
-        reduced = picture.reduce(FINE)
+            view.cross(event)
+        reduced = view.picture.reduce(FINE)
         self._label(reduced, index, view)
         return reduced
 
@@ -237,55 +220,57 @@ class RoutePicture:
         write(picture, (12, bottom - 18), f"{SCALE_BAR_M:g} m", INK, 13, PAPER)
 
 
-@dataclass(frozen=True)
 class View:
-    """The map from the world to the pixels of a view whose ego heads up.
+    """A picture from above whose ego heads up; what is drawn is in world metres.
 
-    Attributes:
-        scale: Pixels per metre.
-        anchor: (column, row) of the ego.
+    It begins with the ground, a picture of two texels a pixel whose upper left corner
+    is at a place of the world. Widths are those of the reduced picture.
     """
 
-    ego: Ego
-    scale: float
-    anchor: tuple[float, float]
-
-    @property
-    def axes(self) -> Floats:
-        """[2, 2] rows: pixels right and pixels down for metres east and north."""
-        cos, sin = math.cos(self.ego.heading), math.sin(self.ego.heading)
-        return self.scale * np.array([(sin, -cos), (-cos, -sin)])
+    def __init__(
+        self,
+        ground: Image.Image,
+        corner: tuple[float, float],
+        ego: Ego,
+        size: tuple[int, int],
+    ) -> None:
+        width, height = size[0] * FINE, size[1] * FINE
+        self.ego, self.scale = ego, height / (AHEAD_M + BEHIND_M)
+        self.anchor = width / 2, AHEAD_M * self.scale
+        # pixels right and pixels down for metres east and north
+        cos, sin = math.cos(ego.heading), math.sin(ego.heading)
+        self.axes = self.scale * np.array([(sin, -cos), (-cos, -sin)])
+        # from pixels to metres east and south of the corner, then to texels
+        back = np.linalg.inv(self.axes)
+        begin = np.subtract((ego.x, ego.y), corner) - back @ self.anchor
+        turn = np.column_stack([back, begin]) / (2 * RESOLUTION_M)
+        turn[1] *= -1.0
+        self.picture = ground.transform(
+            (width, height),
+            Image.Transform.AFFINE,
+            turn.ravel().tolist(),
+            Image.Resampling.BILINEAR,
+            fillcolor=GROUND[PixelClass.TERRAIN],
+        )
+        self.drawing = ImageDraw.Draw(self.picture)
 
     def to_pixels(self, points: npt.ArrayLike) -> Floats:
         """Convert world points [..., 2] to pixels (column, row)."""
         offset = np.asarray(points, float) - (self.ego.x, self.ego.y)
         return np.asarray(offset @ self.axes.T + self.anchor)
 
-    def to_world(self, pixel: tuple[float, float]) -> Floats:
-        """Convert a pixel to a world point."""
-        away = np.linalg.solve(self.axes, np.subtract(pixel, self.anchor))
-        return np.add(away, (self.ego.x, self.ego.y))
-
-
-@dataclass(frozen=True)
-class Pen:
-    """Draws things of the world, in metres, into a view; widths are of the picture."""
-
-    drawing: ImageDraw.ImageDraw
-    view: View
-
     def line(self, points: npt.ArrayLike, colour: Colour, width_px: int) -> None:
         """Draw a polyline of world points [N, 2]."""
-        pixels = self.view.to_pixels(points).ravel().tolist()
+        pixels = self.to_pixels(points).ravel().tolist()
         self.drawing.line(pixels, colour, width_px * FINE, joint="curve")
 
     def polygon(self, points: Floats, colour: Colour) -> None:
         """Fill a polygon of world points [N, 2]."""
-        self.drawing.polygon(self.view.to_pixels(points).ravel().tolist(), colour)
+        self.drawing.polygon(self.to_pixels(points).ravel().tolist(), colour)
 
     def disc(self, point: npt.ArrayLike, colour: Colour, radius_px: float) -> None:
         """Fill a disc with a white rim around a world point."""
-        centre = self.view.to_pixels(point).tolist()
+        centre = self.to_pixels(point).tolist()
         self.drawing.circle(centre, (radius_px + 1.0) * FINE, PAPER)
         self.drawing.circle(centre, radius_px * FINE, colour)
 
@@ -321,13 +306,13 @@ class Pen:
             self.disc((signal.x, signal.y), colour, 5.0)
             return
         sides = 8 if signal.kind is SignalKind.STOP_SIGN else 3
-        centre = self.view.to_pixels((signal.x, signal.y)).tolist()
+        centre = self.to_pixels((signal.x, signal.y)).tolist()
         turned = 180 if sides == 3 else 0  # a give-way sign stands on its point
         self.drawing.regular_polygon((centre, 6.0 * FINE), sides, turned, colour)
 
     def cross(self, event: Event) -> None:
         """Draw a red cross where the ego was."""
-        x, y = self.view.to_pixels((event.x, event.y)).tolist()
+        x, y = self.to_pixels((event.x, event.y)).tolist()
         arm = 7.0 * FINE
         for colour, width in ((PAPER, 7), (INFRACTION, 3)):
             for slant in (arm, -arm):

@@ -128,25 +128,17 @@ class StudyCells:
         self, condition: Condition, prepared: Sequence[PreparedVariant]
     ) -> tuple[DriveRecord, ...]:
         """Drive the variants of one condition, the baseline first."""
-        driven = self.study.driven_under(condition)
+        driven, baseline = self.study.driven_under(condition), self.study.baseline
         prepared = [each for each in prepared if each.variant in driven]
-        if not prepared:
-            return ()
-        names = [each.variant.name for each in prepared]
-        baseline = prepared[names.index(self.study.baseline)]
-        reference = self._driven(baseline, condition)
-        records = list[DriveRecord]()
-        for each in prepared:
-            if each is baseline:
-                records.append(reference)
-                continue
-            record = self._driven(each, condition)
-            if record.routes and reference.routes:
-                seed = self.study.seed
-                gap = difference(record.routes, reference.routes, seed)
-                record = replace(record, difference=gap)
-            records.append(record)
-        return tuple(records)
+        # the baseline drives first: others are compared with it
+        ordered = sorted(prepared, key=lambda each: each.variant.name != baseline)
+        records = {e.variant.name: self._driven(e, condition) for e in ordered}
+        for name, record in records.items():
+            if name != baseline and record.routes and records[baseline].routes:
+                reference, seed = records[baseline].routes, self.study.seed
+                gap = difference(record.routes, reference, seed)
+                records[name] = replace(record, difference=gap)
+        return tuple(records[each.variant.name] for each in prepared)
 
     def drive(self, prepared: PreparedVariant, condition: Condition) -> Drive | None:
         """Return what a cell drives; None without a driver or its latency."""

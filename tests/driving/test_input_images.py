@@ -361,11 +361,17 @@ def test_intrinsics_are_those_of_the_rig_in_any_axes(axes: Axes) -> None:
     [
         ("command{one_hot=4}", r"numbers \[0, 1, 2, 3, 4, 5\] do not fit one_hot = 4"),
         ("command{one_hot=1000000000}", "one_hot = 1000000000 classes, of 1000 at"),
-        ("past{steps=1000000000}", "1000000000 steps 0.5 s apart: .* up to 1000"),
-        ("past{steps=0}", "past: 0 steps 0.5 s apart"),
+        (
+            "past{steps=1000000000}",
+            "past: steps: Input should be less than",
+        ),
+        ("past{steps=0}", "past: steps: Input should be greater than"),
         ("constant{values=[1], shape=[2]}", r"1 values have no shape \[2\]"),
-        ("constant{values=[1, 2], shape=[-1, -2]}", r"no shape \[-1, -2\]"),
-        ("constant{values=[1e300]}", "values must be finite, up to 1e.18"),
+        (
+            "constant{values=[1, 2], shape=[-1, -2]}",
+            r"shape\.0: Input should be",
+        ),
+        ("constant{values=[1e300]}", r"values\.0: Input should be less than or equal"),
         ("velocities", "no input source 'velocities'; there are speed, velocity"),
         ("target-point:middle", "target-point: which: Input should be 'near' or 'far'"),
     ],

@@ -38,8 +38,8 @@ def moment(i: int, *events: Event, images: Image8 = BLACK) -> Moment:
     return Moment(scene, images, PLAN_AHEAD, events)
 
 
-def picture(*moments: Moment, tile_width: int = 160) -> RoutePicture:
-    return RoutePicture("Accident_1", TEXTURE, town.ROUTE, moments, tile_width)
+def picture(*moments: Moment) -> RoutePicture:
+    return RoutePicture("Accident_1", TEXTURE, town.ROUTE, moments)
 
 
 def count(pixels: Image8, colour: tuple[int, int, int]) -> int:
@@ -48,7 +48,7 @@ def count(pixels: Image8, colour: tuple[int, int, int]) -> int:
 
 def above(frame: Image.Image) -> Image8:
     """The view from above: right of three tiles and their gaps."""
-    return np.asarray(frame)[:-34, 3 * 164 :]
+    return np.asarray(frame)[:-34, 3 * 324 :]
 
 
 def test_a_frame_has_six_tiles_a_view_from_above_and_a_caption() -> None:
@@ -58,9 +58,9 @@ def test_a_frame_has_six_tiles_a_view_from_above_and_a_caption() -> None:
     sides = ("{}_LEFT", "{}", "{}_RIGHT")
     for row, column in np.ndindex(2, 3):
         name = sides[column].format(("FRONT", "BACK")[row])
-        pixel = frame[row * 100 + 60, column * 164 + 80]
+        pixel = frame[row * 196 + 120, column * 324 + 160]
         assert pixel.tolist() == [20 * CAMERA_NAMES.index(name)] * 3
-    assert above(drawn).shape[0] == 196
+    assert above(drawn).shape[0] == 388
     assert (frame[-30:] < 120).any()
 
 
@@ -106,7 +106,7 @@ def test_an_event_is_drawn_once_and_a_trigger_is_no_infraction() -> None:
 def test_a_strip_sets_moments_side_by_side() -> None:
     film = picture(*(moment(i) for i in range(4)))
     strip = film.strip([0, 2, 3])
-    assert strip.size == (3 * 160 + 2 * 4, 30 + 4 + 96 + 4 + 160)
+    assert strip.size == (3 * 320 + 2 * 4, 30 + 4 + 192 + 4 + 320)
     # without a moment there is nothing to draw
     with pytest.raises(EvaluationError, match="Accident_1: no moments to draw"):
         picture()

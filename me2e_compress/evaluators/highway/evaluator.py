@@ -72,20 +72,18 @@ class Highway(Evaluator):
         if policy is None:
             raise EvaluationError(f"{self.name} drives a policy: name one")
         need_extra("highway", "driving")
-        image_size = image_size_of(opened(policy))
-        made, routes = drive.conditions(), _ours(drive.routes)
+        made = drive.conditions()
+        weather = made.pop("weather")
         return {
             VERSION: ROAD_VERSION,
             "version": __version__,
             "policy": policy.fingerprint(),
-            "latency": made["latency"],
-            "latency_model": made["latency_model"],
-            "dt_us": made["dt_us"],
-            "image_size": list(image_size),
-            "weather": made["weather"],
+            **made,
+            "image_size": list(image_size_of(opened(policy))),
+            "weather": weather,
             "frame_limit_s": drive.frame_limit_s,
             "set_size": drive.set_size,
-            "routes_sha256": digest_of(routes),
+            "routes_sha256": digest_of(_ours(drive.routes)),
         }
 
     def episodes(
