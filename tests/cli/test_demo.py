@@ -57,13 +57,6 @@ def test_the_demo_compresses_drives_and_reports(cli: Cli, tmp_path: Path) -> Non
     assert [name for name in links if not (out / name).exists()] == []
 
 
-def test_all_tables_are_shown_to_who_asks(cli: Cli) -> None:
-    shown = cli.done(f"-v {DEMO}").out
-
-    for title in ("Pass by pass", "Modules", "Fidelity over 2 frames"):
-        assert shown.count(title) == 1
-
-
 @pytest.mark.parametrize("name", ["report.html", "highway.full.onnx", "frames"])
 def test_what_is_there_is_refused_before_any_work(
     cli: Cli, tmp_path: Path, name: str
@@ -76,17 +69,27 @@ def test_what_is_there_is_refused_before_any_work(
     assert f"out/{name}" in cli.refused("demo --out out")
 
 
-def test_all_its_steps_are_one_document(
-    cli: Cli, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    found = FramesResult("m", Path("f"), 0)
+@pytest.fixture
+def fast(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Steps that are done at once: `0 frames of m` is the result of all."""
+    result = FramesResult("m", Path("f"), 0)
     names = ("compress", "weigh", "compare", "drive")
-    steps = {name: lambda listener: found for name in names}
+    steps = {name: lambda listener: result for name in names}
     monkeypatch.setattr(demo.DriverDemo, "steps", property(lambda self: steps))
 
-    document = cli.document("demo --out out")
 
-    assert document["drive"]["frames"] == 0
+@pytest.mark.usefixtures("fast")
+def test_all_its_steps_are_one_document(cli: Cli) -> None:
+    assert cli.document(DEMO)["drive"]["frames"] == 0
+
+
+@pytest.mark.usefixtures("fast")
+@pytest.mark.parametrize(("words", "times"), [("", 4 + 1), ("-v ", 4 + 4)])
+def test_a_step_is_shown_in_full_to_who_asks_and_the_last_to_all(
+    cli: Cli, words: str, times: int
+) -> None:
+    """Each has a line of its own as soon as it is done."""
+    assert cli.done(f"{words}{DEMO}").out.count("0 frames of m") == times
 
 
 @pytest.mark.parametrize("line", ["demo --out out", "frames highway -o made"])

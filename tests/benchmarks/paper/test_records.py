@@ -3,13 +3,16 @@
 import hashlib
 import json
 import re
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from benchmarks.paper import weigh
 from benchmarks.paper.__main__ import NOTHING, PAGE, main
+from benchmarks.paper.accident import FILE as ACCIDENT
 from benchmarks.paper.accident import Accident, plans_before
 from benchmarks.paper.evidence import FEWEST_RUNS
 from benchmarks.paper.records import RECORDS, add_facts, read_paper
@@ -89,8 +92,10 @@ def test_questions_that_changed_after_their_drives_are_named(
 
 
 def test_a_study_that_was_driven_is_weighed_and_its_accident_kept(
-    tmp_path: Path,
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr(weigh, "PROFILED", 2)
+    monkeypatch.setattr(weigh, "RUN_SAMPLES", 2)
     straight_on(tmp_path / "slow.onnx")
     write_frames(tmp_path / "frames", command=np.array([3]))
     study = Study(
@@ -134,7 +139,15 @@ def test_what_is_no_record_is_named(tmp_path: Path) -> None:
         main([str(tmp_path), "-o", str(tmp_path / "page.html")])
 
 
-def test_the_page_is_drawn_of_what_is_kept(tmp_path: Path) -> None:
+def test_a_page_is_drawn_of_what_is_kept(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Figures of few drives, and the accident that is kept of the whole study."""
+    study = load_study(PAGE.study, "5")
+    write_records(study, tmp_path)
+    shutil.copyfile(PAGE.kept / ACCIDENT, tmp_path / ACCIDENT)
+    monkeypatch.setattr("benchmarks.paper.__main__.PAGE", replace(PAGE, kept=tmp_path))
+
     main(["-o", str(tmp_path / "page.html")])
 
     assert (tmp_path / "page.html").read_text().count("<svg") == 4
