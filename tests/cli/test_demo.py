@@ -10,22 +10,21 @@ from me2e_compress.study import demo
 from me2e_compress.workflows.frames import FramesResult
 from tests.command import Cli
 from tests.stand_in import weights
-from tests.study.conftest import Here
+from tests.support.in_process import Here, here
 
-__all__ = ["weights"]
+__all__ = ["here", "weights"]
 
 DEMO = "demo --out out"
 
 
 @pytest.fixture(autouse=True)
-def small(weights: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def small(weights: Path, here: Here, monkeypatch: pytest.MonkeyPatch) -> None:
     """A small driver in the place of the one that ships, few frames, no processes."""
     monkeypatch.setattr(demo, "CALIBRATION_FRAMES", 3)
     monkeypatch.setattr(demo, "HELD_OUT_FRAMES", 2)
     monkeypatch.setattr(demo, "LATENCY_SAMPLES", 5)
     monkeypatch.setattr(demo, "ROUTES", "ParkedObstacle_R2_0")
     monkeypatch.setattr(demo, "RECIPE", "full")
-    monkeypatch.setattr(demo, "LocalEngine", lambda workers: Here())
 
 
 def test_the_demo_compresses_drives_and_reports(cli: Cli, tmp_path: Path) -> None:

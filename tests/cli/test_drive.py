@@ -18,7 +18,12 @@ from tests.frames import record
 from tests.nets import save_text
 from tests.runtime.energy.opened import Driver
 from tests.simulator.world.driving import route_of
+from tests.support.in_process import here, short
 from tests.workflows.test_check_model import ADAPTER, PLAN, tcp_like
+
+__all__ = ["here", "short"]
+
+pytestmark = pytest.mark.usefixtures("here")
 
 BLIND = "evaluate blind --routes routes.json -o results"
 STOP = "VanillaNonSignalizedTurnEncounterStopsign"
@@ -74,6 +79,7 @@ def test_a_route_that_cannot_be_counted_is_left_out(cli: Cli, manifest: Path) ->
     assert "1 of 2 routes, PARTIAL" in cli.done("score results").words
 
 
+@pytest.mark.usefixtures("short")
 def test_a_route_is_drawn(cli: Cli, manifest: Path) -> None:
     straight_on(manifest / "m.onnx")
     weather = "--render crossing --weather fog_m=60,dropped=BACK+FRONT_LEFT"

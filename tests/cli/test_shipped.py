@@ -14,8 +14,9 @@ from me2e_compress.workflows.checks import model_path
 from tests.command import Cli
 from tests.evaluators.highway.drivers import EXIT, straight_on
 from tests.stand_in import record_driver, weights, write_model
+from tests.support.in_process import here, short
 
-__all__ = ["weights"]
+__all__ = ["here", "short", "weights"]
 
 pytestmark = pytest.mark.usefixtures("weights")
 
@@ -76,6 +77,7 @@ def test_a_module_is_taken_out(cli: Cli) -> None:
     assert "occupancy reads as its mean over 1 frame" in notes
 
 
+@pytest.mark.usefixtures("short")
 @pytest.mark.parametrize("name", shipped.SHIPPED)
 def test_evaluate_drives_it_and_names_everything_that_could_drive(
     cli: Cli, tmp_path: Path, name: str

@@ -6,13 +6,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from me2e_compress.evaluators.highway import engine
 from me2e_compress.registry.drafts import IN_JSON
 from me2e_compress.simulator.routes import save_routes
 from me2e_compress.study import load_study
 from tests.command import Cli, write_frames
 from tests.evaluators.highway.drivers import CROSSING, straight_on
-from tests.study.conftest import Here
+from tests.support.in_process import Here, here
+
+__all__ = ["here"]
+
+pytestmark = pytest.mark.usefixtures("here")
 
 STUDY = """
 title = "Try"
@@ -37,14 +40,6 @@ recipe = "exact"
 name = "device"
 latency = "trace"
 """
-
-
-@pytest.fixture(autouse=True)
-def here(monkeypatch: pytest.MonkeyPatch) -> Here:
-    """Drive in this process."""
-    here = Here()
-    monkeypatch.setattr(engine, "engine_named", lambda *words: here)
-    return here
 
 
 @pytest.fixture
@@ -99,10 +94,7 @@ def test_what_is_wrong_is_one_line(
 
 
 @pytest.mark.usefixtures("toml")
-def test_an_engine_nobody_knows(cli: Cli, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.undo()
-    monkeypatch.chdir(cli.folder)
-
+def test_an_engine_nobody_knows(cli: Cli) -> None:
     said = cli("study study.toml -o out --engine cloud")
     assert said.code == 1
     assert "engine 'cloud'" in said.err

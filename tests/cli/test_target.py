@@ -20,6 +20,9 @@ from me2e_compress.workflows.lint import asked_of
 from me2e_compress.workflows.options import LintOptions
 from tests.command import Cli, write_frames
 from tests.evaluators.highway.drivers import PARKED, slow_here, straight_on
+from tests.support.in_process import here, short
+
+__all__ = ["here", "short"]
 
 CONVOLUTIONS = """
     <ir_version: 9, opset_import: ["" : 17]>
@@ -160,6 +163,7 @@ def test_profile_and_compare_say_it_of_files_of_whoever(cli: Cli, model: Path) -
     assert cli.document("compare m.onnx out.onnx frames")["slow_here"] == {}
 
 
+@pytest.mark.usefixtures("short")
 def test_evaluate_says_it_of_the_file_that_drives(cli: Cli, tmp_path: Path) -> None:
     save_routes((PARKED,), tmp_path / "routes.json")
     slow_here(tmp_path / "slow.onnx")

@@ -1,18 +1,12 @@
 """Small studies: two short routes, drivers that need no images."""
 
 import dataclasses
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from me2e_compress.driving.policies import Driver
-from me2e_compress.evaluators import Drive
-from me2e_compress.evaluators.contract import Driven
-from me2e_compress.evaluators.highway import runner
-from me2e_compress.simulator.routes import Route
 from me2e_compress.study import (
     Condition,
     Study,
@@ -23,6 +17,7 @@ from me2e_compress.study import (
 )
 from tests.command import write_frames
 from tests.evaluators.highway.drivers import CROSSING, PARKED, straight_on
+from tests.support.in_process import Here
 
 ROUTES = (CROSSING, PARKED)
 IDEAL, SLOW = Condition("ideal", "none"), Condition("slow", "fps:2")
@@ -31,20 +26,6 @@ FASTER = Variant("faster", "blind:9")
 TWICE_AS_FAR = "factor = Constant <value_float = 2.0> () plan = Mul (ahead, factor)"
 
 Make = Callable[..., Study]
-
-
-@dataclass
-class Here:
-    """Drives in this process, which need not start first, and writes down what."""
-
-    driven: list[tuple[str, str]] = field(default_factory=list)
-
-    def drive(
-        self, policy: Driver, drive: Drive, routes: Sequence[Route]
-    ) -> Iterator[Driven]:
-        for route in routes:
-            self.driven.append((policy.label, route.id))
-            yield Driven(runner.drive(route, policy.open(), drive), 0.0, 0)
 
 
 @pytest.fixture(scope="session")

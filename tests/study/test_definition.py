@@ -16,7 +16,8 @@ from me2e_compress.study.drive_record import DriveRecord
 from me2e_compress.study.workload import held_frames, workload
 from tests.docs.pages import EXAMPLE
 from tests.installed import install
-from tests.study.conftest import BLIND, FASTER, IDEAL, ROUTES, SLOW, Here, Make
+from tests.study.conftest import BLIND, FASTER, IDEAL, ROUTES, SLOW, Make
+from tests.support.in_process import Here
 
 
 @pytest.mark.parametrize(

@@ -13,7 +13,8 @@ from me2e_compress.study import Study, StudyResult, Timing, load_study, run_stud
 from me2e_compress.study.report.page import write_study
 from me2e_compress.study.workload import PlannedDrive, Workload, workload
 from tests.evaluators.lanes import DRIVEN, install_lanes
-from tests.study.conftest import IDEAL, ROUTES, Here, Make
+from tests.study.conftest import IDEAL, ROUTES, Make
+from tests.support.in_process import Here
 
 TEXT = """
 title = "Lanes"

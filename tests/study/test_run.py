@@ -28,7 +28,8 @@ from me2e_compress.study.definition import FramesToRecord
 from me2e_compress.study.drive_record import DriveRecord, compared
 from me2e_compress.study.study_result import pair_table
 from tests.evaluators.highway.drivers import straight_on
-from tests.study.conftest import BLIND, IDEAL, ROUTES, SLOW, Here, Make
+from tests.study.conftest import BLIND, IDEAL, ROUTES, SLOW, Make
+from tests.support.in_process import Here
 
 STUDY = """
 title = "Killed"
@@ -177,7 +178,7 @@ KILLED = """
 import sys
 from pathlib import Path
 from me2e_compress.study import load_study, run_study
-from tests.study.conftest import Here
+from tests.support.in_process import Here
 
 run_study(load_study(Path(sys.argv[1])), Path(sys.argv[2]), Here())
 """

@@ -24,7 +24,8 @@ from me2e_compress.workflows.result import SILENT
 from tests.benchmarks.paper.made import write_records
 from tests.command import write_frames
 from tests.evaluators.highway.drivers import straight_on
-from tests.study.conftest import IDEAL, Here
+from tests.study.conftest import IDEAL
+from tests.support.in_process import Here
 
 CRASHED = Route("crashed", "Accident", "Overtaking", 1)
 
