@@ -38,15 +38,13 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-@pytest.fixture
-def folder(tmp_path: Path) -> Path:
-    """Where the blocks of a page run: a model lies there."""
+def write_model(path: Path) -> None:
+    """Write the model that pages take for granted."""
     model, generator = onnx.parser.parse_model(MODEL), np.random.default_rng(0)
     for name, shape in (("w", (4, 3, 3, 3)), ("p", (256, 4))):
         array = generator.standard_normal(shape, np.float32)
         model.graph.initializer.append(onnx.numpy_helper.from_array(array, name))
-    onnx.save(model, tmp_path / "model.onnx")
-    return tmp_path
+    onnx.save(model, path)
 
 
 def run(

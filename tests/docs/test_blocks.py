@@ -3,6 +3,7 @@
 import contextlib
 import dataclasses
 import importlib
+import json
 import re
 import shlex
 import sys
@@ -16,12 +17,18 @@ from me2e_compress.errors import GraphError
 from me2e_compress.registry import Registry
 from me2e_compress.testing import check_form
 from me2e_compress.workflows import listing
-from tests.docs.conftest import run
+from tests.command import Cli, cli, command
+from tests.docs.conftest import run, write_model
 from tests.docs.pages import EXAMPLE, PAGES, ROOT, WRITING, Block, blocks
+from tests.installed import install
+from tests.support.in_process import here, short
+
+__all__ = ["cli", "command", "here", "short"]
 
 pytestmark = pytest.mark.xdist_group("installed")
 # the script of engine-dumps runs where an engine does; it has a test of its own
 CODE = [p for p in PAGES if blocks(p, "python") and p.stem != "engine-dumps"]
+README, *OTHERS = CODE
 
 BEFORE = {
     "cameras": """
@@ -51,21 +58,81 @@ ADDED = entry_points((EXAMPLE / "pyproject.toml").read_text(encoding="utf-8"))
 writing = pytest.mark.parametrize("page", WRITING, ids=lambda page: page.stem)
 
 
-@pytest.mark.parametrize("page", CODE, ids=lambda page: page.stem)
-def test_the_code_of_a_page_runs(page: Path, folder: Path, site: Path) -> None:
+ALL_PAGES = """
+import json, os, runpy, sys, traceback, warnings
+errors = {}
+for page in sys.argv[1:]:
+    os.chdir(page)
+    with warnings.catch_warnings():
+        if "writing-" in page:
+            warnings.simplefilter("error")
+        try:
+            runpy.run_path("page.py", run_name="__main__")
+        except Exception:
+            errors[os.path.basename(page)] = traceback.format_exc()
+with open("../errors.json", "w") as stream:
+    json.dump(errors, stream)
+"""
+"""Runs each in its folder; one process for all, which imports everything once."""
+
+
+@pytest.fixture(scope="module")
+def errors(site: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
+    """What the code of pages raised, by page, the README left out."""
+    pages = tmp_path_factory.mktemp("pages")
+    folders = [write_page(page, pages / page.stem) for page in OTHERS]
+    run([sys.executable, "-c", ALL_PAGES, *map(str, folders)], None, site)
+    found: dict[str, str] = json.loads((pages / "errors.json").read_text())
+    return found
+
+
+def write_page(page: Path, folder: Path) -> Path:
+    """Write its blocks, one behind the other, beside a model."""
     code = "".join(block.text for block in blocks(page, "python"))
+    folder.mkdir(exist_ok=True)
+    write_model(folder / "model.onnx")
     (folder / "page.py").write_text(BEFORE.get(page.stem, "") + code)
-    if page in WRITING:
-        run([sys.executable, "-W", "error", "page.py"], folder, site)
-    else:
-        cells = "exec(open('page.py', encoding='utf-8').read())"  # has no main guard
-        run([sys.executable, "-c", cells], folder, site)
+    return folder
+
+
+@pytest.mark.parametrize("page", OTHERS, ids=lambda page: page.stem)
+def test_the_code_of_a_page_runs(page: Path, errors: dict[str, str]) -> None:
+    assert errors.get(page.stem) is None
+
+
+def test_the_readme_proves_the_driver_that_ships_on_its_own_frames(
+    tmp_path: Path, site: Path
+) -> None:
+    """Its planner tosses a coin on made-up inputs: the plan would go unjudged."""
+    write_page(README, tmp_path)
+    cells = "exec(open('page.py', encoding='utf-8').read())"  # has no main guard
+    run([sys.executable, "-c", cells], tmp_path, site)
+
+    report = json.loads((tmp_path / "highway.exact.report.json").read_text())
+    (check,) = report["verifications"]
+    assert check["inputs"] == "recorded"
+    assert check["unsteady"] == []
+    assert check["errors"]["plan"] < 1e-5
+    assert check["errors"]["occupancy"] < 1e-5
+
+
+@pytest.fixture
+def example(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """The example package, installed as far as this process sees."""
+    monkeypatch.syspath_prepend(EXAMPLE)
+    for group, names in ADDED.items():
+        install(monkeypatch, tmp_path / "site", f"example-{group}", group, names)
 
 
 @writing
-def test_the_commands_of_a_page_run(page: Path, folder: Path, site: Path) -> None:
-    for block in blocks(page, "sh"):
-        assert run(["bash", "-e", "-c", block.text], folder, site)
+@pytest.mark.usefixtures("example", "short")
+def test_the_commands_of_a_page_run(page: Path, cli: Cli) -> None:
+    write_model(cli.folder / "model.onnx")
+    lines = [line for block in blocks(page, "sh") for line in block.text.splitlines()]
+    for line in filter(None, lines):
+        program, *words = shlex.split(line)
+        assert program == "me2e-compress"
+        assert cli.done(words[0], *words[1:]).out
 
 
 @pytest.mark.parametrize(
@@ -111,8 +178,8 @@ def test_the_example_package_is_what_the_page_shows_or_names(page: Path) -> None
             assert names == ADDED[group]
 
 
-def test_every_addition_of_the_example_is_listed(folder: Path, site: Path) -> None:
-    listed = run(["me2e-compress", "list"], folder, site)
+def test_every_addition_of_the_example_is_listed(site: Path) -> None:
+    listed = run(["me2e-compress", "list"], None, site)
     names = [name for group in ADDED.values() for name in group]
     assert [name for name in names if not re.search(rf"\b{name}\b", listed)] == []
 
