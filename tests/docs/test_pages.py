@@ -30,8 +30,9 @@ from tests.evaluators.highway.drivers import straight_on
 from tests.frames import record
 from tests.nets import save_text
 from tests.stacks import dense_frames, write_dense
+from tests.stand_in import weights
 
-__all__ = ["cli", "command"]
+__all__ = ["cli", "command", "weights"]
 
 DOCS = ROOT / "docs"
 CAMERA = ROOT / "examples" / "front_camera"
@@ -161,6 +162,7 @@ def test_two_graphs_or_one_and_its_engine(words: str, cli: Cli) -> None:
     assert "expected" in said.err
 
 
+@pytest.mark.usefixtures("weights")
 def test_the_front_camera_is_recorded_cloned_and_plans(tmp_path: Path) -> None:
     spec = importlib.util.spec_from_file_location("front", CAMERA / "clone.py")
     assert spec is not None

@@ -16,6 +16,9 @@ from me2e_compress.workflows.frames import record_frames
 from me2e_compress.workflows.options import FramesOptions
 from tests.driving.observed import RIG, motion, observation
 from tests.evaluators.highway.drivers import straight_on
+from tests.stand_in import weights
+
+__all__ = ["weights"]
 
 STATE = """
 axes = "forward-right"
@@ -249,6 +252,7 @@ def test_a_route_begins_with_the_value_of_another_input(tmp_path: Path) -> None:
     assert answers(policy, (7_000_000,)) == [0.0]
 
 
+@pytest.mark.usefixtures("weights")
 def test_recorded_scenes_begin_so_too(tmp_path: Path) -> None:
     model, toml = counter(tmp_path), tmp_path / "a.toml"
     toml.write_text(OF_INPUT)

@@ -19,6 +19,9 @@ from me2e_compress.workflows.options import FramesOptions
 from models.stacks import STACKS, TCP, VAD_TINY
 from tests.driving.observed import motion, observation
 from tests.evaluators.highway.drivers import EXIT, straight_on
+from tests.stand_in import weights
+
+__all__ = ["weights"]
 
 ACTION = 6
 """Throttle 0.7, steer 0.1 of Bench2DriveZoo's 39."""
@@ -42,6 +45,7 @@ def tcp(tmp_path: Path) -> Path:
     )
 
 
+@pytest.mark.usefixtures("weights")
 def test_tcp_sees_its_strip_and_its_state(tcp: Path, tmp_path: Path) -> None:
     options = FramesOptions(count=2, seed=1, adapter=Path("tcp"), scene_length=2)
 

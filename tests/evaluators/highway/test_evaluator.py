@@ -21,6 +21,9 @@ from models.driver.expert.blind import BlindDriver
 from tests.command import contents
 from tests.evaluators.highway.drivers import CROSSING, EXIT, GREEN, PARKED, ROUTES
 from tests.evaluators.highway.evaluations import TRACED, driven, made_by
+from tests.support.in_process import Here, here
+
+__all__ = ["here"]
 
 TWO = (CROSSING, PARKED)
 FASTER = BlindDriver(9.0)
@@ -30,8 +33,8 @@ FASTER = BlindDriver(9.0)
 def driven_once(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     """Two routes at 8 and at 9 m/s; take copies."""
     made = tmp_path_factory.mktemp("driven")
-    driven(made / "8", TWO)
-    driven(made / "9", TWO, FASTER)
+    driven(made / "8", TWO, engine=Here())
+    driven(made / "9", TWO, FASTER, engine=Here())
     return made / "8", made / "9"
 
 
@@ -41,15 +44,16 @@ def results(driven_once: tuple[Path, Path], tmp_path: Path) -> Path:
 
 
 def test_the_bytes_do_not_depend_on_the_number_of_workers(tmp_path: Path) -> None:
+    routes = (PARKED, EXIT)  # the second takes longer, and begins first
     one, two = (
-        driven(tmp_path / str(workers), engine=LocalEngine(workers))
+        driven(tmp_path / str(workers), routes, engine=LocalEngine(workers))
         for workers in (1, 2)
     )
 
     assert one == two
-    assert [episode.route for episode in one] == [route.id for route in ROUTES]
+    assert [episode.route for episode in one] == ["parked", "exit"]
     assert contents(tmp_path / "1") == contents(tmp_path / "2")
-    assert len(contents(tmp_path / "1")) == len(ROUTES) + 1
+    assert len(contents(tmp_path / "1")) == len(routes) + 1
 
 
 def test_wall_clock_times_lie_beside_the_folder(tmp_path: Path) -> None:
@@ -99,6 +103,7 @@ def test_what_a_kill_left_at_the_beginning_does_not_matter(
     assert folder.episodes() == {}
 
 
+@pytest.mark.usefixtures("here")
 def test_a_file_that_is_corrupt_or_of_another_evaluation_is_driven_again(
     results: Path, driven_once: tuple[Path, Path]
 ) -> None:
@@ -139,6 +144,7 @@ def test_results_of_another_evaluation_are_not_mixed(
     assert contents(results) == before
 
 
+@pytest.mark.usefixtures("here")
 def test_results_that_drove_on_after_collisions_are_of_old(results: Path) -> None:
     file = results / "evaluation.json"
     manifest = json.loads(file.read_text())
@@ -149,6 +155,7 @@ def test_results_that_drove_on_after_collisions_are_of_old(results: Path) -> Non
         driven(results, TWO)
 
 
+@pytest.mark.usefixtures("here")
 def test_measured_latency_drives_alone_and_warns(tmp_path: Path) -> None:
     warnings = list[str]()
 
@@ -180,6 +187,7 @@ def test_long_types_begin_in_whatever_order_they_come() -> None:
     assert longest_first(ROUTES[::-1]) == ordered
 
 
+@pytest.mark.usefixtures("here")
 def test_progress_runs_with_the_scores(tmp_path: Path) -> None:
     reports = list[tuple[str, int, int, str]]()
     listener = Listener(lambda *report: reports.append(report))
