@@ -28,8 +28,8 @@ class Border:
     """A tensor where int8 may begin or end.
 
     It is int8 if any of ``makers`` is. ``quantize_s`` is paid if no int8 layer makes
-    it, ``dequantize_s`` to convert it to float if one does; ``read_as_float`` tells
-    whether anything but layers and joins reads it, or it leaves the graph.
+    it, ``dequantize_s`` for each that reads it in float if one does; ``float_readers``
+    are those that are no layers or joins, and the graph where it is an output.
     """
 
     quantize_s: float
@@ -37,7 +37,7 @@ class Border:
     makers: Layers = frozenset()
     readers: Layers = frozenset()
     joins: tuple[Join, ...] = ()
-    read_as_float: bool = False
+    float_readers: int = 0
 
     def layers(self) -> Iterator[ir.Node]:
         """Iterate over all layers whose int8 decides what it costs."""
@@ -50,12 +50,9 @@ class Border:
     def paid_s(self, int8: Collection[ir.Node]) -> float:
         """Return its conversion seconds if exactly these layers are int8."""
         if _some(self.makers, int8):
-            stays = (
-                not self.read_as_float
-                and all(each in int8 for each in self.readers)
-                and all(_some(each.readers, int8) for each in self.joins)
-            )
-            return 0.0 if stays else self.dequantize_s
+            readers = sum(each not in int8 for each in self.readers)
+            joins = sum(not _some(each.readers, int8) for each in self.joins)
+            return (self.float_readers + readers + joins) * self.dequantize_s
         read = _some(self.readers, int8) or any(
             _some(each.makers, int8) and _some(each.readers, int8)
             for each in self.joins

@@ -52,29 +52,31 @@ def test_products_below_one_tile_stay_float(shape: tuple[int, int], rule: str) -
 
 
 @pytest.mark.parametrize(
-    ("depth", "more", "rule"),
+    ("image", "weight", "more", "rules"),
     [
-        (2048, 16, "layer"),
+        ("1,2048", (2048, 64), 16, ("layer", "gemv")),
         # too few weights of the model's, or at all; TensorRT reads none faster
-        (2048, 640, "gemv"),
-        (512, 16, "gemv"),
+        ("1,2048", (2048, 64), 640, ("gemv", "gemv")),
+        ("1,512", (512, 64), 16, ("gemv", "gemv")),
+        # a convolution of one pixel; of two it is none
+        ("1,512,1,1", (64, 512, 1, 1), 16, ("gemv", "layer")),
+        ("1,512,1,2", (64, 512, 1, 1), 16, ("layer", "layer")),
+        ("1,1024,1,1", (64, 1024, 1, 1), 640, ("layer", "layer")),
     ],
 )
 def test_one_row_is_int8_for_onnxruntime_where_its_weights_are_many(
-    depth: int, more: int, rule: str
+    image: str, weight: tuple[int, ...], more: int, rules: tuple[str, str]
 ) -> None:
+    layer = "MatMul" if len(weight) == 2 else "Conv"
     text = OPSETS + (
-        f"p (float[1,{depth}] x, float[{depth},64] w, float[64,64,{more}] v)"
-        " => (float[1,64] y, float[64,64,1] z)"
-        " { y = MatMul(x, w) z = ReduceMax<axes=[2]>(v) }"
+        f"p (float[{image}] x, float{[*weight]} w, float[64,64,{more}] v)"
+        f" => (float y, float z) {{ y = {layer}(x, w) z = ReduceMax<axes=[2]>(v) }}"
     ).replace(': 17, "trt"', ': 13, "trt"')
-    model = net(text, {"w": np.ones((depth, 64)), "v": np.ones((64, 64, more))})
+    model = net(text, {"w": np.ones(weight), "v": np.ones((64, 64, more))})
 
-    rules = {
-        target.name: by_output(make_plan(model, HEAD, costs=target.costs))["y"].rule
-        for target in (OnnxRuntime(), TensorRT())
-    }
-    assert rules == {"onnxruntime": rule, "tensorrt": "gemv"}
+    for target, rule in zip((OnnxRuntime(), TensorRT()), rules, strict=True):
+        plan = make_plan(model, HEAD, costs=target.costs)
+        assert by_output(plan)["y"].rule == rule
 
 
 @pytest.mark.parametrize(

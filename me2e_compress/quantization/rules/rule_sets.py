@@ -169,7 +169,8 @@ class MatrixVector(Rule):
 
     Such a product takes the time of reading its weights. Where the target estimates
     costs, those of a large part of the model are read as int8 in 0.4 of the time
-    (onnxruntime 1.31, a QGemm of 1 by 3,072 by 256).
+    (onnxruntime 1.31, a QGemm of 1 by 3,072 by 256), and a convolution of one pixel and
+    few weights, a product too, is slower (those of squeeze and excitation by a sixth).
 
     Attributes:
         share: least part of the model's weights that become int8 so; None: none do.
@@ -180,20 +181,27 @@ class MatrixVector(Rule):
 
     def objection(self, node: ir.Node, facts: RuleFacts) -> str | None:
         """Object if one side of the product is a single row or column."""
+        if node.op_type == "Conv":
+            image, weight = map(static_shape, node.inputs[:2])
+            pixel = image and weight and math.prod(image) == weight[1]
+            few = pixel and self._is_read(node, facts, 0, LEAST_READ - 1)
+            return "few weights on one pixel: a matrix-vector product" if few else None
         if node.op_type not in PRODUCTS:
             return None
         size = extent(node, weight=node.inputs[1] in facts.constants)
-        if not size.is_vector or self._pays(node, facts):
+        large = max(LEAST_READ, (self.share or 0) * facts.weight_elements)
+        if not size.is_vector or self._is_read(node, facts, large):
             return None
         return f"{size.rows} rows by {size.columns} columns: a matrix-vector product"
 
-    def _pays(self, node: ir.Node, facts: RuleFacts) -> bool:
-        weight, costs = node.inputs[1], facts.costs
-        shape = static_shape(weight)
+    def _is_read(
+        self, node: ir.Node, facts: RuleFacts, least: float, most: float = math.inf
+    ) -> bool:
+        """Return whether costs say how long so many constant weights are read."""
+        shape, costs = static_shape(node.inputs[1]), facts.costs
         if self.share is None or shape is None or costs is None:
             return False
-        large = max(LEAST_READ, self.share * facts.weight_elements)
-        holds = weight in facts.constants and math.prod(shape) >= large
+        holds = node.inputs[1] in facts.constants and least <= math.prod(shape) <= most
         return holds and costs(facts.model, ()) is not None
 
 
@@ -366,12 +374,8 @@ class NarrowConvolution(Rule):
             packed = 0 in (inputs % self.packing, outputs % self.packing)
             wide = first or max(inputs, outputs) >= self.minimum
             fits = packed and wide and len(set(kernel)) == 1
-        if fits:
-            return None
-        return (
-            f"{inputs} to {outputs} channels in {group} groups, kernel {list(kernel)}:"
-            " too narrow for int8 kernels"
-        )
+        size = f"{inputs} to {outputs} channels in {group} groups, kernel {[*kernel]}"
+        return None if fits else f"{size}: too narrow for int8 kernels"
 
 
 @dataclasses.dataclass(frozen=True)

@@ -109,15 +109,13 @@ def costs_of(
     }
     # Layers save their arithmetic, sampling operators their reads.
     region = find_region(model.graph, names)
-    saved = {}
-    for layer in region.layers:
-        work = work_of(layer)
-        if work is not None:
-            saved[layer] = machine.seconds(work[0]) - machine.seconds(work[1])
-    for node in region.sampled.values():
-        counts = sampled_work(node)
-        if counts is not None:
-            saved[node] = machine.seconds(counts[0]) - machine.seconds(counts[1])
+    works = {layer: work_of(layer) for layer in region.layers}
+    works |= {node: sampled_work(node) for node in region.sampled.values()}
+    saved = {
+        node: machine.seconds(work[0]) - machine.seconds(work[1])
+        for node, work in works.items()
+        if work is not None
+    }
     # Each uint8 tensor may cost a conversion at its border.
     around = _Surroundings(region)
     borders = tuple(around.border(value, machine) for value in region.grids)
@@ -206,7 +204,7 @@ class _Surroundings:
             tuple(
                 Join(self.makers(end), self.readers(end)) for end in map(end_of, joins)
             ),
-            others or value.is_graph_output(),
+            others + value.is_graph_output(),
         )
 
     def _is_product(self, value: ir.Value) -> bool:
@@ -241,15 +239,15 @@ class _Surroundings:
             self._readers[value] = frozenset(direct) or frozenset().union(*behind)
         return self._readers[value]
 
-    def _uses(self, value: ir.Value) -> tuple[list[ir.Node], list[ir.Node], bool]:
+    def _uses(self, value: ir.Value) -> tuple[list[ir.Node], list[ir.Node], int]:
         """Sort the readers of a tensor into layers, carriers of uint8, and others."""
         layers: list[ir.Node] = []
         carriers: list[ir.Node] = []
-        others = False
-        # A float reader forces a conversion.
+        others = 0
+        # onnxruntime converts anew for each float reader.
         for reader, index in value.uses():
             if not self._region.reads(reader, index):
-                others = True
+                others += 1
             elif reader in self._region.layers:
                 layers.append(reader)
             elif reader in self._region.sampled:

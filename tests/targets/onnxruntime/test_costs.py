@@ -118,23 +118,21 @@ def test_a_shared_input_is_quantized_once() -> None:
         {"v": np.ones((64, 64)), "w": np.ones((64, 64))},
     )
     layers: list[ir.Node] = list(model.graph)
-    costs = OnnxRuntime().costs(model, layers)
+    (border,) = OnnxRuntime().costs(model, layers).borders
 
-    assert len(costs.borders) == 1
-    assert costs.borders[0].readers == frozenset(layers)
+    assert border.readers == frozenset(layers)
 
 
 @pytest.mark.parametrize(
-    ("outputs", "reader", "as_float"),
+    ("outputs", "reader", "times"),
     [
-        ("", "", False),
-        (", float[1,4,8,8] p", "", True),
-        (", float[1,4,8,8] z", "z = Sigmoid(p)", True),
-        (", float[1,4,8,8] p, float[1,4,8,8] z", "z = Sigmoid(p)", True),
+        ("", "", 0),
+        (", float[1,4,8,8] p", "", 1),
+        (", float[1,4,8,8] z", "z = Sigmoid(p)", 1),
+        (", float[1,4,8,8] p, float[1,4,8,8] z", "z = Sigmoid(p)", 2),
     ],
-    ids=["a layer alone", "an output", "another operator", "both"],
 )
-def test_what_is_read_as_float(outputs: str, reader: str, as_float: bool) -> None:
+def test_what_is_converted_for_float(outputs: str, reader: str, times: int) -> None:
     model = net(
         f"""        c (float[1,4,8,8] x, float[4,4,1,1] w, float[4,4,1,1] v)
             => (float[1,4,8,8] y{outputs}) {{
@@ -147,8 +145,8 @@ def test_what_is_read_as_float(outputs: str, reader: str, as_float: bool) -> Non
     borders = OnnxRuntime().costs(model, layers).borders
 
     (between,) = (each for each in borders if each.makers == {layers[0]})
-    assert between.readers == {layers[1]}
-    assert between.read_as_float is as_float
+    assert between.paid_s(layers) == times * between.dequantize_s
+    assert between.paid_s(layers[:1]) == (times + 1) * between.dequantize_s
 
 
 # Feature maps that fused operators sample: uint8 where the plan says so.
