@@ -157,7 +157,8 @@ class Observation:
         speed_mps: The ego's speed.
         scene: Ground truth at this instant, in the simulator's own type (highway-env:
             `me2e_compress.simulator.scene.Scene`); None unless `Policy.privileged`.
-        world: The simulated world, likewise; a policy must never step it.
+        world: The simulated world, likewise (of highway-env a
+            :class:`~me2e_compress.simulator.world.World`); never to be stepped.
         motion: The ego's pose and motion from its own sensors; None if the simulator
             does not provide it. The CAN bus alone has no absolute position.
         target_points: float32 [2, 2], the next node of the route's sparse plan and the

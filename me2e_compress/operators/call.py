@@ -58,7 +58,17 @@ class FusedCall:
         domain: str = "",
         outputs: int = 1,
     ) -> ir.Value:
-        """Insert a node before the fused one and return its first output."""
+        """Insert a node before the fused one and return its first output.
+
+        Raises:
+            GraphError: an input is no value.
+        """
+        for index, value in enumerate(inputs):
+            if value is not None and not isinstance(value, ir.Value):
+                raise GraphError(
+                    f"{op_type}: input {index} is {value!r}, not a value: write"
+                    f" call.numbers({value!r}, like=x)"
+                )
         name = fresh_name(f"{self._stem}/{op_type}", self.names)
         made = ir.node(
             op_type, inputs, attributes, domain=domain, name=name, num_outputs=outputs

@@ -75,9 +75,12 @@ class Loss:
     def __str__(self) -> str:
         whose = "" if self.layers == 1 else f" ({self.layers} layers together)"
         time, saves = f"{abs(self.saved_s) * 1e6:.1f} µs", self.saved_s >= 0
+        borders = f"take {self.paid_s * 1e6:.1f} µs to quantize and dequantize"
+        if self.paid_s < 0:
+            borders = f"save {-self.paid_s * 1e6:.1f} µs of reading and writing"
         return (
             f"int8 would {f'save {time} of' if saves else f'add {time} to'} arithmetic"
-            f" and take {self.paid_s * 1e6:.1f} µs to quantize and dequantize{whose}"
+            f" and {borders}{whose}"
         )
 
 

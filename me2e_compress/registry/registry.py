@@ -119,7 +119,8 @@ class Registry(Generic[T]):
                 raise self.error(f"{name} needs the option {where}") from error
             if own := first.get("ctx", {}).get("error"):  # the item's own words
                 raise self.error(prefixed(name, str(own))) from error
-            raise self.error(f"{name}: {where}: {first['msg']}") from error
+            text = first["msg"].replace("a valid tuple", "a list, as [a, b]")
+            raise self.error(f"{name}: {where}: {text}") from error
         return made
 
     def with_options(self, item: T, options: Mapping[str, object]) -> T:

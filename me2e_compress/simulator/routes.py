@@ -10,6 +10,7 @@ import hashlib
 import json
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
+from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
 
@@ -228,8 +229,8 @@ def pick_routes(routes: Sequence[Route], which: str) -> tuple[Route, ...]:
     for name in which.split(","):
         if name.strip() not in by_id:
             raise EvaluationError(
-                f"no route {name.strip()!r}; there are {len(by_id)}, "
-                f"for example {next(iter(by_id), 'none')}"
+                f"no route {name.strip()!r}; there are {len(by_id)}, for example "
+                + "".join(get_close_matches(name.strip(), by_id, n=1, cutoff=0.0))
             )
         picked.append(by_id[name.strip()])
     return tuple(picked)

@@ -45,7 +45,7 @@ class World:
 
     Attributes:
         stage: What the scenario set, bodies and signals included.
-        path: The ego's route.
+        path: The ego's route, right-handed as scenes are.
         roadmap: All lanes, stop lines and crosswalks.
         parameters: Every parameter of the scenario with its value.
         outside_m: Metres between the ego's centre and the nearest lane, 0 inside.

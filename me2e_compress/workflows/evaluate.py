@@ -57,7 +57,10 @@ def drive_of(options: EvaluateOptions, evaluator: Evaluator) -> Drive:
     routes: Sequence[RouteInfo] = ()
     set_size = 0
     if "routes" in evaluator.takes:
-        routes, set_size = evaluator.routes(str(options.routes))  # a number, too
+        try:
+            routes, set_size = evaluator.routes(str(options.routes))  # a number, too
+        except ValueError as error:
+            raise EvaluationError(f"--routes {options.routes}: {error}") from error
     conditions = Drive.of_words(options.latency_model, options.dt_ms, options.weather)
     return dataclasses.replace(
         conditions,

@@ -106,6 +106,14 @@ def test_who_declares_what_it_does_not_have_is_refused(
         evaluator_named("declared")
 
 
+def test_a_word_that_an_evaluator_cannot_read_is_one_line(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(Highway, "routes", lambda self, words: int(words))
+    with pytest.raises(EvaluationError, match=r"^--routes two: invalid literal"):
+        drive_of(EvaluateOptions(routes="two"), Highway())
+
+
 def test_routes_of_another_kind_are_not_highways() -> None:
     lanes: Sequence[RouteInfo] = [Lane("lane", 0)]
     with pytest.raises(EvaluationError, match="highway drives routes of its own kind"):

@@ -5,6 +5,7 @@ import onnx_ir as ir
 import pytest
 
 from me2e_compress import graph
+from me2e_compress.errors import GraphError
 from me2e_compress.operators.call import FusedCall
 
 # A Constant node of a file read by onnx_ir has neither type nor shape.
@@ -41,3 +42,10 @@ def test_no_value_of_another_node_loses_its_name_to_an_output(of_node: bool) -> 
     assert output.name == "y"
     assert exp.outputs[0].name == "a"
     assert model.graph[-1].op_type == "Identity"
+
+
+def test_a_bare_number_is_refused_and_how_to_write_it_is_said() -> None:
+    relu = ir.from_onnx_text(TEXT).graph[1]
+    call = FusedCall(relu, opset=17, by="test")
+    with pytest.raises(GraphError, match=r"^Mul: input 1 is 2\.0, .* call\.numbers"):
+        call.add("Mul", [relu.inputs[0], 2.0])  # type: ignore[list-item]

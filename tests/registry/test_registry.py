@@ -102,7 +102,7 @@ def test_defaults_are_written_where_they_are_asked_for() -> None:
         ("circle:", "a value is expected behind circle:"),
         ("square:wide", "square: side: Input should be a valid number"),
         ("square:0", "square: side: Input should be greater than 0"),
-        ("square{tags=a}", "square: tags: Input should be a valid tuple"),
+        ("square{tags=a}", r"square: tags: Input should be a list, as \[a, b\]"),
         ("square{kind=c}", "square: kind: Input should be 'a' or 'b'"),
         ("square{tags=[}", "from '}' on: a value is expected"),
         ("square{tags=[a b]}", r"from 'b\]}' on: a comma or \] is expected"),

@@ -117,7 +117,8 @@ def test_picking_all_some_or_named_routes() -> None:
     [
         ("0", "0 routes were asked for; there are 6"),
         ("7", "7 routes were asked for; there are 6"),
-        ("r1,zz", "no route 'zz'; there are 6, for example r0"),
+        ("r1, R5", "no route 'R5'; there are 6, for example r5"),
+        ("r1,zz", "no route 'zz'; there are 6, for example r"),
     ],
 )
 def test_picking_what_is_not_there(which: str, words: str) -> None:

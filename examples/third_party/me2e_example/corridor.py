@@ -15,6 +15,7 @@ from me2e_compress.driving.contract import (
 )
 from me2e_compress.driving.latency import DecisionFacts
 from me2e_compress.driving.policies import Driver
+from me2e_compress.errors import EvaluationError
 from me2e_compress.evaluators import Drive, Evaluator
 from me2e_compress.evaluators.contract import Listener
 from me2e_compress.metrics.episode import (
@@ -59,6 +60,9 @@ class Corridor(Evaluator):
     ) -> Iterator[Episode]:
         """Yield each corridor once, in order."""
         assert policy is not None
+        opened = policy.open()
+        if opened.needs_images or opened.privileged:
+            raise EvaluationError(f"{policy.label}: corridors have no images or scenes")
         for lane in drive.routes:
             yield self._drive(lane, policy, drive)
 

@@ -110,11 +110,12 @@ def put(
     by: str,
     sources: Sequence[ir.Node] = (),
     attributes: Mapping[str, int | float | str | Sequence[int]] | None = None,
+    domain: str = "",
 ) -> ir.Node:
-    """Put a standard operator in a node's place; it takes over output and name.
+    """Put an operator in a node's place; it takes over output and name.
 
     The old node is removed. ``by`` is the pass's name, ``sources`` are the other nodes
-    that the new one stands for.
+    that the new one stands for; the graph must import ``domain``.
 
     Raises:
         GraphError: another output of the node is read.
@@ -124,7 +125,9 @@ def put(
         raise GraphError(f"node {old.name} is not in a graph")
     if read := [value.name for value in old.outputs[1:] if is_read(value)]:
         raise GraphError(f"node {old.name} cannot be replaced: {read[0]} is read too")
-    new = ir.node(op_type, inputs, attributes, name=old.name, num_outputs=1)
+    new = ir.node(
+        op_type, inputs, attributes, domain=domain, name=old.name, num_outputs=1
+    )
     new.outputs[0].shape, new.outputs[0].type = result.shape, result.type
     new.outputs[0].name = result.name
     provenance.inherit(new, (old, *sources), by=by)

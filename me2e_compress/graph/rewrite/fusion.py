@@ -14,6 +14,7 @@ from me2e_compress.graph.nodes import (
     input_at,
     is_read,
     is_standard,
+    nodes_in,
     opset_of,
     sole_reader,
 )
@@ -84,11 +85,21 @@ class Kit:
         attributes: Mapping[str, int | float | str | Sequence[int]] | None = None,
         *,
         behind: Sequence[ir.Node] = (),
+        domain: str = "",
     ) -> None:
         """Replace all that matched, and a row of nodes ``behind``, by one operator."""
         *sources, last = (self.match.root, *behind)
         sources += self.match.nodes[1:]
-        put(last, op_type, inputs, by=self.by, sources=sources, attributes=attributes)
+        by, more = self.by, attributes
+        put(
+            last,
+            op_type,
+            inputs,
+            by=by,
+            sources=sources,
+            attributes=more,
+            domain=domain,
+        )
         for node in reversed(behind[:-1]):
             remove_node(node)
 
@@ -111,15 +122,15 @@ class Kit:
         self.graph.insert_before(root, node)
         return node.outputs[0]
 
-    def absorb(self, *changed: ir.Node) -> None:
-        """Remove the last node, whose work the changed ones do from now on.
+    def absorb(self, first: ir.Node, *others: ir.Node) -> None:
+        """Remove the last node, whose work these nodes do from now on.
 
         The first of them makes its output.
         """
         root = self.match.root
-        for node in changed:
+        for node in (first, *others):
             provenance.inherit(node, (node, root), by=self.by)
-        replace_value(root.outputs[0], changed[0].outputs[0])
+        replace_value(root.outputs[0], first.outputs[0])
         remove_node(root)
 
 
@@ -211,6 +222,9 @@ def fuse(model: ir.Model, fusions: Sequence[Fusion], *, by: str) -> Fused:
             break
         fused.done.update(done)
         remove_dead(model.graph)
+    for node in nodes_in(model.graph):
+        if not is_standard(node):
+            model.graph.opset_imports.setdefault(node.domain, 1)
     return fused
 
 

@@ -206,3 +206,13 @@ def test_a_fusion_may_complete_another() -> None:
     assert fuse(model, [silent], by="test").notes() == ()
     assert fuse(model, [ONCE], by="test").notes() == ("fused: Relu of Relu (3)",)
     assert ops(model) == ["Relu"]
+
+
+def test_a_fused_operator_takes_the_place_and_its_domain_is_imported() -> None:
+    model = graph_of("a = HardSigmoid(x)", "y = Mul(x, a)")
+    gate = op("Mul", X, op("HardSigmoid", X))
+    fused = Fusion("gate", gate, lambda m, kit: kit.put("Gate", [m[X]], domain="mine"))
+    assert fuse(model, [fused], by="test").changes == 1
+    (node,) = model.graph
+    assert (node.domain, node.op_type) == ("mine", "Gate")
+    assert model.graph.opset_imports["mine"] == 1
