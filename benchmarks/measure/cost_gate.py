@@ -1,32 +1,48 @@
-"""Does the cost model know where int8 pays? Layers drawn by seed, timed both ways.
+"""Does the cost model know where int8 pays? Forms and layers, timed both ways.
 
-    python -m benchmarks.measure.cost_gate OUT [--layers 72] [--seed 0]
+    python -m benchmarks.measure.cost_gate [--only PART]
+    python -m benchmarks.measure.cost_gate --models OUT [--layers 72] [--seed 0]
 
-Weighted layers of VAD-tiny, the driver that ships and ResNet-50, as many of each, are
-cut out of their graphs (after the exact passes) with bias and ReLU, and timed alone in
-float and in int8 for onnxruntime, in turn, on one thread, in CPU seconds. Alone means
-that the input is quantized and the answer dequantized. The model of the rule ``cost``
-says the sign beforehand, from shapes; "always int8" is what it has to beat. Then, by
-module: the MACs that int8 takes over, what it saves and what its borders cost, as
-predicted for the whole graph. Under two CPU minutes; exporting needs torch.
+The first measures the forms of :mod:`benchmarks.subjects.int8_forms`: a layer by
+kernel, stride, group and channels, and what stands between, before and behind layers.
+The second draws weighted layers of VAD-tiny, the driver that ships and ResNet-50, as
+many of each, cut out of their graphs (after the exact passes) with bias and ReLU. Each
+is timed alone, from float to float, for onnxruntime, on one thread, in CPU seconds, in
+turn: in float, with every layer in int8, and where rules ``safe`` keep some of several
+layers in int8, as they are placed. The model of rule ``cost`` says beforehand, from
+shapes, what int8 saves. A choice is wrong where it takes more than a tenth longer than
+the best of the three; "always int8" is what it has to beat.
+
+With ``--models`` follow, by module, the MACs that int8 takes over, what it saves and
+what its borders cost, as predicted for the whole graph. Under two CPU minutes each;
+exporting needs torch.
 """
 
 import argparse
-from collections import Counter
-from collections.abc import Collection, Iterator
+import dataclasses
+from collections.abc import Collection, Iterable, Iterator
 from pathlib import Path
 from random import Random
 
 import onnx_ir as ir
+import onnxruntime
 
 from benchmarks.subjects import resnet50
-from benchmarks.tools.layer_timing import Layer, time_both
+from benchmarks.subjects.int8_forms import forms
+from benchmarks.tools.layer_timing import (
+    Layer,
+    int8_of,
+    plan_of,
+    random_model,
+    time_graphs,
+)
 from me2e_compress import graph
 from me2e_compress.graph import static_shape
 from me2e_compress.graph.nodes import constant_values
 from me2e_compress.passes import Context
 from me2e_compress.passes.quantize_int8 import QuantizeInt8
 from me2e_compress.quantization.costs import Costs
+from me2e_compress.runtime.profile import processor
 from me2e_compress.shipped.drivers import shipped
 from me2e_compress.targets import Target
 from me2e_compress.targets.onnxruntime import OnnxRuntime
@@ -36,24 +52,33 @@ from me2e_compress.targets.weights import biased_end
 from me2e_compress.workflows.plan import PreparedGraph
 from models.export import export
 
-NEAR = 0.05
-"""A difference of that part of the float time is a tie."""
+WRONG = 1.1
+"""A choice that takes so many times as long as the best is wrong; less is noise."""
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("out", type=Path)
+    parser.add_argument("--only", default="", help="part of the form's name")
+    parser.add_argument("--models", type=Path, help="folder of the exported models")
     parser.add_argument("--layers", type=int, default=72)
     parser.add_argument("--seed", type=int, default=0)
     chosen = parser.parse_args()
-    prepared = dict(graphs(chosen.out))
+    print(f"{processor()}, one thread, onnxruntime {onnxruntime.__version__}\n")
+    if chosen.models is None:
+        named = [each for each in forms() if chosen.only in each.name]
+        show((each.name, random_model(each.text())) for each in named)
+        return
+    prepared = dict(graphs(chosen.models))
     drawn = Random(chosen.seed)
     rows = []
     for name, ready in prepared.items():
-        found = list(layers_of(ready.model))
-        count = min(chosen.layers // len(prepared), len(found))
-        rows += [(name, each) for each in drawn.sample(found, count)]
-    signs(rows)
+        layers = list(layers_of(ready.model))
+        count = min(chosen.layers // len(prepared), len(layers))
+        rows += [(name, each) for each in drawn.sample(layers, count)]
+    show(
+        (f"{name}: {each.op} {each.read} by {each.weight}", each.graph())
+        for name, each in rows
+    )
     for name, ready in prepared.items():
         modules(name, ready)
 
@@ -116,39 +141,86 @@ def net_s(costs: Costs, int8: Collection[ir.Node]) -> float:
     return sum(costs.saved_s.get(each, 0.0) for each in int8) - paid
 
 
-def predicted_s(layer: Layer) -> float:
-    """Return what int8 of a layer alone should save, seconds."""
-    model = layer.graph()
-    nodes = [node for node in model.graph if node.op_type == layer.op]
-    return net_s(costs_of(model, nodes), frozenset(nodes))
+@dataclasses.dataclass(frozen=True)
+class Row:
+    """A graph in float, in int8, and as it is placed.
 
+    Attributes:
+        float_s: CPU seconds without int8.
+        int8_s: with every layer in int8; None where no layer has a kernel.
+        placed_s: as rules ``safe`` place it.
+        saves_s: what int8 of every layer should save.
+        layers: how many have an int8 kernel, and how many of them are placed in int8.
+    """
 
-def signs(rows: list[tuple[str, Layer]]) -> None:
-    """Time the layers, and print how often the sign was right."""
-    timed = {each: time_both(each) for each in dict.fromkeys(each for _, each in rows)}
-    right, clear = Counter[str](), Counter[str]()
-    print("| model | layer | float µs | int8 µs | saved | predicted | |")
-    print("|---|---|---|---|---|---|---|")
-    for name, layer in rows:
-        float_s, int8_s = timed[layer]
-        saved, expected = float_s - int8_s, predicted_s(layer)
-        good = (saved > 0) == (expected > 0)
-        right[name] += good
-        tie = abs(saved) < NEAR * float_s
-        clear[name] += good or tie
-        print(
-            f"| {name} | {layer.op} {layer.read} by {layer.weight}"
-            f" | {float_s * 1e6:.1f} | {int8_s * 1e6:.1f} | {saved * 1e6:+.1f}"
-            f" | {expected * 1e6:+.1f} | {'' if good else 'tie' if tie else 'wrong'} |"
+    float_s: float
+    int8_s: float | None = None
+    placed_s: float = 0.0
+    saves_s: float = 0.0
+    layers: tuple[int, int] = (0, 0)
+
+    @property
+    def times(self) -> list[float]:
+        """All seconds that were measured."""
+        both = [self.float_s] if self.int8_s is None else [self.float_s, self.int8_s]
+        return [*both, self.placed_s] if self.layers[1] else both
+
+    def is_wrong(self, taken_s: float) -> bool:
+        """Return whether a choice takes much longer than the best."""
+        return taken_s > WRONG * min(self.times)
+
+    def __str__(self) -> str:
+        if self.int8_s is None:
+            return f"{self.float_s * 1e6:.0f} | | | | no kernel |"
+        count, placed = self.layers
+        choice = "float" if not placed else "int8" if placed == count else "mixed"
+        choice += f" ({placed} of {count})" if choice == "mixed" else ""
+        return (
+            f"{self.float_s * 1e6:.0f} | {self.int8_s * 1e6:.0f}"
+            f" | {(self.float_s - self.int8_s) * 1e6:+.0f} | {self.saves_s * 1e6:+.0f}"
+            f" | {choice} {self.placed_s / self.float_s:.2f}"
+            f" | {'wrong' if self.is_wrong(self.placed_s) else ''}"
         )
-    losing = sum(timed[each][0] < timed[each][1] for _, each in rows)
-    count = len(rows)
+
+
+def measured(model: ir.Model) -> Row:
+    """Time a graph, and ask the model of costs and the rules what they would do."""
+    plan = plan_of(model)
+    nodes = {str(node.outputs[0].name): node for node in model.graph}
+    names = [each.output for each in plan.chosen if each.weight is not None]
+    layers = [nodes[name] for name in names if objection(nodes[name]) is None]
+    if not layers:
+        return Row(time_graphs({"float": model})["float"])
+    chosen = plan_of(model, "safe{balance=false}", OnnxRuntime().costs)
+    int8 = {each.output for each in chosen.chosen} & set(names)
+    # one of the two, or a third
+    files = {"float": model, "int8": int8_of(model, plan)}
+    form = "float" if not int8 else "int8" if len(int8) == len(layers) else "mixed"
+    if form == "mixed":
+        files[form] = int8_of(model, chosen)
+    taken = time_graphs(files)
+    saves = net_s(costs_of(model, layers), frozenset(layers))
+    counts = (len(layers), len(int8))
+    return Row(taken["float"], taken["int8"], taken[form], saves, counts)
+
+
+def show(graphs: Iterable[tuple[str, ir.Model]]) -> None:
+    """Time graphs, and print how often the choice was wrong."""
+    rows = list[Row]()
+    print("form | float µs | int8 µs | saved | predicted | chosen, of float's | wrong")
+    print("---|---:|---:|---:|---:|---|---")
+    for name, model in graphs:
+        row = measured(model)
+        print(f"{name} | {row}", flush=True)
+        rows += [row] if row.int8_s is not None else []
+    wrong = sum(row.is_wrong(row.placed_s) for row in rows)
+    always = sum(row.is_wrong(row.int8_s or 0.0) for row in rows)
+    right = sum((row.saves_s > 0) == (row.float_s > (row.int8_s or 0)) for row in rows)
     print(
-        f"\n{count} layers ({len(timed)} different), {losing} of them slower in int8"
-        f" (always int8 would be right for {(count - losing) / count:.0%}):"
-        f" sign right for {right.total()} ({right.total() / count:.0%});"
-        f" {clear.total()} ({clear.total() / count:.0%}) where a difference below"
-        f" {NEAR:.0%} counts as none; {dict(right)}\n"
+        f"\n{len(rows)} with an int8 kernel: the choice takes more than a tenth"
+        f" longer than the best for {wrong} ({wrong / len(rows):.0%}), always int8 for"
+        f" {always};"
+        f" the sign of what int8 saves is right for {right} ({right / len(rows):.0%})\n"
     )
 
 

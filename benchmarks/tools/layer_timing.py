@@ -8,12 +8,14 @@ from time import perf_counter, process_time
 import numpy as np
 import onnx
 import onnx_ir as ir
+from onnx_ir.passes.common import LiftConstantsToInitializersPass
 
 from me2e_compress import graph
 from me2e_compress.calibration.ranges import Ranges
 from me2e_compress.graph import provenance
 from me2e_compress.graph.modules.module_map import ModuleMap
 from me2e_compress.graph.provenance import Provenance
+from me2e_compress.quantization.costs import CostsOf
 from me2e_compress.quantization.decision import QuantPlan
 from me2e_compress.quantization.plan import make_plan
 from me2e_compress.quantization.rules import RULE_SETS
@@ -61,21 +63,7 @@ class Layer:
             f" float[{columns}] b) => (float y) {{\n"
             f"{''.join(self._nodes())}}}"
         )
-        parsed = onnx.parser.parse_model(text)
-        parsed.graph.output[0].type.tensor_type.ClearField("shape")
-        made = ir.from_proto(onnx.shape_inference.infer_shapes(parsed))
-        generator = np.random.default_rng(0)
-        for value in list(made.graph.inputs)[1:]:
-            made.graph.inputs.remove(value)
-            shape = graph.static_shape(value) or ()
-            array = generator.standard_normal(shape).astype(np.float32)
-            fan = max(1.0, float(np.sqrt(array.size / columns)))
-            value.const_value = ir.tensor(array / np.float32(fan), name=value.name)
-            made.graph.register_initializer(value)
-        for node in made.graph:
-            past = Provenance(WHOLE.names()[0], (str(node.outputs[0].name),))
-            provenance.stamp(node, past)
-        return made
+        return random_model(text)
 
     def _nodes(self) -> list[str]:
         lines, last = [], "x"
@@ -95,9 +83,34 @@ class Layer:
         return lines
 
 
-def int8_of(model: ir.Model) -> ir.Model:
-    """Quantize a layer for onnxruntime, every range [-4, 4]."""
-    plan = plan_of(model)
+def random_model(text: str) -> ir.Model:
+    """Build a graph whose inputs but the first are weights to draw; infer shapes.
+
+    Weights are normal, divided by the root of how many are summed; vectors are not.
+    """
+    parsed = onnx.parser.parse_model(text)
+    for output in parsed.graph.output:
+        output.type.tensor_type.ClearField("shape")
+    made = ir.from_proto(onnx.shape_inference.infer_shapes(parsed))
+    LiftConstantsToInitializersPass(lift_all_constants=True, size_limit=0)(made)
+    generator = np.random.default_rng(0)
+    for value in list(made.graph.inputs)[1:]:
+        made.graph.inputs.remove(value)
+        shape = graph.static_shape(value) or ()
+        array = generator.standard_normal(shape).astype(np.float32)
+        columns = shape[1] if len(shape) == 2 else shape[0]
+        fan = max(1.0, float(np.sqrt(array.size / columns)))
+        value.const_value = ir.tensor(array / np.float32(fan), name=value.name)
+        made.graph.register_initializer(value)
+    for place, node in enumerate(made.graph):
+        node.name = node.name or f"node {place}"
+        past = Provenance(WHOLE.names()[0], (str(node.outputs[0].name),))
+        provenance.stamp(node, past)
+    return made
+
+
+def int8_of(model: ir.Model, plan: QuantPlan) -> ir.Model:
+    """Quantize a graph for onnxruntime by a plan, every range [-4, 4]."""
     target = OnnxRuntime()
     names = target.tensors(plan, model)
     ranges = Ranges(
@@ -110,10 +123,12 @@ def int8_of(model: ir.Model) -> ir.Model:
     return target.place(model, plan, ranges)
 
 
-def plan_of(model: ir.Model) -> QuantPlan:
-    """Plan int8 for a layer, whatever it costs."""
-    rules = RULE_SETS.parse("paper{without=[gemv]}")
-    return make_plan(model, QuantScheme.of(WHOLE.names(), WHOLE), rules)
+def plan_of(
+    model: ir.Model, rules: str = "paper{without=[gemv]}", costs: CostsOf | None = None
+) -> QuantPlan:
+    """Plan int8 of every layer, whatever it costs, unless other rules are given."""
+    scheme = QuantScheme.of(WHOLE.names(), WHOLE)
+    return make_plan(model, scheme, RULE_SETS.parse(rules), costs=costs)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -147,19 +162,28 @@ def time_interleaved(
 
 
 def time_both(layer: Layer) -> tuple[float, float]:
-    """Return CPU seconds in float and in int8: medians, in turn, one thread."""
+    """Return CPU seconds of a layer in float and in int8."""
     model = layer.graph()
+    int8 = int8_of(model, plan_of(model))
+    taken = time_graphs({"float": model, "int8": int8})
+    return taken["float"], taken["int8"]
+
+
+def time_graphs(graphs: Mapping[str, ir.Model]) -> dict[str, float]:
+    """Return CPU seconds of graphs of one input: medians, in turn, one thread."""
     sessions = {
-        "float": Session(model, threads=1),
-        "int8": Session(int8_of(model), threads=1, int8_kernels=True),
+        name: Session(model, threads=1, int8_kernels=True)
+        for name, model in graphs.items()
     }
-    array = np.random.default_rng(1).standard_normal(layer.read).astype(np.float32)
-    frames = [Frame(0, starts_scene=True, arrays={"x": array})]
+    (value,) = next(iter(graphs.values())).graph.inputs
+    shape = graph.static_shape(value) or ()
+    array = np.random.default_rng(1).standard_normal(shape).astype(np.float32)
+    frames = [Frame(0, starts_scene=True, arrays={str(value.name): array})]
     once = time_interleaved(sessions, frames, 3)
     shortest = min(min(each.cpu_s) for each in once.values())
     runs = int(np.clip(CPU_S / shortest, 5, MOST_RUNS))
-    found = time_interleaved(sessions, frames, runs)
-    return median(found["float"].cpu_s), median(found["int8"].cpu_s)
+    times = time_interleaved(sessions, frames, runs)
+    return {name: median(each.cpu_s) for name, each in times.items()}
 
 
 def _dims(shape: tuple[int, ...]) -> str:
