@@ -168,9 +168,8 @@ class MatrixVector(Rule):
     """Stage 2: a product that degenerates to GEMV gains nothing.
 
     Such a product takes the time of reading its weights. Where the target estimates
-    costs, those of a large part of the model are read as int8 in 0.4 of the time
-    (onnxruntime 1.31, a QGemm of 1 by 3,072 by 256), and a convolution of one pixel and
-    few weights, a product too, is slower (those of squeeze and excitation by a sixth).
+    costs, large parts of the model are read as int8 in 0.4 of it (onnxruntime 1.31, 1
+    by 3,072 by 256); small convolutions of one pixel, products too, are slower so.
 
     Attributes:
         share: least part of the model's weights that become int8 so; None: none do.
