@@ -1,9 +1,8 @@
-"""Run what was written for onnx-ir or for graphsurgeon as a pass of this toolkit."""
+"""Run what was written for graphsurgeon as a pass of this toolkit."""
 
 import dataclasses
 from collections import Counter
 from collections.abc import Callable
-from typing import ClassVar
 
 import onnx_graphsurgeon as gs
 import onnx_ir as ir
@@ -13,35 +12,7 @@ from me2e_compress.graph import digest, provenance
 from me2e_compress.graph.surgeon import from_graphsurgeon, to_graphsurgeon
 from me2e_compress.passes.base import Context, Pass, PassResult
 
-__all__ = ["OnnxIrPass", "SurgeonFunction"]
-
-
-@dataclasses.dataclass(frozen=True)
-class OnnxIrPass(Pass):
-    """Run an onnx-ir pass; its changes are counted by comparing the graphs.
-
-    Nodes that it changes name this pass. New nodes get no provenance: the manager
-    refuses onnx-ir passes that make nodes without copying metadata.
-
-    Given:   OnnxIrPass(onnx_ir.passes.common.IdentityEliminationPass())
-
-    Result:  a pass that removes Identity nodes
-
-    Attributes:
-        inner: the pass; it must keep the outputs, as those in ``onnx_ir.passes.common``
-            do.
-    """
-
-    name: ClassVar[str] = "onnx-ir-pass"
-    exact: ClassVar[bool] = True
-    inner: ir.passes.PassBase
-
-    def run(self, model: ir.Model, context: Context) -> PassResult:
-        """Run the inner pass."""
-        before = model.clone()
-        after = self.inner(model).model
-        provenance.sign(before, after, self.name)
-        return PassResult(after, int(digest(after) != digest(before)))
+__all__ = ["SurgeonFunction"]
 
 
 @dataclasses.dataclass(frozen=True)

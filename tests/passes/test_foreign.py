@@ -1,11 +1,10 @@
-"""Passes of onnx-ir and functions of graphsurgeon, run as passes of ours."""
+"""Functions of graphsurgeon, run as passes of ours."""
 
 import dataclasses
 
 import numpy as np
 import onnx_graphsurgeon as gs
 import onnx_ir as ir
-import onnx_ir.passes.common as common
 import pytest
 
 from me2e_compress import graph
@@ -14,34 +13,8 @@ from me2e_compress.graph import provenance
 from me2e_compress.graph.modules.module_map import ModuleMap
 from me2e_compress.graph.provenance import Provenance
 from me2e_compress.passes import Context
-from me2e_compress.passes.foreign import OnnxIrPass, SurgeonFunction
+from me2e_compress.passes.foreign import SurgeonFunction
 from me2e_compress.testing import check_pass
-from tests.passes.small import apply, ops, read
-
-IDENTITY = """
-<ir_version: 9, opset_import: ["" : 17]>
-g (float[2] x) => (float[2] y) { a = Identity(x) y = Relu(a) }
-"""
-
-
-def test_an_onnx_ir_pass_works_as_ours_and_says_what_it_did() -> None:
-    model, other = read(IDENTITY), read(IDENTITY.replace("Identity", "Neg"))
-    current = OnnxIrPass(common.IdentityEliminationPass())
-    apply(current, model)
-    assert ops(model) == ["Relu"]
-    assert apply(current, other).changes == 0
-
-
-def test_changed_nodes_name_the_pass() -> None:
-    text = '<ir_version: 9, opset_import: ["" : 17]>'
-    text += "g (float[2] x) => (float[2] y) { a = Softmax(x) y = Relu(a) }"
-    current = OnnxIrPass(common.AddDefaultAttributesPass())
-
-    softmax, relu = check_pass(current, ir.from_onnx_text(text)).model.graph
-
-    pasts = [provenance.read(node) for node in (softmax, relu)]
-    assert [past and past.passes for past in pasts] == [("onnx-ir-pass",), ()]
-
 
 CONTEXT = Context(
     ModuleMap.parse('[modules.neck]\nrole = "feature"\npatterns = ["neck"]', "one")
