@@ -6,14 +6,10 @@
     Result:  one Conv with other weights
 
 With y = k x + d per output channel: weight' = k weight, bias' = k bias + d, computed
-in float64 (Ioffe, Szegedy 2015 for the k and d of a normalization). A weight that
-several layers share is scaled once for each different k, so that layers followed by the
-same numbers still share it. The copies may grow the file by the price of the removed
-nodes (:mod:`me2e_compress.passes.work`); if they cost more, the weight and the nodes
-after its layers stay unchanged.
+in float64 (Ioffe, Szegedy 2015 for the k and d of a normalization). What stands behind
+a layer whose weight others read, too, stays.
 """
 
-import hashlib
 import math
 
 import numpy as np
@@ -21,7 +17,6 @@ import onnx_ir as ir
 
 from me2e_compress.graph import bias_of, channel_axis, static_shape
 from me2e_compress.graph.nodes import (
-    Array,
     Numbers,
     holds_numbers,
     numbers_of,
@@ -35,11 +30,9 @@ from me2e_compress.graph.rewrite import (
     Match,
     constant,
     either,
-    match,
     op,
     var,
 )
-from me2e_compress.passes.work import BYTES_PER_NODE, work
 
 # What follows a layer channel by channel.
 
@@ -115,10 +108,12 @@ def _fold_affine(match: Match, kit: Kit) -> str | None:
     bias = np.broadcast_to(bias * scale + shift, scale.shape)
     if overflow(weight, stored) or overflow(bias, stored):
         return f"{what} whose weights would overflow"
-    # Store them, unless copies of a shared weight cost too much
+    # Store them, unless others read the weight as it is
     name = match[SHARED].name or layer.name or "layer"
-    if not _give(layer, match[SHARED], weight.astype(stored.dtype), scale, kit):
-        return f"{what} that shares its weights"
+    if not (scale == 1).all():
+        if sole_reader(match[SHARED]) is not layer:
+            return f"{what} that shares its weights"
+        kit.refill(layer, 1, weight.astype(stored.dtype), name)
     kit.refill(
         layer, 2, bias.astype(stored.dtype), f"{name.removesuffix('.weight')}.bias"
     )
@@ -126,58 +121,6 @@ def _fold_affine(match: Match, kit: Kit) -> str | None:
         layer.attributes["beta"] = ir.AttrFloat32("beta", 1.0)  # it is in the bias
     kit.absorb(layer)
     return None
-
-
-def _give(
-    layer: ir.Node, shared: ir.Value, weight: Array, scale: Numbers, kit: Kit
-) -> bool:
-    if (scale == 1).all():
-        return True
-    # Reuse the copy of a layer with the same scale, unless it was scaled again since
-    name = _copy_name(layer, shared, scale)
-    copy = kit.graph.initializers.get(name)
-    tensor = None if copy is None else copy.const_value
-    if tensor is None or not np.array_equal(tensor.numpy(), weight):
-        copy = None
-    if copy is None and sole_reader(shared) is layer:
-        kit.refill(layer, 1, weight, shared.name or name)
-        return True
-    # Else make a copy if the removed nodes are worth it
-    if copy is None:
-        if not _is_worth_copies(shared):
-            return False
-        copy = kit.constant(weight, name)
-    layer.replace_input_with(1, copy)
-    return True
-
-
-def _copy_name(layer: ir.Node, shared: ir.Value, scale: Numbers) -> str:
-    """Name the copy of a weight after its layout and scale: equal copies are one."""
-    layout = f"{layer.op_type} {layer.attributes.get_int('transB', 0)}"
-    digest = hashlib.blake2b(layout.encode(), digest_size=8)
-    digest.update(np.ascontiguousarray(scale).tobytes())
-    return f"{shared.name}.scaled.{digest.hexdigest()}"
-
-
-def _is_worth_copies(shared: ir.Value) -> bool:
-    """Return whether the removed nodes are worth the copies of a shared weight."""
-    copies, stays, worth = set[str](), shared.is_graph_output(), 0.0
-    for layer, index in shared.uses():
-        reader = sole_reader(layer.outputs[0]) if index == 1 else None
-        matched = affine = None
-        if reader is not None and not reader.attributes.get_int("training_mode", 0):
-            matched = match(AFFINE, reader)
-        if matched is not None and matched.node(LAYER) is layer:
-            affine = _affine(matched)
-        if matched is None or affine is None:
-            stays = True
-            continue
-        worth += BYTES_PER_NODE * work(matched.root)
-        copies.add(_copy_name(layer, shared, _per_output(layer, affine[0])))
-    made = shared.graph.initializers if shared.graph is not None else {}
-    growth = sum(name not in made for name in copies) - (not stays)
-    tensor = shared.const_value
-    return growth * (0 if tensor is None else tensor.nbytes) <= worth
 
 
 def _per_output(layer: ir.Node, scale: Numbers) -> Numbers:
