@@ -33,10 +33,12 @@ def restore(
     input; ``by`` is the pass to name in the provenance of new nodes. ``node_names``
     restores the names of known nodes of the same operator too.
     """
+    # What the model says of itself
     model.domain, model.doc_string = like.domain, like.doc_string
     model.model_version = like.model_version
     _merge(model.metadata_props, like.metadata_props)
     _merge(model.graph.metadata_props, like.graph.metadata_props)
+    # Functions, and values by their names
     for key, function in model.functions.items():
         if key in like.functions:
             _merge(function.metadata_props, like.functions[key].metadata_props)
@@ -44,6 +46,7 @@ def restore(
     past = {value.name: value.metadata_props for value in _values(like)}
     for value in _values(model):
         _merge(value.metadata_props, past.get(value.name, {}))
+    # Nodes that are known again, then those that are new
     nodes = list(model.graph.all_nodes())
     known = _match(nodes, list(like.graph.all_nodes()))
     if node_names:
@@ -92,12 +95,14 @@ def _alike(one: ir.Node, other: ir.Node) -> bool:
 def _inherit_from_neighbours(
     nodes: Sequence[ir.Node], matches: dict[ir.Node, ir.Node], by: str
 ) -> None:
+    # One of another operator stands for what vanished above it, too
     alive = {value.name for node in nodes for value in node.outputs}
     claimed: set[ir.Node] = set()
     for node in nodes:
         if provenance.read(node) is None and (known := matches.get(node)) is not None:
             vanished = _vanished_above(known, alive, claimed)
             provenance.inherit(node, (known, *vanished), by=by)
+    # New ones: from producers down, then from consumers up
     place = {node: index for index, node in enumerate(nodes)}
     for node in nodes:
         makers = [value.producer() for value in node.inputs if value is not None]

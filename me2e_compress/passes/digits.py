@@ -56,6 +56,7 @@ def regrouped(layout: Layout, shape: Sequence[int]) -> Layout | None:
 
     ``[16] -> [2, 8]`` splits a digit in two; ``[4, 3] -> [6, 2]`` has no digits.
     """
+    # The most significant digit is the last of the list
     rest = list(reversed(flat(layout)))
     groups: list[Digits] = []
     for size in shape:
@@ -106,9 +107,13 @@ def merged(digits: Iterable[Digit]) -> Digits:
 
 def split_like(digits: Digits, others: Iterable[Digit]) -> Digits:
     """Return digits split wherever those of others begin or end."""
+    # Where the digits of others begin and end, by index: a digit of stride 2 and size 4
+    # at 2 and 8
     edges: dict[str, set[int]] = {}
     for other in others:
         edges.setdefault(other.axis, set()).update((other.stride, other.end))
+    # Cut a digit of stride 1 and size 16 there: 1..2, 2..8 and 8..16 are digits of
+    # sizes 2, 4 and 2, of which the last is the most significant
     pieces_of: list[Digit] = []
     for digit in digits:
         inner = {
@@ -130,12 +135,14 @@ def runs(source: Digits, wanted: Digits) -> tuple[list[Digits], list[int]]:
 
     Returns the runs in the order of the source, and the wanted order as positions.
     """
+    # A run begins wherever the next wanted digit is not the next of the source
     places = [source.index(digit) for digit in wanted]
     starts = [
         place
         for before, place in zip([None, *places], places, strict=False)
         if before is None or place != before + 1
     ]
+    # The same runs in the order of the source, each up to where the next begins
     cuts = sorted(starts)
     pieces = [
         source[low:high]

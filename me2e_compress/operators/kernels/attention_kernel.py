@@ -76,7 +76,7 @@ class _Step:
     def write(self) -> None:
         builder = self.builder
         before = self._row(self.state, WORD(MOST))
-        # The largest scores, in variables that LLVM keeps in registers
+        # new = max(old, scores), in variables that LLVM keeps in registers
         largest = [self._variable(each) for each in before]
         with cgutils.for_range(builder, self.count) as loop:
             scores = self._row(self.scores, loop.index)
@@ -86,7 +86,7 @@ class _Step:
                 builder.store(builder.select(more, score, old), most)
         most = [builder.load(each) for each in largest]
         self._set_row(self.state, WORD(MOST), most)
-        # Correct what was summed before
+        # What was summed before has powers of score - old: times 2^(old - new)
         corrections = [
             self.simd.power_of_2(builder.fsub(old, new))
             for old, new in zip(before, most, strict=True)
@@ -101,7 +101,7 @@ class _Step:
             row = zip(self._row(self.sums, loop.index), corrections, strict=True)
             corrected = [builder.fmul(each, correction) for each, correction in row]
             self._set_row(self.sums, loop.index, corrected)
-        # Powers, and their sums
+        # 2^(score - new), and the total of these
         with cgutils.for_range(builder, self.count) as loop:
             row = zip(self._row(self.scores, loop.index), most, strict=True)
             powers = [

@@ -58,6 +58,8 @@ Numbers: TypeAlias = Sequence[Any]
 
 def _input(w: Vectors, d: Numbers) -> Numbers:
     """Multiply B^T by six vectors."""
+    # d4 - d2 / p^2 and d3 - d1 / p^2 for the points p^2 = 1/2 and 2: the rows of p and
+    # of -p are their sum and their difference, the odd part times p
     near_even, far_even = w.plus(d[4], -2.0, d[2]), w.plus(d[4], -0.5, d[2])
     near_odd, far_odd = w.plus(d[3], -2.0, d[1]), w.plus(d[3], -0.5, d[1])
     return (
@@ -72,6 +74,7 @@ def _input(w: Vectors, d: Numbers) -> Numbers:
 
 def _filter(w: Vectors, g: Numbers) -> Numbers:
     """Multiply G by three vectors."""
+    # g0 + p g1 + p^2 g2 for p and -p, times a factor of the pair
     near = w.times(-2 / 3, w.plus(g[0], 0.5, g[2]))
     far = w.times(1 / 6, w.plus(g[0], 2.0, g[2]))
     return (
@@ -86,6 +89,8 @@ def _filter(w: Vectors, g: Numbers) -> Numbers:
 
 def _output(w: Vectors, m: Numbers) -> Numbers:
     """Multiply A^T by six vectors."""
+    # Output k is the sum of p^k m(p) over the points: even powers take m(p) + m(-p),
+    # odd ones m(p) - m(-p); the first has the point 0 besides, the last infinity
     near, far = w.add(m[1], m[2]), w.add(m[3], m[4])
     near_odd, far_odd = w.subtract(m[1], m[2]), w.subtract(m[3], m[4])
     return (

@@ -90,6 +90,7 @@ def repeated_axes(value: ir.Value) -> RepeatedAxes | None:
     if not shape or 0 in shape:
         return None
     layout: Layout = tuple(whole(str(axis), size) for axis, size in enumerate(shape))
+    # Go back as far as digits can be followed; remember where the fewest elements are
     best, least = None, math.prod(shape)
     nodes: list[ir.Node] = []
     while len(nodes) < LONGEST:
@@ -161,6 +162,7 @@ def _sizes(
             for other in kept
         )
 
+    # Cut each axis into digits that the source has and digits that it repeats over
     for axis, size in enumerate(shape):
         pieces = split_like(whole(str(axis), size), kept)
         if not pieces:
@@ -355,6 +357,7 @@ def _split(
 
 def _joined(node: ir.Node, shape: tuple[int, ...]) -> _Plan | None:
     """Plan a Concat whose operands all repeat along the same axes, constants too."""
+    # A constant repeats along an axis if all its slices are equal
     values = [value for value in node.inputs if value is not None]
     axis = node.attributes.get_int("axis", 0) % len(shape)
     stored = {value: array_of(value) for value in values if holds_numbers(value)}

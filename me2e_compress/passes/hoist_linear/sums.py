@@ -236,6 +236,7 @@ class _Search:
 
     def of(self, value: ir.Value, *, owned: bool, depth: int) -> Form:
         """Return the cheapest form; ``owned``: only this product needs its reader."""
+        # As it is, or by each line of the algebra that fits its maker
         if value not in self.known:
             owned = owned and sole_reader(value) is not None
             forms = [self.direct(value, owned=owned)]
@@ -268,6 +269,7 @@ class _Search:
         layer = layer_behind(value)
         if layer is None:
             return None
+        # V W is [rows[-1], columns]; the first layer goes if nothing else reads it
         owned = owned and all(sole_reader(each.outputs[0]) for each in layer.nodes)
         inner = self.of(layer.source, owned=owned, depth=depth)
         rows = static_shape(layer.source) or (1,)
@@ -295,6 +297,7 @@ class _Search:
         rows = [static_shape(each) or () for each in terms if not holds_numbers(each)]
         if any(each[-1:] != shape[-1:] for each in rows):
             return None
+        # The Add is needed as before; a layer or a constant among the terms takes W in
         one, two = (self.of(each, owned=owned, depth=depth) for each in terms)
         minus = node.op_type == "Sub"
         cost = one.cost + two.cost + (not owned)
