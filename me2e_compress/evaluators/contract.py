@@ -144,18 +144,13 @@ def _weather_of(text: str) -> Weather:
     for pair in filter(None, text.split(",")):
         name, _, value = pair.partition("=")
         options[name.strip()] = value.split("+") if name == "dropped" else value
-    unknown = [name for name in options if name not in Weather.__dataclass_fields__]
-    if unknown:
-        raise EvaluationError(
-            f"weather option {unknown[0]!r}: there are "
-            f"{', '.join(Weather.__dataclass_fields__)}"
-        )
     try:
         return TypeAdapter(Weather).validate_python(options)
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
+        there = ", ".join(Weather.__dataclass_fields__)
         raise EvaluationError(
-            f"weather option {first['loc'][0]}: {first['msg']}"
+            f"weather option {first['loc'][0]}: {first['msg']}; there are {there}"
         ) from error
 
 

@@ -12,7 +12,7 @@ from typing import Annotated, Literal
 
 import numpy as np
 import numpy.typing as npt
-from pydantic import Field
+from pydantic import ConfigDict, Field, with_config
 
 from me2e_compress.errors import EvaluationError
 
@@ -140,6 +140,7 @@ def fixed_point(pixels: Floats) -> npt.NDArray[np.int32]:
 Share = Annotated[float, Field(ge=0.0, le=1.0)]
 
 
+@with_config(ConfigDict(extra="forbid"))
 @dataclass(frozen=True, slots=True)
 class Weather:
     """Weather and sensor faults, read from words. The default is a clear day.

@@ -135,7 +135,7 @@ DRIVE = {
     "--routes 1 --render nowhere": "no route 'nowhere'",
     "--routes 1 --engine cloud": "no engine 'cloud'",
     "--routes 1 --engine local:a:1": "no engine 'local:a:1'",
-    "--routes 1 --weather snow=1": "weather option 'snow'",
+    "--routes 1 --weather snow=1": "weather option snow: Unexpected",
     "--routes 1 --weather night=dark": "weather option night",
     "--routes 1 --latency fast": "no latency source 'fast'",
 }

@@ -100,7 +100,7 @@ def test_a_driver_that_is_no_model_takes_nothing(options: dict[str, object]) -> 
         ({}, "give a latency or mean_of"),
         ({"latency": "none", "mean_of": "a.b"}, "give a latency or mean_of"),
         ({"latency": "none", "dt_ms": 30.0}, "a step of 30 ms: it must divide 50 ms"),
-        ({"latency": "none", "weather": "hail=1"}, "weather option 'hail'"),
+        ({"latency": "none", "weather": "hail=1"}, "weather option hail"),
         ({"latency": "none", "latency_model": "lifo"}, "there are drop, fifo"),
         ({"latency": "trace{seed=-1}"}, "seed: Input should be greater"),
         (
