@@ -8,7 +8,6 @@ Beside it stands the other published model, a pipeline that delays every control
 skips no decision: `LatencyModel`.
 """
 
-import abc
 from collections import deque
 from dataclasses import dataclass, field
 from enum import StrEnum
@@ -34,41 +33,6 @@ class LatencyModel(StrEnum):
     Bench2Drive-Robust."""
 
 
-@dataclass
-class ControlClock(abc.ABC, Generic[T]):
-    """Says in which frames a control acts and a decision is due.
-
-    Args:
-        in_force: The control before any decision acts.
-        dt_us: Step of the simulated world, microseconds.
-    """
-
-    in_force: T
-    dt_us: int = DT_US
-    _frame: int = field(default=0, init=False)
-
-    @property
-    @abc.abstractmethod
-    def decision_is_due(self) -> bool:
-        """Whether the policy looks at this frame."""
-
-    @abc.abstractmethod
-    def decide(self, control: T, latency_us: int) -> None:
-        """Take the decision that is due, whose control took so long, at this frame."""
-
-    def advance(self) -> T:
-        """Return the control that acts in this frame, and go to the next."""
-        self._frame += 1
-        return self.in_force
-
-
-def control_clock(model: LatencyModel, in_force: T, dt_us: int) -> ControlClock[T]:
-    """Build the clock of a model; see `ControlClock`."""
-    if model is LatencyModel.FIFO:
-        return PipelinedControl(in_force, dt_us)
-    return HeldControl(in_force, dt_us)
-
-
 def skipped_decisions(latency_us: int, dt_us: int = DT_US) -> int:
     """Return n of equation 4: how many decisions a latency skips.
 
@@ -80,37 +44,6 @@ def skipped_decisions(latency_us: int, dt_us: int = DT_US) -> int:
     be compared with each other.
     """
     return max(0, _whole(latency_us) // dt_us - 1)
-
-
-@dataclass
-class HeldControl(ControlClock[T]):
-    """Takes one decision at a time.
-
-    A decision taken at frame k that skips n = 0 decisions acts at once. With n > 0 the
-    control in force before frame k stays for the frames k to k + n, whose observations
-    are not used, and the new one acts from frame k + n + 1 on, where the next decision
-    is taken.
-    """
-
-    _due: int = field(default=0, init=False)
-    _coming: T | None = field(default=None, init=False)
-
-    @property
-    def decision_is_due(self) -> bool:
-        """Whether the policy looks at this frame."""
-        return self._frame == self._due
-
-    def decide(self, control: T, latency_us: int) -> None:
-        """Take the decision that is due at this frame."""
-        # the last decision's control acts from this frame on
-        if self._coming is not None:
-            self.in_force = self._coming
-        skipped = skipped_decisions(latency_us, self.dt_us)
-        self._coming = control
-        if not skipped:
-            self.in_force = control
-        # the next decision is due when this one's control acts
-        self._due = self._frame + skipped + 1
 
 
 def delayed_frames(latency_us: int, dt_us: int = DT_US) -> int:
@@ -128,29 +61,52 @@ def _whole(latency_us: int) -> int:
 
 
 @dataclass
-class PipelinedControl(ControlClock[T]):
-    """Delays every control; a decision is due at every frame.
+class ControlClock(Generic[T]):
+    """Says in which frames a control acts and a decision is due.
 
-    The control decided at frame k acts from frame k + ceil(t / dt) on, until the next
-    one does. First in, first out: a fast decision does not overtake a slow one before
-    it. As many decisions run side by side as the delay has frames, so the model says
-    what a delay does, not what one computer that takes t can do.
+    By default one decision at a time is taken: one taken at frame k that skips n = 0
+    decisions acts at once. With n > 0 the control in force before frame k stays for the
+    frames k to k + n, whose observations are not used, and the new one acts from frame
+    k + n + 1 on, where the next decision is taken.
+
+    In a pipeline a decision is due at every frame, and the control decided at frame k
+    acts from frame k + ceil(t / dt) on, until the next one does. First in, first out: a
+    fast decision does not overtake a slow one before it. As many decisions run side by
+    side as the delay has frames, so that says what a delay does, not what one computer
+    that takes t can do.
+
+    Args:
+        in_force: The control before any decision acts.
+        dt_us: Step of the simulated world, microseconds.
+        model: Whether decisions are dropped, or all controls delayed.
     """
 
+    in_force: T
+    dt_us: int = DT_US
+    model: LatencyModel = LatencyModel.DROP
+    _frame: int = field(default=0, init=False)
+    _due: int = field(default=0, init=False)
     _coming: deque[tuple[int, T]] = field(default_factory=deque, init=False)
 
     @property
     def decision_is_due(self) -> bool:
-        """Whether the policy looks at this frame: at every one."""
-        return True
+        """Whether the policy looks at this frame."""
+        return self._frame == self._due
 
     def decide(self, control: T, latency_us: int) -> None:
-        """Take the decision of this frame."""
-        ready = self._frame + delayed_frames(latency_us, self.dt_us)
-        self._coming.append((ready, control))
+        """Take the decision that is due, whose control took so long, at this frame."""
+        if self.model is LatencyModel.FIFO:
+            acts = self._frame + delayed_frames(latency_us, self.dt_us)
+            self._due = self._frame + 1
+        else:
+            skipped = skipped_decisions(latency_us, self.dt_us)
+            self._due = self._frame + skipped + 1
+            acts = self._due if skipped else self._frame
+        self._coming.append((acts, control))
 
     def advance(self) -> T:
         """Return the control that acts in this frame, and go to the next."""
         while self._coming and self._coming[0][0] <= self._frame:
             _, self.in_force = self._coming.popleft()
-        return super().advance()
+        self._frame += 1
+        return self.in_force

@@ -16,7 +16,7 @@ from typing import Any
 
 from pydantic import TypeAdapter
 
-from me2e_compress.driving.realtime import HeldControl
+from me2e_compress.driving.realtime import ControlClock
 from me2e_compress.errors import EvaluationError
 from me2e_compress.evaluators.highway.controller import AnchoredPlan
 from me2e_compress.evaluators.highway.driven_frames import propose, seed_of
@@ -86,7 +86,7 @@ def dry_run(route: Route, policy: Blind | Expert) -> DryRun:
     """Drive a route once, until the rest cannot change the verdict."""
     world, rules = World(route), EndingRules()
     observer = ObservationBuilder(world, policy, CameraRig(), None)
-    clock, ending = HeldControl(Control(0.0, 0.0)), None
+    clock, ending = ControlClock(Control(0.0, 0.0)), None
     policy.reset(route)
     scene = world.scene()
     while ending is None:

@@ -20,10 +20,8 @@ from me2e_compress.driving.latency import (
     with_draws,
 )
 from me2e_compress.driving.realtime import (
-    HeldControl,
+    ControlClock,
     LatencyModel,
-    PipelinedControl,
-    control_clock,
     delayed_frames,
     skipped_decisions,
 )
@@ -261,7 +259,7 @@ def by_the_text(latencies_us: list[int], dt_us: int) -> tuple[list[int], list[in
 
 @given(latencies, steps)
 def test_the_clock_follows_the_rule(latencies_us: list[int], dt_us: int) -> None:
-    held = HeldControl(-1, dt_us)
+    held = ControlClock(-1, dt_us)
     expected, expected_decisions = by_the_text(latencies_us, dt_us)
 
     acting, decided_at = list[int](), list[int]()
@@ -284,7 +282,7 @@ def test_a_pipeline_delays_by_the_frames_begun(latency_us: int, frames: int) -> 
     assert delayed_frames(latency_us) == frames
 
 
-def acting(clock: PipelinedControl[int], latencies_us: list[int]) -> list[int]:
+def acting(clock: ControlClock[int], latencies_us: list[int]) -> list[int]:
     found = list[int]()
     for frame, latency_us in enumerate(latencies_us):
         assert clock.decision_is_due
@@ -296,7 +294,7 @@ def acting(clock: PipelinedControl[int], latencies_us: list[int]) -> list[int]:
 @given(latencies, steps)
 def test_a_pipeline_is_a_queue(latencies_us: list[int], dt_us: int) -> None:
     """Decision k is out when it and all before it are ready; the newest out acts."""
-    found = acting(PipelinedControl(-1, dt_us), latencies_us)
+    found = acting(ControlClock(-1, dt_us, LatencyModel.FIFO), latencies_us)
 
     for frame, acts in enumerate(found):
         out = [
@@ -309,7 +307,7 @@ def test_a_pipeline_is_a_queue(latencies_us: list[int], dt_us: int) -> None:
 
 def test_without_latency_both_models_act_at_once() -> None:
     for model in LatencyModel:
-        clock = control_clock(model, -1, 50_000)
+        clock = ControlClock(-1, model=model)
         clock.decide(0, 0)
         assert clock.advance() == 0
 

@@ -29,7 +29,7 @@ from me2e_compress.driving.contract import (
 from me2e_compress.driving.input_sources import can_bus_between
 from me2e_compress.driving.latency import DecisionFacts, parse_latency
 from me2e_compress.driving.onnx_policy import OnnxPolicy
-from me2e_compress.driving.realtime import DT_US, HeldControl
+from me2e_compress.driving.realtime import DT_US, ControlClock
 from me2e_compress.driving.shipped_adapters import adapter_file
 from me2e_compress.runtime.providers import PROVIDERS
 from models.tcp.waypoint_pid import PidOptions, WaypointPid
@@ -114,7 +114,7 @@ class GraphAgent(AutonomousAgent):  # type: ignore[misc]
         latency = parse_latency(options.latency)
         self._is_warm = not latency.measures
         self._charge = latency.on_route(WALL_CLOCK.sub("", save_name))
-        self._clock = HeldControl(FULL_BRAKE)
+        self._clock = ControlClock(FULL_BRAKE)
 
     def sensors(self) -> list[dict[str, Any]]:
         """List the cameras that the graph takes, IMU, GPS and speedometer."""

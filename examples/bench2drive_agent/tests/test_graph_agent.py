@@ -10,7 +10,7 @@ import pytest
 from pydantic import ValidationError
 
 from agent_files import options, straight_on
-from me2e_compress.driving.realtime import HeldControl
+from me2e_compress.driving.realtime import ControlClock
 from me2e_compress.errors import EvaluationError
 from me2e_compress.evaluators.bench2drive.recordings import (
     read_decisions,
@@ -83,7 +83,7 @@ def numbered(
 
 def acting(latencies_us: list[int], frames: int) -> list[float]:
     """Which decision acts in each frame, as the evaluator of highway-env has it."""
-    clock, numbers, charged = HeldControl(0), count(1), iter(latencies_us)
+    clock, numbers, charged = ControlClock(0), count(1), iter(latencies_us)
     found = list[float]()
     for _ in range(frames):
         if clock.decision_is_due:

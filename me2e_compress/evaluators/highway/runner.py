@@ -18,7 +18,7 @@ from me2e_compress.driving.contract import (
     checked,
 )
 from me2e_compress.driving.latency import DecisionFacts
-from me2e_compress.driving.realtime import control_clock
+from me2e_compress.driving.realtime import ControlClock
 from me2e_compress.errors import EvaluationError
 from me2e_compress.evaluators.contract import Drive
 from me2e_compress.evaluators.highway.controller import AnchoredPlan, control_of
@@ -135,7 +135,7 @@ class _Drive:
         self.world = world = World(route, dt_us=conditions.dt_us)
         self.recorder, self.rules = EpisodeRecorder(world), EndingRules()
         coast, model = Control(0.0, 0.0), conditions.latency_model
-        self.clock = control_clock(model, coast, conditions.dt_us)
+        self.clock = ControlClock(coast, conditions.dt_us, model)
         self.charge = conditions.latency.on_route(route.id)
         rig = CameraRig(*image_size_of(policy))
         self.cameras = None

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from me2e_compress.driving.realtime import HeldControl
+from me2e_compress.driving.realtime import ControlClock
 from me2e_compress.errors import EvaluationError
 from me2e_compress.evaluators.highway.controller import AnchoredPlan
 from me2e_compress.evaluators.highway.driven_frames import propose, seed_of
@@ -82,7 +82,7 @@ def test_the_planned_waypoints_are_where_the_ego_then_is() -> None:
 
 def test_a_decision_that_takes_long_drives_worse() -> None:
     """Nobody drives a ring whose every control is 0.85 s old."""
-    held = HeldControl(Control(0.0, 0.0))
+    held = ControlClock(Control(0.0, 0.0))
     world, memory = World(route("EnterActorFlow")), Memory()
     top = ceiling(world.path)
     while not world.done and world.time_us < 40_000_000:
