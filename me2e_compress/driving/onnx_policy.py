@@ -5,10 +5,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Self
 
+import numpy as np
+
 from me2e_compress.driving.adapter import Adapter
 from me2e_compress.driving.adapter.adapter import ZEROS, RecurrentEntry
 from me2e_compress.driving.adapter.inputs import ModelInputs, contract_names
-from me2e_compress.driving.adapter.outputs import ModelOutputs
+from me2e_compress.driving.adapter.outputs import COMMAND, plan_read
 from me2e_compress.driving.contract import (
     PLAN_TIMES_S,
     Observation,
@@ -20,6 +22,7 @@ from me2e_compress.driving.contract import (
 from me2e_compress.driving.host_stage import HostStage, HostWork
 from me2e_compress.errors import EvaluationError, FramesError, GraphError
 from me2e_compress.runtime.frames import Array
+from me2e_compress.runtime.plan_adapter import PlanAdapter
 from me2e_compress.runtime.providers import CPU, Provider
 from me2e_compress.runtime.session import Session, zeros
 
@@ -86,7 +89,7 @@ class OnnxPolicy:
     session: Session
     adapter: Adapter
     inputs: ModelInputs
-    outputs: ModelOutputs
+    reads: PlanAdapter
     recurrent: dict[str, str]
     first: FirstValues
     stage: HostStage | None = None
@@ -128,9 +131,9 @@ class OnnxPolicy:
         """Drive a graph that is open, and run it once on zeros; see :meth:`open`."""
         recurrent = recurrent_of(session, adapter)
         inputs = ModelInputs.of(session, adapter, recurrent)
-        outputs = ModelOutputs.of(session, adapter)
+        reads = plan_read(session, adapter)
         first = FirstValues.of(session, adapter.recurrent, recurrent)
-        policy = cls(session, adapter, inputs, outputs, recurrent, first, stage)
+        policy = cls(session, adapter, inputs, reads, recurrent, first, stage)
         # a misfit that only a run shows
         policy.reset(None)
         policy.plan(inputs.nothing(command=0))
@@ -170,9 +173,9 @@ class OnnxPolicy:
         outputs = self.session.run({**self._state, **feeds})
         self._begins = False
         self._state = {name: outputs[to] for name, to in self.recurrent.items()}
-        # the host stage may change the plan, as six waypoints every 0.5 s
-        plan = self.outputs.trajectory(outputs, feeds, observation)
-        if self.stage is not None:
+        # the plan in the ego frame, and what the host makes of it
+        plan = self.trajectory(outputs, feeds, observation)
+        if self.stage is not None:  # it changes six waypoints every 0.5 s
             work = self.stage.work(six_waypoints(plan), outputs)
             if not isinstance(work, HostWork):
                 raise EvaluationError(
@@ -182,6 +185,17 @@ class OnnxPolicy:
             self.host_iterations, self.host_cells = work.iterations, work.cells
             plan = Trajectory(work.plan, PLAN_TIMES_S)
         return plan
+
+    def trajectory(
+        self,
+        outputs: Mapping[str, Array],
+        feeds: Mapping[str, Array],
+        observation: Observation,
+    ) -> Trajectory:
+        """Return the plan in the ego frame."""
+        command = np.array([observation.command])
+        points = self.reads.plan(outputs, {**feeds, COMMAND: command})
+        return self.reads.trajectory(self.adapter.to_ego(points))
 
 
 def recurrent_of(session: Session, adapter: Adapter) -> dict[str, str]:

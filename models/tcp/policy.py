@@ -119,7 +119,7 @@ class TcpPolicy:
             control = best_action(outputs["action_index"])
         if self.fusion is None:
             return control
-        plan = self.graph.outputs.trajectory(outputs, feeds, observation)
+        plan = self.graph.trajectory(outputs, feeds, observation)
         if plan is None or observation.target_points is None:
             raise EvaluationError("fusion aims at a target point, and there is none")
         forward, left = observation.target_points[0].tolist()

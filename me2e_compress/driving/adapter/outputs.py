@@ -5,14 +5,14 @@ import json
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Self, TypeAlias
+from typing import TypeAlias
 
 import numpy as np
 import onnx_ir as ir
 
 from me2e_compress.driving.adapter.adapter import ZEROS, Adapter
 from me2e_compress.driving.adapter.inputs import ModelInputs
-from me2e_compress.driving.contract import Observation, Shape, Trajectory
+from me2e_compress.driving.contract import Shape
 from me2e_compress.driving.input_sources import INPUT_SOURCES
 from me2e_compress.driving.shipped_adapters import adapter_file
 from me2e_compress.errors import EvaluationError, GraphError
@@ -25,7 +25,6 @@ from me2e_compress.graph.recurrence import (
     recurrent_inputs,
     sides,
 )
-from me2e_compress.runtime.frames import Array
 from me2e_compress.runtime.plan_adapter import PLAN, PlanAdapter
 from me2e_compress.runtime.session import DTYPES, Session, zeros
 
@@ -33,30 +32,11 @@ COMMAND = "command"
 """Name of the navigator's command among the inputs."""
 
 
-@dataclass(frozen=True)
-class ModelOutputs:
-    """How a graph's outputs are read at each decision, without recurrent ones."""
-
-    adapter: Adapter
-    plan: PlanAdapter
-
-    @classmethod
-    def of(cls, session: Session, adapter: Adapter) -> Self:
-        """Find the outputs of a graph to read."""
-        plan = plan_of(adapter.plan, session.metadata, list(session.outputs))
-        check_command(plan, session.inputs)
-        return cls(adapter, plan)
-
-    def trajectory(
-        self,
-        outputs: Mapping[str, Array],
-        feeds: Mapping[str, Array],
-        observation: Observation,
-    ) -> Trajectory:
-        """Return the plan in the ego frame."""
-        command = np.array([observation.command])
-        points = self.plan.plan(outputs, {**feeds, COMMAND: command})
-        return self.plan.trajectory(self.adapter.to_ego(points))
+def plan_read(session: Session, adapter: Adapter) -> PlanAdapter:
+    """Return how the plan of a graph is read, checked against its ports."""
+    plan = plan_of(adapter.plan, session.metadata, list(session.outputs))
+    check_command(plan, session.inputs)
+    return plan
 
 
 def check_command(plan: PlanAdapter, inputs: Collection[str]) -> None:
@@ -309,7 +289,7 @@ def output_uses(
     uses = {answer: f"fed back to {name}" for name, answer in recurrent.items()}
     problem = ""
     try:
-        plan = ModelOutputs.of(session, adapter).plan
+        plan = plan_read(session, adapter)
     except (EvaluationError, GraphError) as error:
         problem = str(error)
     else:

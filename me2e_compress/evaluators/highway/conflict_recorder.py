@@ -5,7 +5,7 @@ driving it takes.
 """
 
 import math
-from dataclasses import dataclass, field
+from collections.abc import Sequence
 
 import numpy as np
 import numpy.typing as npt
@@ -26,7 +26,7 @@ from me2e_compress.simulator.plane_geometry import (
     gaps,
     overlaps,
 )
-from me2e_compress.simulator.scene import Actor, ActorKind, Ego, Scene, box_of
+from me2e_compress.simulator.scene import Actor, Ego, Scene, box_of
 
 Floats = npt.NDArray[np.float64]
 
@@ -47,55 +47,41 @@ CHUNK = 256
 """Number of ego frames that are compared at once."""
 
 
-@dataclass
-class ConflictRecorder:
-    """Keeps the boxes of all frames until the route is over."""
-
-    _egos: list[tuple[float, ...]] = field(default_factory=list, init=False)
-    _actors: list[list[tuple[float, ...]]] = field(default_factory=list, init=False)
-    _kinds: dict[int, ActorKind] = field(default_factory=dict, init=False)
-
-    def record(self, scene: Scene) -> None:
-        """Keep one frame."""
-        self._egos.append((*box_of(scene.ego), scene.ego.speed_mps))
-        rows = list[tuple[float, ...]]()
-        for actor in scene.actors:
-            self._kinds[actor.id] = actor.kind
-            rows.append((*box_of(actor), actor.speed_mps, actor.id))
-        self._actors.append(rows)
-
-    def result(self) -> ConflictRecord:
-        """Return the distances, times and encounters of the frames kept so far."""
-        # rows of all actors, each with the number of its frame
-        counts = [len(rows) for rows in self._actors]
-        frame = np.repeat(np.arange(len(counts)), counts)
-        actors = np.array([row for rows in self._actors for row in rows]).reshape(-1, 7)
-        egos = np.array(self._egos).reshape(-1, 6)
-        # every actor against the ego of the same frame
-        one, other = egos[frame], actors[:, :6]
-        distance = gaps(one[:, :5], other[:, :5])
-        velocity = _velocity(other) - _velocity(one)
-        seconds = contact_times(one[:, :5], other[:, :5], velocity)
-        # the smallest value of each frame
-        nearest, soonest = np.full((2, len(counts)), np.inf)
-        np.minimum.at(nearest, frame, distance)
-        np.minimum.at(soonest, frame, seconds)
-        # where both came to one place, of every actor that moved
-        encounters = list[Encounter]()
-        for number in np.unique(actors[:, 6]).astype(int).tolist():
-            own = actors[:, 6] == number
-            if actors[own, 5].any():
-                kind = self._kinds[number].value
-                for ego_at, at, angle in _same_place(egos, actors[own], frame[own]):
-                    time_us = max(ego_at, at) * FRAME_US
-                    pet_s = abs(ego_at - at) * FRAME_US / 1e6
-                    what = number, kind, time_us, pet_s, round(angle, 3), ego_at < at
-                    encounters.append(Encounter(*what))
-        return ConflictRecord(
-            _known(nearest, math.inf),
-            _known(soonest, TTC_HORIZON_S),
-            tuple(sorted(encounters, key=lambda each: (each.time_us, each.actor))),
-        )
+def conflicts_of(scenes: Sequence[Scene]) -> ConflictRecord:
+    """Return distances, times and encounters of a route's frames, 50 ms apart."""
+    # rows of all actors, each with the number of its frame
+    kinds = {actor.id: actor.kind for scene in scenes for actor in scene.actors}
+    counts = [len(scene.actors) for scene in scenes]
+    frame = np.repeat(np.arange(len(counts)), counts)
+    rows = [(*box_of(a), a.speed_mps, a.id) for scene in scenes for a in scene.actors]
+    actors = np.array(rows).reshape(-1, 7)
+    boxes = [(*box_of(scene.ego), scene.ego.speed_mps) for scene in scenes]
+    egos = np.array(boxes).reshape(-1, 6)
+    # every actor against the ego of the same frame
+    one, other = egos[frame], actors[:, :6]
+    distance = gaps(one[:, :5], other[:, :5])
+    velocity = _velocity(other) - _velocity(one)
+    seconds = contact_times(one[:, :5], other[:, :5], velocity)
+    # the smallest value of each frame
+    nearest, soonest = np.full((2, len(counts)), np.inf)
+    np.minimum.at(nearest, frame, distance)
+    np.minimum.at(soonest, frame, seconds)
+    # where both came to one place, of every actor that moved
+    encounters = list[Encounter]()
+    for number in np.unique(actors[:, 6]).astype(int).tolist():
+        own = actors[:, 6] == number
+        if actors[own, 5].any():
+            kind = kinds[number].value
+            for ego_at, at, angle in _same_place(egos, actors[own], frame[own]):
+                time_us = max(ego_at, at) * FRAME_US
+                pet_s = abs(ego_at - at) * FRAME_US / 1e6
+                what = number, kind, time_us, pet_s, round(angle, 3), ego_at < at
+                encounters.append(Encounter(*what))
+    return ConflictRecord(
+        _known(nearest, math.inf),
+        _known(soonest, TTC_HORIZON_S),
+        tuple(sorted(encounters, key=lambda each: (each.time_us, each.actor))),
+    )
 
 
 def contact_of(ego: Ego, actor: Actor) -> Contact:

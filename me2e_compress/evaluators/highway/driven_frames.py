@@ -11,12 +11,10 @@ from me2e_compress.driving.onnx_policy import OnnxPolicy
 from me2e_compress.driving.realtime import DT_US
 from me2e_compress.errors import EvaluationError, FramesError
 from me2e_compress.evaluators.highway.controller import AnchoredPlan
-from me2e_compress.evaluators.highway.observe import ObservationBuilder
+from me2e_compress.evaluators.highway.observe import ObservationBuilder, cameras_of
 from me2e_compress.evaluators.highway.runner import EndingRules
 from me2e_compress.runtime.frames import Array, Frame
 from me2e_compress.simulator.camera_rig import CameraRig
-from me2e_compress.simulator.cameras.ground import paint_texture
-from me2e_compress.simulator.cameras.renderer import Cameras
 from me2e_compress.simulator.routes import (
     EXPERT_S,
     SCENARIO_ABILITIES,
@@ -137,8 +135,6 @@ def _look(
 
 
 def _observer_of(world: World, policy: OnnxPolicy) -> ObservationBuilder:
-    rig, cameras = CameraRig(*policy.image_size), None
-    if policy.needs_images:
-        texture = paint_texture(world.roadmap, world.path.points)
-        cameras = Cameras(texture, rig, world.weather)
+    rig = CameraRig(*policy.image_size)
+    cameras = cameras_of(world, rig) if policy.needs_images else None
     return ObservationBuilder(world, policy, rig, cameras)

@@ -5,8 +5,8 @@ from dataclasses import dataclass, field, replace
 from statistics import fmean
 
 from me2e_compress.evaluators.highway.conflict_recorder import (
-    ConflictRecorder,
     at_fault,
+    conflicts_of,
     contact_of,
 )
 from me2e_compress.metrics.episode import (
@@ -57,7 +57,7 @@ class EpisodeRecorder:
     world: World
     frames: list[EgoFrame] = field(default_factory=list)
     decisions: list[InferenceRecord] = field(default_factory=list)
-    conflicts: ConflictRecorder = field(default_factory=ConflictRecorder)
+    scenes: list[Scene] = field(default_factory=list)
 
     def record(self, scene: Scene) -> None:
         """Record a frame if one is due."""
@@ -84,7 +84,7 @@ class EpisodeRecorder:
             traffic_speed_mps=fmean(near) if near else None,
         )
         self.frames.append(frame)
-        self.conflicts.record(scene)
+        self.scenes.append(scene)
 
     def episode(self, ending: Ending, failure: str | None = None) -> Episode:
         """Return the episode of the world's route."""
@@ -103,7 +103,7 @@ class EpisodeRecorder:
             frames=tuple(self.frames),
             decisions=tuple(self.decisions),
             junction_m=junction_m(world.path),
-            conflicts=self.conflicts.result(),
+            conflicts=conflicts_of(self.scenes),
         )
 
 

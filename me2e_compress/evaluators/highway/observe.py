@@ -10,7 +10,8 @@ import numpy.typing as npt
 
 from me2e_compress.driving.contract import EgoKinematics, Observation, Policy
 from me2e_compress.driving.input_sources import can_bus_between
-from me2e_compress.simulator.camera_rig import CameraRig
+from me2e_compress.simulator.camera_rig import CLEAR, CameraRig, Weather
+from me2e_compress.simulator.cameras.ground import paint_texture
 from me2e_compress.simulator.cameras.renderer import Cameras
 from me2e_compress.simulator.plane_geometry import RoutePath
 from me2e_compress.simulator.scene import ActorKind, Ego, Scene
@@ -51,6 +52,12 @@ class RouteNodes:
         index = int(np.searchsorted(self.stations_m, station_m + REACHED_M, "right"))
         ends = self.points[[min(index, last), min(index + 1, last)]]
         return ego.seen(*ends.T).astype(np.float32)
+
+
+def cameras_of(world: World, rig: CameraRig, weather: Weather = CLEAR) -> Cameras:
+    """Return the cameras on a route; clear weather is what the route says."""
+    texture = paint_texture(world.roadmap, world.path.points)
+    return Cameras(texture, rig, world.weather if weather == CLEAR else weather)
 
 
 @dataclass

@@ -24,12 +24,14 @@ from me2e_compress.evaluators.contract import Drive
 from me2e_compress.evaluators.highway.controller import AnchoredPlan, control_of
 from me2e_compress.evaluators.highway.drivers import image_size_of
 from me2e_compress.evaluators.highway.episode_recorder import EpisodeRecorder
-from me2e_compress.evaluators.highway.observe import ObservationBuilder, road_users
+from me2e_compress.evaluators.highway.observe import (
+    ObservationBuilder,
+    cameras_of,
+    road_users,
+)
 from me2e_compress.metrics.episode import Ending, Episode, InferenceRecord
 from me2e_compress.metrics.route_scores import BLOCKED_SPEED_MPS, BLOCKED_US
-from me2e_compress.simulator.camera_rig import CLEAR, CameraRig
-from me2e_compress.simulator.cameras.ground import paint_texture
-from me2e_compress.simulator.cameras.renderer import Cameras
+from me2e_compress.simulator.camera_rig import CameraRig
 from me2e_compress.simulator.pictures import Moment
 from me2e_compress.simulator.routes import Route
 from me2e_compress.simulator.scene import Control, Ego, Scene
@@ -140,10 +142,7 @@ class _Drive:
         rig = CameraRig(*image_size_of(policy))
         self.cameras = None
         if policy.needs_images or listeners.on_moment is not None:
-            texture = paint_texture(world.roadmap, world.path.points)
-            given = conditions.weather
-            weather = world.weather if given == CLEAR else given
-            self.cameras = Cameras(texture, rig, weather)
+            self.cameras = cameras_of(world, rig, conditions.weather)
         needed = self.cameras if policy.needs_images else None
         self.observer = ObservationBuilder(world, policy, rig, needed)
         self.plan: tuple[Ego, Plan] | None = None

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from me2e_compress.evaluators.highway.observe import can_bus_of
+from me2e_compress.evaluators.highway.observe import cameras_of, can_bus_of
 from me2e_compress.simulator.camera_rig import CameraRig
 from me2e_compress.simulator.plane_geometry import Floats, RoutePath
 from me2e_compress.simulator.scene import Signal, SignalKind, SignalState
@@ -21,7 +21,7 @@ from models.driver.episodes.agents import (
 )
 from models.driver.episodes.birdseye import ground_classes
 from models.driver.episodes.jpeg import pictures
-from models.driver.episodes.recording_policy import LabelledFrame, cameras_of
+from models.driver.episodes.recording_policy import LabelledFrame
 from models.driver.expert.expert_policy import decide
 from models.driver.expert.privileged import Privileged
 from models.driver.expert.reentry import beyond

@@ -19,11 +19,9 @@ from me2e_compress.driving.contract import (
     RouteInfo,
     six_waypoints,
 )
-from me2e_compress.evaluators.highway.observe import ObservationBuilder
+from me2e_compress.evaluators.highway.observe import ObservationBuilder, cameras_of
 from me2e_compress.runtime.plan_adapter import Trajectory
 from me2e_compress.simulator.camera_rig import CameraRig
-from me2e_compress.simulator.cameras.ground import paint_texture
-from me2e_compress.simulator.cameras.renderer import Cameras
 from me2e_compress.simulator.plane_geometry import Floats
 from me2e_compress.simulator.scene import Scene
 from me2e_compress.simulator.world import World
@@ -149,12 +147,6 @@ class LabelledFrame:
     command: int
     memory: Memory
     decision: ExpertDecision
-
-
-def cameras_of(world: World, rig: CameraRig) -> Cameras:
-    """Return the cameras of a route, with its ground and its weather."""
-    texture = paint_texture(world.roadmap, world.path.points)
-    return Cameras(texture, rig, world.weather)
 
 
 @dataclass(frozen=True, eq=False)

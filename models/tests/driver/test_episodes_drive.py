@@ -8,6 +8,7 @@ import pytest
 
 from me2e_compress.driving.contract import Observation, Plan
 from me2e_compress.evaluators import Drive
+from me2e_compress.evaluators.highway.observe import cameras_of
 from me2e_compress.evaluators.highway.runner import drive
 from me2e_compress.simulator.camera_rig import CLEAR, CameraRig
 from me2e_compress.simulator.cameras.ground import paint_texture
@@ -22,7 +23,6 @@ from models.driver.episodes.episode_arrays import Arrays, arrays_of
 from models.driver.episodes.recording_policy import (
     Perturbation,
     RecordingPolicy,
-    cameras_of,
 )
 from models.driver.expert.expert_policy import Expert, ceiling
 from models.tests.driver.beginning import drive_beginning

@@ -10,8 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from me2e_compress.evaluators.highway.conflict_recorder import (
-    ConflictRecorder,
     at_fault,
+    conflicts_of,
     contact_of,
 )
 from me2e_compress.evaluators.highway.episode_recorder import (
@@ -48,10 +48,8 @@ ROAD = Roadmap((lane("a>b:0", -20.0, 6.0), lane("b>c:0", 6.0, 60.0)))
 
 
 def recorded(*frames: tuple[Ego, tuple[Actor, ...]]) -> ConflictRecord:
-    recorder = ConflictRecorder()
-    for k, (ego, actors) in enumerate(frames):
-        recorder.record(Scene(50_000 * k, ego, actors, ()))
-    return recorder.result()
+    scenes = [Scene(50_000 * k, *frame, ()) for k, frame in enumerate(frames)]
+    return conflicts_of(scenes)
 
 
 def crossing(late_s: float) -> ConflictRecord:
