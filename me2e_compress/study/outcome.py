@@ -49,13 +49,12 @@ class Clock:
     load: Load | None = None
 
     def latencies(self, prepared: PreparedVariant) -> dict[int, Measure]:
-        """Return the percentiles that are shown, see `latency`; none of no model."""
-        unknown = Measure(None, "ms", prepared.failure or "no model")
+        """Return the percentiles that are shown; none of no model."""
+        if prepared.model is None:
+            unknown = Measure(None, "ms", prepared.failure or "no model")
+            return dict.fromkeys(LATENCY_PERCENTILES, unknown)
         name = prepared.variant.name
-        return {
-            percent: self.latency(name, percent) if prepared.model else unknown
-            for percent in LATENCY_PERCENTILES
-        }
+        return {each: self.latency(name, each) for each in LATENCY_PERCENTILES}
 
     def latency(self, variant: str, percent: float) -> Measure:
         """Return a percentile on the device, ms; None without enough samples."""

@@ -206,7 +206,8 @@ def _place(at: Any) -> tuple[float, float]:
 
 def _fill(policy: OnnxPolicy) -> tuple[int, ...]:
     """Return the mean colour, R, G, B, so that padding becomes zero."""
-    if (norm := policy.normalization) is None:
+    norms = (each.normalization for each in policy.inputs.images.values())
+    if (norm := next(norms, None)) is None:
         return (0, 0, 0)
     mean = norm.mean if norm.order == "rgb" else norm.mean[::-1]
     return tuple(min(max(round(level / norm.scale), 0), 255) for level in mean)

@@ -53,7 +53,7 @@ class AdaptedInputs:
             self.policy.reset(None)
         seen = self._observation(log, scene, at, before)
         try:
-            feeds = self.policy.feeds(seen)
+            feeds = self.policy.inputs.feeds(seen)
             first = self.policy.first.at(feeds) if before is None else {}
         except EvaluationError as error:
             raise FramesError(f"{log.name}: {error}") from error

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import NamedTuple
 
 from me2e_compress.simulator.plane_geometry import Command, LaneMarking
@@ -161,40 +162,51 @@ def start_speed(stage: Stage) -> float:
     return stage.uniform("speed_mps", 7.0, 10.0)
 
 
-def multilane(stage: Stage) -> Street:
-    """Lay a straight one-way road of two or three lanes and a narrow shoulder."""
-    lanes, lane = _lanes(stage)
-    return _street(stage, Section(lanes, limit_mps=14.0), 1.0, lane=lane)
+def street(
+    stage: Stage,
+    limit_mps: float,
+    shoulder_m: float,
+    several: bool = False,
+    oncoming: int = 0,
+    radius_m: tuple[float, float] | None = None,
+    light: bool = False,
+) -> Street:
+    """Lay a road whose lane the ego follows to the goal, with a shoulder.
+
+    It has one lane, or ``several``, of which the ego's is drawn; with a radius there is
+    a bend in it. A straight one may have a light.
+    """
+    lanes, lane = 1, 0
+    if several:
+        lanes = stage.integer("lanes", 2, 3)
+        lane = min(stage.integer("ego_lane", 0, lanes - 1), lanes - 1)
+    pieces = straight(stage) if radius_m is None else _curve(stage, *radius_m)
+    section, start = Section(lanes, limit_mps=limit_mps), origin(stage)
+    road = lay_road(stage.network, "r", start, pieces, section, oncoming, shoulder_m)
+    first, *others = road.ahead(lane)
+    legs = [Leg(first, enter_m=BEFORE_M), *(Leg(index) for index in others)]
+    stage.drive(legs, start_speed(stage))
+    road = replace(road, lane=lane)
+    return with_light(stage, road, shoulder_m) if light else road
 
 
-def single_lane(stage: Stage) -> Street:
-    """Lay a straight one-way road of one lane, without room to overtake."""
-    return with_light(stage, _street(stage, Section(limit_mps=14.0), 0.5), 0.5)
-
-
-def bend(stage: Stage) -> Street:
-    """Lay a one-way road of two or three lanes through a bend."""
-    lanes, lane = _lanes(stage)
-    pieces = _curve(stage, 60.0, 100.0)
-    return _street(stage, Section(lanes, limit_mps=14.0), 1.0, pieces, lane=lane)
-
-
-def two_way(stage: Stage) -> Street:
-    """Lay a straight road, one lane each way; overtaking uses the oncoming lane."""
-    street = _street(stage, Section(limit_mps=13.0), 0.6, oncoming=1)
-    return with_light(stage, street, 0.6)
-
-
-def two_way_bend(stage: Stage) -> Street:
-    """Lay a winding road with one lane each way and a paved shoulder."""
-    pieces = _curve(stage, 50.0, 90.0)
-    return _street(stage, Section(limit_mps=12.0), 1.8, pieces, oncoming=1)
-
-
-def parking_street(stage: Stage) -> Street:
-    """Lay a street with one lane each way and a parking lane on either side."""
-    street = _street(stage, Section(limit_mps=12.0), PARKING_M, oncoming=1)
-    return with_light(stage, street, PARKING_M)
+multilane = partial(street, limit_mps=14.0, shoulder_m=1.0, several=True)
+"""A straight one-way road of two or three lanes and a narrow shoulder."""
+single_lane = partial(street, limit_mps=14.0, shoulder_m=0.5, light=True)
+"""A straight one-way road of one lane, without room to overtake."""
+bend = partial(multilane, radius_m=(60.0, 100.0))
+"""A one-way road of two or three lanes through a bend."""
+one_each_way = partial(street, limit_mps=13.0, shoulder_m=0.6, oncoming=1)
+two_way = partial(one_each_way, light=True)
+"""A straight road, one lane each way; overtaking uses the oncoming lane."""
+two_way_bend = partial(
+    street, limit_mps=12.0, shoulder_m=1.8, oncoming=1, radius_m=(50.0, 90.0)
+)
+"""A winding road with one lane each way and a paved shoulder."""
+parking_street = partial(
+    street, limit_mps=12.0, shoulder_m=PARKING_M, oncoming=1, light=True
+)
+"""A street with one lane each way and a parking lane on either side."""
 
 
 def parking_bay(stage: Stage) -> Street:
@@ -215,7 +227,7 @@ def parking_bay(stage: Stage) -> Street:
 
 def zebra_street(stage: Stage) -> Street:
     """Lay a two-way street with a crosswalk, and lights at it."""
-    street = _street(stage, Section(limit_mps=13.0), 0.6, oncoming=1)
+    street = one_each_way(stage)
     s = stage.place("crosswalk_m", 55.0, 80.0)
     return with_light(stage, street, 0.6, s)
 
@@ -260,35 +272,12 @@ def with_light(
     return street
 
 
-def _lanes(stage: Stage) -> tuple[int, int]:
-    """Return two or three lanes, and the one in which the ego drives."""
-    lanes = stage.integer("lanes", 2, 3)
-    return lanes, min(stage.integer("ego_lane", 0, lanes - 1), lanes - 1)
-
-
 def _curve(stage: Stage, tightest: float, widest: float) -> tuple[Piece, ...]:
     radius = stage.uniform("radius_m", tightest, widest)
     side = 1.0 if stage.choice("bend", ("left", "right")) == "left" else -1.0
     before, after = BEFORE_M + 30.0 + stage.lead_m, stage.goal_m - stage.lead_m
     after += BEYOND_M - 90.0
     return Piece(before), Piece(radius, side * (60.0 / radius)), Piece(after)
-
-
-def _street(
-    stage: Stage,
-    section: Section,
-    shoulder_m: float,
-    pieces: Sequence[Piece] = (),
-    lane: int = 0,
-    oncoming: int = 0,
-) -> Street:
-    """Lay a road whose lane the ego follows to the goal."""
-    start, pieces = origin(stage), pieces or straight(stage)
-    road = lay_road(stage.network, "r", start, pieces, section, oncoming, shoulder_m)
-    first, *others = road.ahead(lane)
-    legs = [Leg(first, enter_m=BEFORE_M), *(Leg(index) for index in others)]
-    stage.drive(legs, start_speed(stage))
-    return replace(road, lane=lane)
 
 
 # Fast roads: an on-ramp, an off-ramp, a lane that ends.

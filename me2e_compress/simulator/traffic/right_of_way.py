@@ -186,6 +186,11 @@ class User:
     rank: int
     bound: bool
 
+    @property
+    def ends_m(self) -> tuple[float, float]:
+        """Where its front and its rear are."""
+        return self.at_m + self.length_m / 2, self.at_m - self.length_m / 2
+
 
 class RightOfWay:
     """Rules of all junctions of a finished network.
@@ -268,8 +273,7 @@ class RightOfWay:
             for user in users:
                 if user.id == car.id:
                     continue
-                nose, tail = user.at_m + user.length_m / 2, user.at_m
-                tail -= user.length_m / 2
+                nose, tail = user.ends_m
                 if tail > conflict.theirs[1] or (user.bound and nose < 0.0):
                     continue
                 mine = (rank, round(front_m), car.id)
@@ -310,8 +314,7 @@ class RightOfWay:
             if at > first + ENTRY_M:
                 continue
             for user in self._users.get(conflict.other, ()):
-                nose, tail = user.at_m + user.length_m / 2, user.at_m
-                tail -= user.length_m / 2
+                nose, tail = user.ends_m
                 if user.id == 0 or tail > conflict.theirs[0]:
                     continue
                 left = max(conflict.theirs[0] - nose, 0.0)

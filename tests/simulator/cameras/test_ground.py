@@ -12,7 +12,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from me2e_compress.simulator.camera_rig import CAMERA_NAMES, CameraRig, Weather
+from me2e_compress.simulator.camera_rig import (
+    CAMERA_NAMES,
+    CameraName,
+    CameraRig,
+    Weather,
+)
 from me2e_compress.simulator.cameras.ground import GroundTexture, paint_texture
 from me2e_compress.simulator.cameras.renderer import Cameras
 from me2e_compress.simulator.plane_geometry import Roadmap
@@ -206,7 +211,7 @@ def test_at_night_lamps_shine_and_the_rest_is_dark(
 
 @pytest.mark.parametrize("gone", [("BACK",), ("FRONT", "BACK_LEFT")])
 def test_a_dropped_camera_is_black_and_the_others_are_as_ever(
-    see: Eyes, gone: tuple[str, ...]
+    see: Eyes, gone: tuple[CameraName, ...]
 ) -> None:
     whole, images = see(Weather()), see(Weather(dropped=gone))
     for i, name in enumerate(CAMERA_NAMES):
