@@ -239,7 +239,7 @@ SCENARIOS: dict[str, tuple[Callable[..., Any], ...]] = {
     ),
     # another road user appears suddenly
     "BlockedIntersection": (
-        partial(junction, moves=MOVES, lights=True),
+        partial(signal_junction, moves=MOVES, ego_light=None),
         actors.blocked_exit,
     ),
     "DynamicObjectCrossing": (roads.two_way, actors.walker_behind_van),
@@ -251,7 +251,7 @@ SCENARIOS: dict[str, tuple[Callable[..., Any], ...]] = {
     "ParkingCrossingPedestrian": (roads.parking_street, actors.walker_between_cars),
     "StaticCutIn": (roads.multilane, actors.queue_cut_in),
     "VehicleTurningRoute": (
-        partial(junction, moves=TURNS, lights=True),
+        partial(signal_junction, moves=TURNS, ego_light=None),
         actors.cyclists_on_exit,
     ),
     "VehicleTurningRoutePedestrian": (

@@ -78,15 +78,12 @@ def junction(
     arms: Sequence[str] = ARMS,
     lanes: int = 1,
     limit_mps: float = 13.0,
-    lights: bool = False,
 ) -> Crossing:
     """Lay a junction; ``sign`` stands on the ego's arm.
 
     The ego's move is drawn if there are several ``moves``. Without a sign, traffic from
-    its sides gives way. With ``lights`` it has these instead.
+    its sides gives way.
     """
-    if lights:
-        return signal_junction(stage, moves, None)
     move = moves[0] if len(moves) == 1 else stage.choice("move", moves)
     minor = ("left", "right") if sign is None else ("back", "ahead")
     crossing = _crossing(stage, move, arms, lanes, limit_mps, minor)
@@ -137,7 +134,7 @@ FOUND_S = {SignalState.GREEN: (1.0, 6.0), SignalState.RED: (-9.0, -3.0)}
 
 def crosswalk_junction(stage: Stage, moves: Sequence[str]) -> Crossing:
     """Lay a junction with a crosswalk on the arm that the ego turns into."""
-    crossing = junction(stage, moves, lights=True)
+    crossing = signal_junction(stage, moves, None)
     half = crossing.lanes * LANE_WIDTH_M
     places = ((0.5, half), (3.5, half), (3.5, -half), (0.5, -half))
     stage.add_crosswalk([crossing.arm(crossing.move, *at) for at in places])
