@@ -27,7 +27,7 @@ from me2e_compress.metrics.measure import (
 PERCENTS = (50, 90, 99, 100)
 """Percentiles of the latencies of a route's decisions."""
 DIGITS = 6
-"""Digits that files keep of what is not a score."""
+"""Digits that files keep, as the leaderboard does of scores."""
 
 WORDS = {
     InfractionKind.COLLISION_PEDESTRIAN: "collision with a pedestrian",
@@ -148,14 +148,8 @@ class RouteSummary:
 
     def rounded(self) -> Self:
         """Return it with as many digits as files keep."""
-        measured = (
-            *("efficiency", "comfort", "ttc_exposure"),
-            *("smallest_ttc", "smallest_pet", "smallest_distance"),
-            *("bench2drive_efficiency", "bench2drive_smoothness"),
-        )
-        values = {name: getattr(self, name) for name in measured}
-        known = {name: each for name, each in values.items() if each is not None}
-        return replace(self, **{n: round(each, DIGITS) for n, each in known.items()})
+        floats = {k: v for k, v in vars(self).items() if isinstance(v, float)}
+        return replace(self, **{name: round(v, DIGITS) for name, v in floats.items()})
 
 
 POINTS = "points"

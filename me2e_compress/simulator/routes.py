@@ -98,14 +98,13 @@ manifest of its drives: another version makes another route of it."""
 class Route:
     """One route: a scenario type and everything that decides how it unfolds.
 
-    The id, of letters, digits, ``_`` and ``-``, is unique in its manifest; the ability
-    is the first that Bench2Drive counts the type under. The seed decides every
-    parameter that is not given, so editing one changes that one and nothing else.
+    The id, of letters, digits, ``_`` and ``-``, is unique in its manifest. The seed
+    decides every parameter that is not given, so editing one changes that one and
+    nothing else.
     """
 
     id: str
     scenario: str
-    ability: str
     seed: int
     parameters: dict[str, Parameter] = field(default_factory=dict)
 
@@ -114,16 +113,10 @@ class Route:
             raise EvaluationError(
                 f"route id {self.id!r}: only letters, digits, '_' and '-' are allowed"
             )
-        known = SCENARIO_ABILITIES.get(self.scenario)
-        if known is None:
+        if self.scenario not in SCENARIO_ABILITIES:
             raise EvaluationError(
                 f"route {self.id}: no scenario {self.scenario!r}; there are "
                 f"{', '.join(sorted(SCENARIO_ABILITIES))}"
-            )
-        if self.ability not in known:
-            raise EvaluationError(
-                f"route {self.id}: {self.scenario} tests {' and '.join(known)}, "
-                f"not {self.ability!r}"
             )
 
     @property
@@ -132,8 +125,10 @@ class Route:
         return SCENARIO_ABILITIES[self.scenario]
 
     def record(self) -> dict[str, Any]:
-        """Return it as files and digests hold it."""
-        return asdict(self) | GENERATION
+        """Return it as files and digests hold it, with its type's first ability."""
+        own = asdict(self)
+        named = {"id": own.pop("id"), "scenario": own.pop("scenario")}
+        return {**named, "ability": self.abilities[0], **own, **GENERATION}
 
 
 def is_route_id(text: str) -> bool:

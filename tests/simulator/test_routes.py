@@ -17,8 +17,7 @@ from me2e_compress.simulator.routes import (
 )
 
 ROUTES = tuple(
-    Route(f"r{k}", "Accident", "Overtaking", k, {"lanes": 2, "bend": "left"})
-    for k in range(6)
+    Route(f"r{k}", "Accident", k, {"lanes": 2, "bend": "left"}) for k in range(6)
 )
 
 
@@ -96,14 +95,13 @@ def test_a_missing_file_or_folder_is_named(tmp_path: Path) -> None:
         ({"id": "a/b"}, "only letters, digits"),
         ({"id": ""}, "only letters, digits"),
         ({"scenario": "Nothing"}, "no scenario 'Nothing'; there are Accident"),
-        ({"ability": "Merging"}, "Accident tests Overtaking, not 'Merging'"),
     ],
 )
 def test_an_impossible_route_is_refused(given: dict[str, str], words: str) -> None:
-    fields = {"id": "a", "scenario": "Accident", "ability": "Overtaking", **given}
+    fields = {"id": "a", "scenario": "Accident", **given}
 
     with pytest.raises(EvaluationError, match=words):
-        Route(fields["id"], fields["scenario"], fields["ability"], 0)
+        Route(fields["id"], fields["scenario"], 0)
 
 
 def test_picking_all_some_or_named_routes() -> None:

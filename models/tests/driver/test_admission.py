@@ -12,7 +12,6 @@ from me2e_compress.evaluators.highway.driven_frames import propose, seed_of
 from me2e_compress.metrics.episode import Ending, InfractionKind
 from me2e_compress.simulator.plane_geometry import Floats
 from me2e_compress.simulator.routes import (
-    SCENARIO_ABILITIES,
     Route,
     load_routes,
     pick_routes,
@@ -41,7 +40,7 @@ SEED = 77_001
 
 
 def route(scenario: str, seed: int = SEED) -> Route:
-    return Route(f"{scenario}-{seed}", scenario, SCENARIO_ABILITIES[scenario][0], seed)
+    return Route(f"{scenario}-{seed}", scenario, seed)
 
 
 @pytest.mark.parametrize(

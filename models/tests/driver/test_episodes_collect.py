@@ -114,7 +114,7 @@ def test_a_folder_of_another_collection_is_refused(
 def test_no_route_for_evaluation_is_trained_on(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    judged = Route("judged", "T_Junction", "Traffic_Signs", seed_of(3, "T_Junction", 0))
+    judged = Route("judged", "T_Junction", seed_of(3, "T_Junction", 0))
     monkeypatch.setattr(room, "load_routes", lambda: (*load_routes(), judged))
 
     with pytest.raises(TrainingError, match="seed 3 gives route judged"):

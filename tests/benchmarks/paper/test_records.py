@@ -27,7 +27,7 @@ from tests.evaluators.highway.drivers import straight_on
 from tests.study.conftest import IDEAL
 from tests.support.in_process import Here
 
-CRASHED = Route("crashed", "Accident", "Overtaking", 1)
+CRASHED = Route("crashed", "Accident", 1)
 
 ONE = """interval = "types"
 correction = "holm"

@@ -22,10 +22,10 @@ from me2e_compress.driving.policies import Driver
 from me2e_compress.simulator.routes import Route
 from models.driver.expert.blind import Blind
 
-CROSSING = Route("crossing", "DynamicObjectCrossing", "Emergency_Brake", 1)
-PARKED = Route("parked", "ParkedObstacle", "Overtaking", 1)
-GREEN = Route("green", "VanillaSignalizedTurnEncounterGreenLight", "Traffic_Signs", 1)
-EXIT = Route("exit", "HighwayExit", "Merging", 1)
+CROSSING = Route("crossing", "DynamicObjectCrossing", 1)
+PARKED = Route("parked", "ParkedObstacle", 1)
+GREEN = Route("green", "VanillaSignalizedTurnEncounterGreenLight", 1)
+EXIT = Route("exit", "HighwayExit", 1)
 ROUTES = (CROSSING, PARKED, GREEN, EXIT)
 
 

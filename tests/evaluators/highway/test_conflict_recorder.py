@@ -140,7 +140,7 @@ def collision(ego: Ego, other: Actor) -> Infraction:
         *(ego.speed_mps, other.id, other.kind),
     )
     world = SimpleNamespace(
-        route=Route("r", "HighwayExit", "Merging", 1),
+        route=Route("r", "HighwayExit", 1),
         path=straight(),
         progress_m=10.0,
         events=(event,),

@@ -129,7 +129,7 @@ def test_a_file_that_is_corrupt_or_of_another_evaluation_is_driven_again(
         ({"drive": replace(TRACED, frame_limit_s=5.0)}, "frame_limit_s"),
         ({"routes": (PARKED, EXIT)}, "routes"),
         (
-            {"routes": (Route("crossing", "HighwayExit", "Merging", 1), PARKED)},
+            {"routes": (Route("crossing", "HighwayExit", 1), PARKED)},
             "routes_sha256",
         ),
     ],

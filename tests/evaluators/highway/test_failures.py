@@ -32,7 +32,7 @@ BLIND = "models.driver.expert:Blind"
 @pytest.mark.usefixtures("here")
 def test_a_killed_run_goes_on_with_nothing_lost_or_repeated(tmp_path: Path) -> None:
     manifest, folder = tmp_path / "routes.json", tmp_path / "results"
-    routes = tuple(Route(f"exit_{k}", "HighwayExit", "Merging", k) for k in range(4))
+    routes = tuple(Route(f"exit_{k}", "HighwayExit", k) for k in range(4))
     save_routes(routes, manifest)
     program = (
         "import sys; from me2e_compress import EvaluateOptions, evaluate;"

@@ -4,7 +4,7 @@ from me2e_compress.driving.latency import FixedLatency
 from me2e_compress.evaluators import Drive
 from me2e_compress.evaluators.highway.runner import drive
 from me2e_compress.metrics.episode import Infraction, InfractionKind
-from me2e_compress.simulator.routes import SCENARIO_ABILITIES, Parameter, Route
+from me2e_compress.simulator.routes import Parameter, Route
 from me2e_compress.simulator.scenarios.roads import two_way
 from me2e_compress.simulator.scene import Control
 from me2e_compress.simulator.traffic.stage import Stage
@@ -21,8 +21,7 @@ ENDS_ONLY = (
 def route_of(
     scenario: str = "Accident", seed: int = 0, **parameters: Parameter
 ) -> Route:
-    ability = SCENARIO_ABILITIES[scenario][0]
-    return Route("test", scenario, ability, seed, dict(parameters))
+    return Route("test", scenario, seed, dict(parameters))
 
 
 def empty_road(stage: Stage) -> None:

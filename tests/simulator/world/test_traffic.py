@@ -37,8 +37,8 @@ def proposed(scenario: str, seed: int = 3) -> Route:
 @pytest.fixture(scope="module")
 def stages() -> dict[str, Stage]:
     return {
-        name: stage_of(Route("test", name, abilities[0], number))
-        for number, (name, abilities) in enumerate(SCENARIO_ABILITIES.items())
+        name: stage_of(Route("test", name, number))
+        for number, name in enumerate(SCENARIO_ABILITIES)
     }
 
 
@@ -198,7 +198,7 @@ def test_a_third_of_the_routes_has_weather() -> None:
     assert len(kinds) * 3 == len(DRAWN)
     for kind in set(kinds):
         assert drawn_weather(kind, 0.0, 0) != drawn_weather(kind, 1.0, 0)
-    night = Route("test", "Accident", "Overtaking", 1, {"weather": "night"})
+    night = Route("test", "Accident", 1, {"weather": "night"})
 
     assert World(night).weather.night > 0.5
 
