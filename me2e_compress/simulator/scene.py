@@ -214,6 +214,4 @@ class PixelClass(IntEnum):
     PEDESTRIAN = 9
     STATIC = 10
     """Cones, barriers."""
-    TRAFFIC_LIGHT = 11
-    TRAFFIC_SIGN = 12
     EGO = 13

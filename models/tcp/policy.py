@@ -111,7 +111,7 @@ class TcpPolicy:
 
     def plan(self, observation: Observation) -> PedalsAndWheel:
         """Return the controls, or both heads fused."""
-        feeds = self.graph.feeds(observation)
+        feeds = self.graph.inputs.feeds(observation)
         outputs = self.graph.session.run(feeds)
         if self.heads == "beta":
             control = likely_action(outputs["mu_branches"], outputs["sigma_branches"])
