@@ -96,9 +96,9 @@ class EerScale:
     add up to 1, offset and span have the units %, %, ratio and joules.
     """
 
-    weights: tuple[float, float, float, float]
-    offset: tuple[float, float, float, float]
-    span: tuple[float, float, float, float]
+    weights: tuple[float, ...]
+    offset: tuple[float, ...]
+    span: tuple[float, ...]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -191,7 +191,7 @@ def scale_of(tables: Mapping[str, Floats]) -> EerScale:
     offset, span = rows.min(axis=0), np.ptp(rows, axis=0)
     span = np.where(span > 0.0, span, 1.0)  # a constant measure has weight 0
     weights = critic_weights((rows - offset) / span)
-    return EerScale(_four(weights), _four(offset), _four(span))
+    return EerScale(*(tuple(each.tolist()) for each in (weights, offset, span)))
 
 
 def critic_weights(rows: Floats) -> Floats:
@@ -232,8 +232,3 @@ def critic_weights(rows: Floats) -> Floats:
             f"rows {int(varies.sum())} vary, and none tells what another does not"
         )
     return content / total
-
-
-def _four(values: Floats) -> tuple[float, float, float, float]:
-    one, two, three, four = values.tolist()
-    return one, two, three, four

@@ -10,7 +10,6 @@ import platform
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any
 
 from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.driving.latency import LatencySource
@@ -24,7 +23,7 @@ from me2e_compress.runtime.session import Session
 from me2e_compress.study.cells import EXACT
 from me2e_compress.study.condition import Condition
 from me2e_compress.study.definition import Study, Variant
-from me2e_compress.study.prepared import PreparedVariant
+from me2e_compress.study.prepared import PlanFidelity, PreparedVariant
 from me2e_compress.study.workspace import Workspace
 from me2e_compress.workflows.result import Listener
 
@@ -161,58 +160,6 @@ def _scale(study: Study, traces: Mapping[str, LatencyTrace]) -> float:
             f"{wanted_s} s"
         )
     return 1e6 * wanted_s / median_us
-
-
-@dataclass(frozen=True)
-class PlanFidelity:
-    """The plan of a variant compared with the baseline's on held-out frames: m, dB."""
-
-    plan_mean: Measure
-    plan_max: Measure
-    plan_sqnr: Measure
-    frames: int = 0
-
-    @classmethod
-    def unknown(cls, reason: str) -> "PlanFidelity":
-        """Return the result for a variant that was not compared."""
-        metres = Measure(None, "m", reason)
-        return cls(metres, metres, Measure(None, "dB", reason))
-
-
-@dataclass(frozen=True)
-class VariantOutcome:
-    """A variant's latency percentiles, plan and size, without drives."""
-
-    prepared: PreparedVariant
-    latency_ms: Mapping[int, Measure]
-    fidelity: PlanFidelity
-
-    @property
-    def name(self) -> str:
-        """Name of the variant."""
-        return self.prepared.variant.name
-
-    @property
-    def size_mb(self) -> Measure:
-        """Size of the model with its weights, 1e6 bytes."""
-        size = self.prepared.size_bytes
-        if size is None:
-            return Measure(None, "MB", self.prepared.failure or "no model")
-        return Measure(size / 1e6, "MB")
-
-    def to_json(self) -> dict[str, Any]:
-        """Return all facts; everything timed is below the key `latency`."""
-        prepared, latencies = self.prepared, self.latency_ms.items()
-        return {
-            "name": self.name,
-            "policy": prepared.variant.policy,
-            "pipeline": prepared.pipeline or None,
-            "model_sha256": prepared.sha256,
-            "weights": prepared.weights,
-            "size": self.size_mb,
-            "fidelity": self.fidelity,
-            "latency": {f"p{percent}": each for percent, each in latencies},
-        }
 
 
 def judge(

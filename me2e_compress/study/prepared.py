@@ -4,6 +4,7 @@ import hashlib
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 from google.protobuf.message import DecodeError
 
@@ -16,6 +17,7 @@ from me2e_compress.errors import GraphError, Me2eError, StudyError
 from me2e_compress.evaluators.highway.drivers import OnnxDriver
 from me2e_compress.graph.modules.module_map import ModuleMap
 from me2e_compress.manager.recipe import to_text
+from me2e_compress.metrics.measure import Measure
 from me2e_compress.registry import documents
 from me2e_compress.runtime.providers import CPU, PROVIDERS
 from me2e_compress.study.definition import Study, Variant
@@ -30,8 +32,27 @@ from me2e_compress.workflows.result import Listener
 
 
 @dataclass(frozen=True)
+class PlanFidelity:
+    """The plan of a variant compared with the baseline's on held-out frames: m, dB."""
+
+    plan_mean: Measure
+    plan_max: Measure
+    plan_sqnr: Measure
+    frames: int = 0
+
+    @classmethod
+    def unknown(cls, reason: str) -> "PlanFidelity":
+        """Return the result for a variant that was not compared."""
+        metres = Measure(None, "m", reason)
+        return cls(metres, metres, Measure(None, "dB", reason))
+
+
+NOT_COMPARED = PlanFidelity.unknown("not compared")
+
+
+@dataclass(frozen=True)
 class PreparedVariant:
-    """A variant whose driver is ready.
+    """A variant whose driver is ready; what it costs, without drives.
 
     Attributes:
         source: Name of the file that passes were applied to.
@@ -42,6 +63,7 @@ class PreparedVariant:
             unknown.
         metadata: What adapter and map state of plan and state, as metadata.
         known: Which inputs are state and which output is the plan, and from where.
+        latency_ms: By percent; empty until it was timed, as it was not compared.
     """
 
     variant: Variant
@@ -55,6 +77,33 @@ class PreparedVariant:
     weights: str = ""
     metadata: Mapping[str, str] = field(default_factory=dict)
     known: str = ""
+    latency_ms: Mapping[int, Measure] = field(default_factory=dict)
+    fidelity: PlanFidelity = NOT_COMPARED
+
+    @property
+    def name(self) -> str:
+        """Name of the variant."""
+        return self.variant.name
+
+    @property
+    def size_mb(self) -> Measure:
+        """Size of the model with its weights, 1e6 bytes."""
+        if self.size_bytes is None:
+            return Measure(None, "MB", self.failure or "no model")
+        return Measure(self.size_bytes / 1e6, "MB")
+
+    def to_json(self) -> dict[str, Any]:
+        """Return all facts; everything timed is below the key `latency`."""
+        return {
+            "name": self.name,
+            "policy": self.variant.policy,
+            "pipeline": self.pipeline or None,
+            "model_sha256": self.sha256,
+            "weights": self.weights,
+            "size": self.size_mb,
+            "fidelity": self.fidelity,
+            "latency": {f"p{percent}": e for percent, e in self.latency_ms.items()},
+        }
 
 
 def prepare_all(

@@ -18,7 +18,6 @@ from me2e_compress.study.drive_record import DriveRecord
 from me2e_compress.study.file import load_study
 from me2e_compress.study.outcome import (
     Clock,
-    VariantOutcome,
     judge,
     this_machine,
     time_all,
@@ -71,10 +70,14 @@ def run_study(
         # plans and drives of every variant are compared with the baseline's
         study, clock = cells.study, cells.clock
         baseline = next(each for each in prepared if each.variant == study.reference)
-        variants = list[VariantOutcome]()
-        for each in prepared:
-            fidelity = judge(study, baseline, each, listener)
-            variants.append(VariantOutcome(each, clock.latencies(each), fidelity))
+        variants = [
+            replace(
+                each,
+                latency_ms=clock.latencies(each),
+                fidelity=judge(study, baseline, each, listener),
+            )
+            for each in prepared
+        ]
         drives = tuple(
             drive
             for condition in study.conditions

@@ -15,7 +15,7 @@ from me2e_compress.study.cells import MISSING, anew_cell, estimate_cell, measure
 from me2e_compress.study.condition import Condition
 from me2e_compress.study.definition import Study
 from me2e_compress.study.drive_record import Comparison, DriveRecord, compared
-from me2e_compress.study.outcome import VariantOutcome
+from me2e_compress.study.prepared import PreparedVariant
 from me2e_compress.workflows.result import Result, Shown, plain
 
 SCORES = tuple(each.name for each in COLUMNS)
@@ -37,7 +37,7 @@ class StudyResult(Result):
     """
 
     study: Study
-    variants: tuple[VariantOutcome, ...]
+    variants: tuple[PreparedVariant, ...]
     drives: tuple[DriveRecord, ...]
     device_scale: float
     machine: str
@@ -83,18 +83,17 @@ class StudyResult(Result):
         """Comparisons of the pairs that the study names."""
         return compared(self.study.pairs, self.drives, self.study.seed)
 
-    def variant(self, name: str) -> VariantOutcome:
+    def variant(self, name: str) -> PreparedVariant:
         """Return a variant by its name."""
         return next(each for each in self.variants if each.name == name)
 
     def shown(self) -> Shown:
         """Return the title with numbers, every table, what failed, a busy machine."""
         study, (driven, whole) = self.study, self.coverage
-        prepared = [each.prepared for each in self.variants]
         alerts = (
             *(
-                f"variant {each.variant.name} was left out: {each.failure}"
-                for each in prepared
+                f"variant {each.name} was left out: {each.failure}"
+                for each in self.variants
                 if each.failure
             ),
             *(
@@ -109,7 +108,7 @@ class StudyResult(Result):
             f" {counted(len(study.conditions), 'condition')} on {driven} of"
             f" {counted(whole, 'route')}",
             chain.from_iterable(self.tables_by_section.values()),
-            [f"{each.variant.name}: {each.known}" for each in prepared if each.known],
+            [f"{each.name}: {each.known}" for each in self.variants if each.known],
             alerts,
         )
 

@@ -82,8 +82,7 @@ def test_a_preview_is_named_so_in_every_title_and_the_headline(page: str) -> Non
 
 def test_the_checkpoint_stands_where_a_variant_was_made(found: StudyResult) -> None:
     first, *others = found.variants
-    of_file = replace(first.prepared, weights="a.pth")
-    first = replace(first, prepared=of_file)
+    first = replace(first, weights="a.pth")
     named = replace(found, variants=(first, *others))
 
     assert "; weights: a.pth</code>" in study_page(named).html()

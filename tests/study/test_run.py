@@ -96,7 +96,7 @@ def test_a_model_has_size_latency_and_fidelity_and_a_driver_has_none(
     assert blind.size_mb.value is None
     assert blind.size_mb.reason == "no model"
     assert blind.latency_ms[50].value is None
-    assert slow.size_mb.value == Path(slow.prepared.variant.policy).stat().st_size / 1e6
+    assert slow.size_mb.value == Path(slow.variant.policy).stat().st_size / 1e6
     assert slow.latency_ms[50].value == pytest.approx(200.0)
     assert again.latency_ms[50].value is not None
     assert fast.latency_ms[99].reason == "needs 100 samples, has 20"

@@ -19,7 +19,7 @@ from me2e_compress.metrics.measure import Estimate, Measure
 from me2e_compress.metrics.scores import Scores
 from me2e_compress.study.cells import estimate_cell, measure_cell, number
 from me2e_compress.study.drive_record import DriveRecord
-from me2e_compress.study.outcome import VariantOutcome
+from me2e_compress.study.prepared import PreparedVariant
 from me2e_compress.study.study_result import StudyResult
 
 INK, MUTED, RULE = "#1d2127", "#6b7480", "#d9dde3"
@@ -174,14 +174,14 @@ def _costs(outcome: StudyResult, places: Mapping[str, float]) -> Iterator[Panel]
     """Yield the panels of what is known without a drive; none of what nobody has."""
     baseline = outcome.variant(outcome.study.baseline)
 
-    def bar(of: VariantOutcome, measure: Measure, its: Measure, form: str) -> Mark:
+    def bar(of: PreparedVariant, measure: Measure, its: Measure, form: str) -> Mark:
         words = measure_cell(measure, form).text
         if of is not baseline and measure.value is not None and its.value:
             words += f" ({100.0 * measure.value / its.value:.0f} %)"
         colour = _colour(outcome, of.name)
         return Mark(places[of.name], colour, words, measure.value)
 
-    def plan(of: VariantOutcome) -> Mark:
+    def plan(of: PreparedVariant) -> Mark:
         mean, most = of.fidelity.plan_mean, of.fidelity.plan_max.value
         words = measure_cell(mean, ".2f").text
         if most is not None:

@@ -85,7 +85,7 @@ def study_page(
     """Return the page of a comparison; ``sections`` stand before how it was made."""
     # what the variants were made of, and how they were timed
     variants = list[tuple[str, str, str | None]]()
-    for prepared in (each.prepared for each in outcome.variants):
+    for prepared in outcome.variants:
         made_of = prepared.source or prepared.variant.policy
         if prepared.pipeline:
             made_of = f"{made_of} → {prepared.pipeline}"
