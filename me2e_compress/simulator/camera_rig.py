@@ -111,11 +111,6 @@ class CameraRig:
         return np.array([(c.x_m, c.y_m, CAMERA_HEIGHT_M) for c in CAMERAS])
 
     @cached_property
-    def translations(self) -> Floats:
-        """[6, 3] t: a point p of the ego frame is R p + t in the camera frame."""
-        return np.asarray(-np.einsum("kij,kj->ki", self.rotations, self.positions))
-
-    @cached_property
     def lidar2img(self) -> npt.NDArray[np.float32]:
         """[6, 4, 4] ego frame to pixels, as nuScenes-style models expect it.
 
@@ -123,8 +118,10 @@ class CameraRig:
         depth in metres and (u, v) the continuous pixel (column, row).
         """
         matrices = np.zeros((len(CAMERAS), 4, 4))
+        # a point p of the ego frame is R (p - position) in the camera frame
+        moved = -np.einsum("kij,kj->ki", self.rotations, self.positions)
         matrices[:, :3, :3] = self.intrinsics @ self.rotations
-        matrices[:, :3, 3] = np.einsum("kij,kj->ki", self.intrinsics, self.translations)
+        matrices[:, :3, 3] = np.einsum("kij,kj->ki", self.intrinsics, moved)
         matrices[:, 3, 3] = 1.0
         return matrices.astype(np.float32)
 

@@ -51,11 +51,6 @@ class Lane:
     right: LaneMarking
     shoulder: bool = False
 
-    @cached_property
-    def headings(self) -> Floats:
-        """[N] radians, of the chord after each point (the last repeats)."""
-        return polyline_headings(self.centre)
-
 
 @dataclass(frozen=True, eq=False)
 class Roadmap:

@@ -211,15 +211,6 @@ def test_tcps_strip_has_its_seams_where_the_published_one_has() -> None:
         ),
         ({"mean": [1, 2, 3]}, "mean and std belong together"),
         ({"mean": [1, 2, 3], "std": [1, 0, 1]}, "std is zero"),
-        (
-            {
-                "cameras": ["FRONT", "BACK"],
-                "stitch": True,
-                "camera_size": [9, 16],
-                "crop": [[0, 0, 5, 5], [0, 0, 5, 6]],
-            },
-            "the crops have different heights",
-        ),
     ],
 )
 def test_a_wrong_table_is_refused(table: dict[str, Any], words: str) -> None:

@@ -158,8 +158,6 @@ class ImageInput(BaseModel):
                         f"crop {[left, top, right, bottom]} does not lie in {rows} rows"
                         f" of {columns} columns"
                     )
-            if self.stitch and len({bottom - top for _, top, _, bottom in crops}) > 1:
-                raise ValueError("stitch: the crops have different heights")
         return self
 
     @property

@@ -47,7 +47,7 @@ def test_left_of_the_car_is_left_ahead_and_right_behind() -> None:
 )
 def test_lidar2img_is_k_times_r_and_t(camera: int, point: tuple[float, ...]) -> None:
     rig = CameraRig(128, 224)
-    seen = rig.rotations[camera] @ point + rig.translations[camera]
+    seen = rig.rotations[camera] @ (point - rig.positions[camera])
     expected = rig.intrinsics[camera] @ seen
     found = (rig.lidar2img[camera].astype(float) @ (*point, 1.0))[:3]
     np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-2)
