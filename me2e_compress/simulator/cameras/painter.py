@@ -149,17 +149,6 @@ class Faces:
     distances: Floats
 
 
-NO_FACES = Faces(
-    cameras=np.zeros(0, np.intp),
-    polygons=[],
-    colours=np.zeros((0, 3)),
-    lamps=np.zeros(0, np.bool_),
-    details=np.zeros(0, np.bool_),
-    places=np.zeros((0, 2)),
-    distances=np.zeros(0),
-)
-
-
 @dataclass(frozen=True, eq=False)
 class Painter:
     """Turns solids into the polygons that a rig sees."""
@@ -167,9 +156,7 @@ class Painter:
     rig: CameraRig
 
     def faces(self, solids: list[Solid], ego: Ego) -> Faces:
-        """Cull, order, cut at the near plane and project."""
-        if not solids:
-            return NO_FACES
+        """Cull, order, cut at the near plane and project one solid or more."""
         # which solids each camera may see, in painting order
         x, y, heading = np.array([s.pose for s in solids]).T
         cos, sin = np.cos(ego.heading), np.sin(ego.heading)

@@ -255,8 +255,9 @@ class Cameras:
         self._ground.paint(images, self.texture, scene.ego)
         self._atmosphere.veil(images)
         # solids from far to near, with light and fog face by face
-        faces = self._painter.faces(solids_of(scene), scene.ego)
-        draw(images, faces, self._atmosphere.tint(faces))
+        if solids := solids_of(scene):
+            faces = self._painter.faces(solids, scene.ego)
+            draw(images, faces, self._atmosphere.tint(faces))
         # rain on the lens, exposure, noise and failed cameras
         self._sensor.expose(images, scene.time_us)
         return images
