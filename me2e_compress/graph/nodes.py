@@ -189,9 +189,6 @@ NATIVE = FLOATS | {
 }
 """All element types that numpy itself computes with."""
 
-CLOSE = 1e-4
-"""How near a constant must be to the textbook's, relative: 0.7071 is 1/sqrt 2."""
-
 
 def maker(value: ir.Value | None, *op_types: str) -> ir.Node | None:
     """Return the node that makes a value, if it is one of these standard operators."""
@@ -278,11 +275,6 @@ def overflow(numbers: Numbers, stored: Array) -> bool:
     """Return whether numbers are too large for the type of a stored array."""
     limit = np.finfo(stored.dtype.name).max
     return not np.all(np.abs(numbers) <= limit)
-
-
-def is_close(value: float | None, expected: float) -> bool:
-    """Return whether a constant is the textbook's, within :data:`CLOSE`."""
-    return value is not None and abs(value - expected) <= CLOSE * abs(expected)
 
 
 def constant_values(model: ir.Model) -> frozenset[ir.Value]:

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from me2e_compress.graph import provenance, rank_of
+from me2e_compress.graph import rank_of
 from me2e_compress.passes.fuse_basic import FuseBasic
 from tests.passes.small import (
     apply,
@@ -13,7 +13,6 @@ from tests.passes.small import (
     fuse_basic,
     normal,
     ops,
-    opset,
     preserved,
     read,
 )
@@ -151,50 +150,6 @@ def test_the_weight_of_a_constant_node_is_written_anew() -> None:
 def test_constants_in_a_row_are_combined(op: str) -> None:
     text = f"g (float[2,4] x) => (float[2,4] y) {{ a = {op}(x, p) y = {op}(q, a) }}"
     fuse_basic(text, [op], p=np.abs(normal(4)), q=np.abs(normal(1)))
-
-
-NORM = """
-g (float[2,5,8] x) => (float[2,5,8] y) {
-    mean = ReduceMean<axes = [-1]>(x)
-    d = Sub(x, mean)
-    sq = Pow(d, two)
-    var = ReduceMean<axes = [-1]>(sq)
-    safe = Add(var, eps)
-    root = Sqrt(safe)
-    n = Div(d, root)
-    s = Mul(n, gamma)
-    y = Add(s, beta)
-}
-"""
-NORM_WEIGHTS: dict[str, Any] = {"two": np.float32(2), "eps": np.float32(1e-5)}
-
-
-def test_layer_normalization() -> None:
-    after = fuse_basic(
-        NORM,
-        ["LayerNormalization"],
-        **NORM_WEIGHTS,
-        gamma=normal(8),
-        beta=normal(8),
-    )
-    node = after.graph.node(0)
-    assert node.attributes.get_float("epsilon", 0.0) == pytest.approx(1e-5)
-    past = provenance.read(node)
-    assert past is not None
-    assert set(past.origins) == {f"n{index}" for index in range(9)}
-
-
-@pytest.mark.parametrize(
-    ("version", "note"),
-    [
-        (17, "fused: layer normalizations (1)"),
-        (13, "left 1: LayerNormalization needs opset 17"),
-    ],
-)
-def test_a_layer_normalization_is_counted_once(version: int, note: str) -> None:
-    text, scale = opset(version) + NORM, {"gamma": normal(8), "beta": normal(8)}
-    model = read(text, **NORM_WEIGHTS, **scale)
-    assert apply(FuseBasic(), model).notes == (note,)
 
 
 def test_nothing_is_fused_into_a_body() -> None:

@@ -25,7 +25,6 @@ from me2e_compress.graph.rewrite.fusion import (
     Fusion,
     Kit,
     fuse,
-    needs_opset,
 )
 from me2e_compress.graph.rewrite.pattern import (
     Match,
@@ -34,7 +33,6 @@ from me2e_compress.graph.rewrite.pattern import (
     either,
     match,
     op,
-    product,
     var,
 )
 
@@ -54,9 +52,7 @@ __all__ = [
     "fuse",
     "lift_constants",
     "match",
-    "needs_opset",
     "op",
-    "product",
     "put",
     "remove_dead",
     "remove_node",

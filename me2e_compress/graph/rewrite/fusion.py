@@ -161,15 +161,6 @@ class Fusion:
     where: Callable[[Match, Facts], bool] | None = None
 
 
-def needs_opset(what: str, version: int) -> Callable[[Match, Facts], str | None]:
-    """Build the check that an operator is there in the model's opset."""
-
-    def check(match: Match, facts: Facts) -> str | None:
-        return None if facts.opset >= version else f"{what} needs opset {version}"
-
-    return check
-
-
 @dataclasses.dataclass
 class Fused:
     """What was fused, and what was left and why; each counted.

@@ -26,65 +26,9 @@ from me2e_compress.graph.nodes import (
     Array,
     Numbers,
     array_of,
-    is_close,
     is_read,
     is_standard,
-    maker,
-    scalar_of,
-    sole_maker,
 )
-
-# A value as a product: a constant times other values.
-
-
-@dataclasses.dataclass
-class Factors:
-    """``scale`` times the factors, each as often as it is listed.
-
-    Attributes:
-        scale: the product of the constant factors, all of one element.
-        factors: the other factors, in order.
-        nodes: the nodes that multiply, the last one first.
-    """
-
-    scale: float
-    factors: list[ir.Value]
-    nodes: list[ir.Node]
-
-
-def factors_of(value: ir.Value) -> Factors | None:
-    """Take Mul, Div by a constant and Pow by 2 or 3 apart, down to the leaves.
-
-    Inner products are opened only where nothing else reads them. None if nothing
-    multiplies.
-    """
-    result, waiting = Factors(1.0, [], []), list[ir.Value | None]([value])
-    while waiting:
-        factor = waiting.pop()
-        number = None if factor is None else scalar_of(factor)
-        if factor is None or number is not None:
-            result.scale *= 1.0 if number is None else number
-            continue
-        make = maker if factor is value else sole_maker
-        node = make(factor, "Mul", "Div", "Pow")
-        kind = "" if node is None else node.op_type
-        left, right = (None, None) if node is None else node.inputs[:2]
-        second = scalar_of(right)
-        # A Mul multiplies both inputs, a Div and a Pow the first one
-        if kind == "Mul":
-            waiting += (right, left)
-        elif kind == "Div" and second:
-            result.scale /= second
-            waiting.append(left)
-        elif kind == "Pow" and left is not None and second in (2.0, 3.0):
-            result.factors += [left] * int(second or 0)
-        else:
-            result.factors.append(factor)
-            continue
-        if node is not None:
-            result.nodes.append(node)
-    return result if result.nodes else None
-
 
 _IN_ANY_ORDER = frozenset(
     {"Add", "And", "Equal", "Max", "Mean", "Min", "Mul", "Or", "Sum", "Xor"}
@@ -98,10 +42,6 @@ class Pattern(abc.ABC):
     @abc.abstractmethod
     def ways(self, value: ir.Value) -> Iterator["Way"]:
         """Walk the ways in which a value may be this: what must match then."""
-
-    def agree(self, known: ir.Value, value: ir.Value) -> bool:
-        """Return whether a value may stand beside another that is this already."""
-        return known is value
 
     def roots(self) -> frozenset[tuple[str, str]]:
         """List the domain and type of the operators that can end the expression.
@@ -145,26 +85,18 @@ class Variable(Pattern):
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Constant(Pattern):
-    """A weight; one element near a number, or one element at all, if asked."""
+    """A weight, of one element if asked."""
 
-    close_to: float | None = None
     scalar: bool = False
     floating: bool = True
 
     def ways(self, value: ir.Value) -> Iterator[Way]:
-        """Look at the array, which is copied only where its number counts."""
+        """Accept a weight whose type and size fit."""
         if self.floating and value.dtype not in FLOATS:
             return
         array = array_of(value)
-        if array is None or (self.scalar and array.size != 1):
-            return
-        if self.close_to is None or is_close(scalar_of(value), self.close_to):
+        if array is not None and not (self.scalar and array.size != 1):
             yield Way()
-
-    def agree(self, known: ir.Value, value: ir.Value) -> bool:
-        """Accept any value for a given number: files hold many ones and halves."""
-        given = self.close_to is not None and any(True for _ in self.ways(value))
-        return given or known is value
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -227,44 +159,17 @@ class Either(Pattern):
             yield Way(((option, value),))
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class Product(Pattern):
-    """A number times some factors, in whatever order and grouping it is written."""
-
-    factors: tuple[Pattern, ...]
-    scale: float
-
-    def roots(self) -> frozenset[tuple[str, str]]:
-        """List what multiplies."""
-        return frozenset({("", "Mul"), ("", "Div")})
-
-    def ways(self, value: ir.Value) -> Iterator[Way]:
-        """Take the value apart; try the factors in each order."""
-        product = factors_of(value)
-        if product is None or len(product.factors) != len(self.factors):
-            return
-        if not is_close(product.scale, self.scale):
-            return
-        nodes = tuple(product.nodes)
-        inner = tuple(node.outputs[0] for node in nodes)
-        for factors in itertools.permutations(product.factors):
-            yield Way(tuple(zip(self.factors, factors, strict=True)), nodes, inner)
-
-
 def var(name: str, *, computed: bool = False) -> Variable:
     """Build the pattern of any value, or of any value that is not a constant."""
     return Variable(name, computed)
 
 
-def constant(
-    close_to: float | None = None, *, scalar: bool = False, floating: bool = True
-) -> Constant:
+def constant(*, scalar: bool = False, floating: bool = True) -> Constant:
     """Build the pattern of a weight, of floats unless ``floating`` is False.
 
-    ``close_to`` is the number that it holds, within a relative 1e-4; ``scalar`` weights
-    have one element.
+    ``scalar`` weights have one element.
     """
-    return Constant(close_to, scalar or close_to is not None, floating)
+    return Constant(scalar, floating)
 
 
 def op(
@@ -288,15 +193,6 @@ def op(
 def either(*options: Pattern) -> Either:
     """Build the pattern of one of several expressions, tried in this order."""
     return Either(options)
-
-
-def product(*factors: Pattern, scale: float = 1.0) -> Product:
-    """Build the pattern of ``scale`` times some factors.
-
-    It matches Mul, Div by a constant and Pow by 2 or 3, nested in any way; the
-    constants, one element each, must multiply to ``scale``.
-    """
-    return Product(factors, scale)
 
 
 # The search for an expression in a graph.
@@ -369,7 +265,7 @@ def _solve(
         return match if closed else None
     (pattern, value), rest = goals[0], goals[1:]
     if pattern in match.values:
-        if not pattern.agree(match.values[pattern], value):
+        if match.values[pattern] is not value:
             return None
         return _solve(rest, match, inner)
     values = {**match.values, pattern: value}

@@ -9,7 +9,7 @@ from me2e_compress.graph import array_of
 from me2e_compress.graph.nodes import maker
 from me2e_compress.graph.rewrite import Fusion, fuse
 from me2e_compress.passes.base import Context, Pass, PassResult
-from me2e_compress.passes.fuse_basic import activations, constants, weights
+from me2e_compress.passes.fuse_basic import constants, weights
 
 __all__ = ["FuseBasic"]
 
@@ -18,12 +18,13 @@ __all__ = ["FuseBasic"]
 class FuseBasic(Pass):
     """Fuse patterns of standard operators into fewer standard operators.
 
-    Given:   Conv -> BatchNormalization -> Relu;  x * 0.5 * (1 + Erf(x / sqrt 2))
+    Given:   Conv -> BatchNormalization -> Relu;  MatMul(x, w) + b of rank 2
 
-    Result:  Conv -> Relu;  Gelu(x) where the opset has it
+    Result:  Conv -> Relu;  Gemm(x, w, b)
 
-    Outputs are equal up to rounding. A residual Conv + Add stays, in the form that
-    TensorRT and onnxruntime fuse with the next activation.
+    Outputs are equal up to rounding. Gelu and LayerNormalization stay decomposed where
+    they are: runtimes find them. A residual Conv + Add stays, in the form that TensorRT
+    and onnxruntime fuse with the next activation.
     """
 
     name: ClassVar[str] = "fuse-basic"
@@ -50,7 +51,5 @@ class FuseBasic(Pass):
         return (
             *weights.FUSIONS,
             constants.GEMM,
-            activations.LAYER_NORM,
-            *activations.GELUS,
             *constants.FUSIONS,
         )

@@ -6,9 +6,14 @@ from typing import NamedTuple
 import onnx_ir as ir
 
 from me2e_compress.errors import PreconditionError
-from me2e_compress.graph.nodes import maker, permutation_of, sole_reader
+from me2e_compress.graph.nodes import (
+    maker,
+    permutation_of,
+    scalar_of,
+    sole_maker,
+    sole_reader,
+)
 from me2e_compress.graph.rewrite import bypass
-from me2e_compress.graph.rewrite.pattern import factors_of
 from me2e_compress.graph.shapes import static_shape
 from me2e_compress.operators import OWN_DOMAIN, FusedCall
 from me2e_compress.operators.kernels.kernel import ATTENTION
@@ -88,11 +93,17 @@ def _found(node: ir.Node, softmax: ir.Node) -> _Attention | None:
 
 
 def _unscaled(value: ir.Value | None) -> tuple[ir.Value | None, float]:
-    """Return what is multiplied by a number, and the number."""
-    product = None if value is None else factors_of(value)
-    if product is None or len(product.factors) != 1:
-        return value, 1.0
-    return product.factors[0], product.scale
+    """Return what is multiplied by numbers, one after the other, and their product."""
+    scale, node = 1.0, maker(value, "Mul", "Div")
+    while node is not None:
+        factor, number = node.inputs[0], scalar_of(node.inputs[1])
+        if number is None and node.op_type == "Mul":
+            number, factor = scalar_of(node.inputs[0]), node.inputs[1]
+        if not number:
+            break
+        scale = scale * number if node.op_type == "Mul" else scale / number
+        value, node = factor, sole_maker(factor, "Mul", "Div")
+    return value, scale
 
 
 def _checked(attention: _Attention, softmax: ir.Node) -> _Shape:

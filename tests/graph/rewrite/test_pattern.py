@@ -16,7 +16,6 @@ from me2e_compress.graph.rewrite import (
     fuse,
     match,
     op,
-    product,
     var,
 )
 from tests.passes.small import ops, read
@@ -85,22 +84,13 @@ def test_what_others_read_is_not_inner_unless_it_is_shared() -> None:
     [
         (constant(), [[1.0, 2.0, 3.0]], True),
         (constant(scalar=True), [[1.0, 2.0, 3.0]], False),
-        (constant(0.7071), 0.70712, True),
-        (constant(0.7071), 0.708, False),
-        (constant(0.0), 1e-9, False),
+        (constant(scalar=True), 0.5, True),
     ],
 )
 def test_constants(pattern: Pattern, value: Any, matches: bool) -> None:
     weights = {"c": np.array(value, np.float32)}
     found = last(op("Mul", X, pattern), "y = Mul(c, x)", **weights)
     assert (found is not None) == matches
-
-
-def test_a_given_number_may_stand_in_several_places() -> None:
-    one = constant(1.0)
-    lines = ("a = Add(x, p)", "y = Div(q, a)")
-    weights = dict.fromkeys("pq", np.ones(1, np.float32))
-    assert last(op("Div", one, op("Add", X, one)), *lines, **weights) is not None
 
 
 def test_a_variable_can_ask_for_what_is_computed() -> None:
@@ -144,33 +134,6 @@ def test_more_operands_attributes_and_domains(
 ) -> None:
     weights = CLIP if "low" in line else {}
     assert (last(pattern, line, **weights) is not None) == matches
-
-
-HALF, TWO = np.float32(0.5), np.float32(2)
-
-
-@pytest.mark.parametrize(
-    "lines",
-    [
-        ("a = Mul(x, z)", "y = Mul(a, half)"),
-        ("a = Mul(half, z)", "y = Mul(a, x)"),
-        ("a = Div(z, two)", "y = Mul(x, a)"),
-        ("a = Mul(x, z)", "y = Div(a, two)"),
-    ],
-)
-def test_a_product_in_any_order_and_grouping(lines: tuple[str, ...]) -> None:
-    found = last(product(X, Y, scale=0.5), *lines, half=HALF, two=TWO)
-    assert found is not None
-    assert {found[X].name, found[Y].name} == {"x", "z"}
-    cube, three = product(X, X, X, scale=0.5), np.float32(3)  # powers are factors
-    lines = ("a = Pow(x, three)", "y = Mul(a, half)")
-    assert last(cube, *lines, half=HALF, three=three) is not None
-
-
-def test_a_product_that_others_read_is_one_factor() -> None:
-    model = graph_of("a = Mul(x, z)", "y = Mul(a, half)", outputs="y a", half=HALF)
-    assert match(product(X, Y, scale=0.5), model.graph[1]) is None
-    assert match(product(X, scale=0.5), model.graph[1]) is not None
 
 
 def test_a_node_whose_other_outputs_are_read_ends_nothing() -> None:
