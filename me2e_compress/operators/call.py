@@ -44,7 +44,8 @@ class FusedCall:
         if node.graph is None:
             raise GraphError(f"node {node.name} is not in a graph")
         self.node, self.opset, self.by = node, opset, by
-        self.compiled, self.sources = compiled, (node,)
+        self.compiled = compiled
+        self.sources: tuple[ir.Node, ...] = (node,)
         self._where: ir.Graph | ir.Function = node.graph
         self.names = names_in(self._where) if names is None else names
         self._stem = node.name or str(node.outputs[0].name)

@@ -84,24 +84,18 @@ class Kit:
         inputs: Sequence[ir.Value | None],
         attributes: Mapping[str, int | float | str | Sequence[int]] | None = None,
         *,
-        behind: Sequence[ir.Node] = (),
         domain: str = "",
     ) -> None:
-        """Replace all that matched, and a row of nodes ``behind``, by one operator."""
-        *sources, last = (self.match.root, *behind)
-        sources += self.match.nodes[1:]
-        by, more = self.by, attributes
+        """Replace all that matched by one operator, of any domain."""
         put(
-            last,
+            self.match.root,
             op_type,
             inputs,
-            by=by,
-            sources=sources,
-            attributes=more,
+            by=self.by,
+            sources=self.match.nodes[1:],
+            attributes=attributes,
             domain=domain,
         )
-        for node in reversed(behind[:-1]):
-            remove_node(node)
 
     def add(
         self,

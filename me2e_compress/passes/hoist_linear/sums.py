@@ -331,7 +331,7 @@ class _Search:
                 self.written.append(self.call.transpose(rows, order))
             else:
                 self.written.append(self.call.view(rows, (*shape[:-1], self.columns)))
-            return self.written[-1:]
+            return [self.written[-1]]
 
         return Form(source_form.macs, source_form.cost + (not owned), write)
 
