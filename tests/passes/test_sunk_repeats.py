@@ -137,22 +137,6 @@ DIFFERS = {
 }
 
 
-def test_flat_rows_are_regrouped_behind_what_is_computed_once() -> None:
-    body = (
-        "t = Tile(x, times) r = Reshape(t, flat) v = Tile(position, times)"
-        " p = Reshape(v, flat) a = Add(r, p) e = Tanh(a) y = Add(e, flats)"
-    )
-    text = graph_of(
-        f"(float[1,1,{CELLS},{WIDE}] x, float[1,1,{CELLS},{WIDE}] position)"
-        f" => (float[{CAMERAS * CELLS},{WIDE}] y)",
-        body,
-    )
-    model = hoist(text, **{n: each for n, each in GIVEN.items() if n != "position"})
-
-    assert rows_of(model, "Tanh") == {1}
-    assert ops(model)[-3:] == ["Expand", "Reshape", "Add"]
-
-
 def test_an_exponent_of_another_type_stays_repeated() -> None:
     text = graph_of(
         f"(float[1,1,{CELLS},{WIDE}] x, int64[1,1,{CELLS},{WIDE}] n)"

@@ -326,33 +326,13 @@ def _combined(node: ir.Node, shape: tuple[int, ...]) -> _Plan | None:
         same = value.dtype == node.outputs[0].dtype and not holds_numbers(value)
         repeated = repeated_axes(value) if same else None
         if repeated is not None and repeated.large != given:
-            return _split(node, repeated, shape)
+            return None
         small = given if repeated is None else repeated.small
         operands.append(_Operand(value, small, repeated))
     if all(each.repeated is None for each in operands):
         return None
     small = np.broadcast_shapes(*(each.shape for each in operands))
     return _Plan(tuple(operands), small, shape)
-
-
-def _split(
-    node: ir.Node, repeated: RepeatedAxes, shape: tuple[int, ...]
-) -> _Plan | None:
-    """Plan the same where an axis repeats in part: the other varies behind it alone."""
-    operands: list[_Operand] = []
-    for value in node.inputs:
-        given = static_shape(value)
-        if value is None or given is None:
-            return None
-        mine = repeated_axes(value) if given == shape else None
-        if mine is not None and mine.large == repeated.large:
-            operands.append(_Operand(value, mine.small, mine))
-        elif repeated.large[-len(given) :] == shape[-len(given) :] or given == ():
-            operands.append(_Operand(value, given))
-        else:
-            return None
-    small = np.broadcast_shapes(*(each.shape for each in operands))
-    return _Plan(tuple(operands), small, repeated.large)
 
 
 def _joined(node: ir.Node, shape: tuple[int, ...]) -> _Plan | None:
