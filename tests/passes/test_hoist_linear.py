@@ -165,34 +165,11 @@ def test_new_nodes_know_their_module_and_every_origin() -> None:
     assert origins == [{"product"}, {"bias"}, {"many", "product", "bias"}]
 
 
-def test_a_decomposed_layer_norm_of_repeated_rows_is_computed_once() -> None:
-    model = hoist(
-        graph_of(
-            f"(float[1,{QUERIES},{WIDE}] x) => (float[{CAMERAS},{QUERIES},16] y)",
-            "many = Expand(x, cameras)  mean = ReduceMean<axes = [-1]>(many)"
-            " centred = Sub(many, mean)  square = Pow(centred, two)"
-            " variance = ReduceMean<axes = [2]>(square)  safe = Add(variance, tiny)"
-            " deviation = Sqrt(safe)  normal = Div(centred, deviation)"
-            " scaled = Mul(normal, gamma)  y = MatMul(scaled, w)",
-        ),
-        cameras=integers(CAMERAS, QUERIES, WIDE), two=normal(1)[0] * 0 + 2,
-        tiny=normal(1)[0] * 0 + 1e-5, gamma=normal(WIDE), w=normal(WIDE, 16),
-    )  # fmt: skip
-    assert products(model) == QUERIES * WIDE * 16
-    assert ops(model)[-1] == "Expand"
-    assert ops(model).count("Expand") == 1
-
-
 REPEATED = "b = Expand(a, many)  c = Reshape(b, flat)"
 ALONG_AXIS = {
     "Softmax": ("y = Softmax<axis = 1>(c)", 32),
     "LogSoftmax": ("y = LogSoftmax<axis = 1>(c)", 32),
     "LayerNormalization": ("y = LayerNormalization<axis = 1>(c, g)", 32),
-    "ReduceL2": ("y = ReduceL2<axes = [1]>(c)", 1),
-    "ReduceMax": ("y = ReduceMax<axes = [1]>(c)", 1),
-    "ReduceMean": ("y = ReduceMean<axes = [1]>(c)", 1),
-    "ReduceMin": ("y = ReduceMin<axes = [1]>(c)", 1),
-    "ReduceSum": ("y = ReduceSum(c, one)", 1),
 }
 
 
@@ -212,21 +189,6 @@ def test_rows_that_were_flattened_behind_their_repetition(op_type: str) -> None:
     model = hoist(text, **shapes, **given)
 
     assert of(op_type, model).outputs[0].shape == (1, 20, width)
-
-
-def test_rows_that_got_an_axis_between_two_repetitions() -> None:
-    body = (
-        "b = Expand(a, s1)  c = Unsqueeze(b, zero)  d = Expand(c, s2)"
-        " y = ReduceSum(d, three)"
-    )
-    text = graph_of("(float[1,1,16] a) => (float[8,20,3,1] y)", body)
-
-    model = hoist(
-        text, s1=integers(20, 3, 1), zero=integers(0), s2=integers(8, 20, 1, 1),
-        three=integers(3),
-    )  # fmt: skip
-
-    assert of("ReduceSum", model).outputs[0].shape == (1, 1, 1, 1)
 
 
 def test_an_axis_of_a_softmax_may_not_be_negative_before_opset_11() -> None:
@@ -270,21 +232,6 @@ def test_a_scale_for_every_row_is_not_moved_with_one_row(
     model = hoist(text, many=integers(20, 6, 32), g=normal(*scale))
 
     assert of("LayerNormalization", model).outputs[0].shape == (20, rows, 32)
-
-
-@pytest.mark.parametrize("attributes", ["alpha = 0.5", "beta = 3.0", "transB = 1"])
-def test_a_gemm_of_repeated_rows_keeps_its_attributes(attributes: str) -> None:
-    text = graph_of(
-        "(float[1,5,4,32] a) => (float[400,32] y)",
-        f"{REPEATED} y = Gemm<{attributes}>(c, w, v)",
-    )
-
-    model = hoist(
-        text, many=integers(20, 5, 4, 32), flat=integers(400, 32),
-        w=normal(32, 32), v=normal(32),
-    )  # fmt: skip
-
-    assert products(model) == 5 * 4 * 32 * 32
 
 
 def copies(count: int) -> ir.Model:

@@ -27,7 +27,6 @@ from me2e_compress.graph import array_of, is_standard, macs, rank_of, static_sha
 from me2e_compress.graph.nodes import (
     Array,
     holds_numbers,
-    integers_at,
     is_read,
     permutation_of,
     sole_reader,
@@ -191,11 +190,6 @@ UNARY = frozenset(
 BINARY = frozenset({"Add", "Div", "Max", "Min", "Mul", "Pow", "Sub"})
 """Element-wise operators of two operands, which broadcast."""
 
-REDUCTIONS = frozenset(
-    {"ReduceL2", "ReduceMax", "ReduceMean", "ReduceMin", "ReduceSum"}
-)
-"""Operators that reduce every row to one number where their axis is the last."""
-
 ALONG_AXIS = frozenset({"LayerNormalization", "LogSoftmax", "Softmax"})
 """Operators that map every row by itself where their axis is the last."""
 
@@ -211,17 +205,10 @@ def is_row_wise(node: ir.Node, opset: int) -> bool:
         return False
     if node.op_type in UNARY or node.op_type in BINARY:
         return True
-    # Reductions and normalizations must work along the last axis
-    rank = rank_of(node.outputs[0]) or 0
-    if node.op_type in REDUCTIONS:
-        axes = integers_at(node, "axes", 1)
-        return bool(node.attributes.get_int("keepdims", 1)) and axes in (
-            [-1],
-            [rank - 1],
-        )
+    # Normalizations must work along the last axis
     if node.op_type not in ALONG_AXIS:
         return False
-    softmax = node.op_type != "LayerNormalization"
+    rank, softmax = rank_of(node.outputs[0]) or 0, node.op_type != "LayerNormalization"
     if not softmax and rank_of(node.inputs[1]) != 1:
         return False
     default = 1 if softmax and opset < SOFTMAX_OPSET else -1
@@ -247,15 +234,11 @@ class _Operand:
 
 @dataclasses.dataclass(frozen=True)
 class _Plan:
-    """A node on other operands: the shape of its result, and that of all repeats.
-
-    ``flat`` is the shape of what a Gemm makes, which knows two axes only.
-    """
+    """A node on other operands: the shape of its result, and that of all repeats."""
 
     operands: tuple[_Operand, ...]
     small: tuple[int, ...]
     large: tuple[int, ...]
-    flat: tuple[int, ...] | None = None
 
 
 def before_repeat(call: FusedCall) -> bool | None:
@@ -281,7 +264,8 @@ def _plan(node: ir.Node, opset: int) -> _Plan | None:
     value = node.inputs[0] if node.inputs else None
     if node.op_type == "Transpose" and value is not None:
         return _turned(node, value)
-    if value is None or not (is_product(node) or is_row_wise(node, opset)):
+    layer = node.op_type != "Gemm" and is_product(node)
+    if value is None or not (layer or is_row_wise(node, opset)):
         return None
     if node.op_type in BINARY:
         return _combined(node, shape)
@@ -297,12 +281,7 @@ def _plan(node: ir.Node, opset: int) -> _Plan | None:
     small, large = (
         (*sizes[:-1], shape[-1]) for sizes in (repeated.small, repeated.large)
     )
-    if node.op_type != "Gemm":
-        return _Plan((operand,), small, large)
-    rows = math.prod(small[:-1])
-    repeated = dataclasses.replace(repeated, small=(rows, given[-1]))
-    operand = _Operand(value, repeated.small, repeated)
-    return _Plan((operand,), small, large, (rows, shape[-1]))
+    return _Plan((operand,), small, large)
 
 
 def _turned(node: ir.Node, value: ir.Value) -> _Plan | None:
@@ -383,7 +362,7 @@ def _pays(node: ir.Node, plan: _Plan) -> bool:
     result, item = node.outputs[0], item_bytes(node.outputs[0])
     before, moved = work(node), math.prod(plan.small) * item
     products = (macs(node) or 0) * math.prod(plan.small) / math.prod(plan.large)
-    after = 1.0 + (plan.flat is not None) + products / MACS_PER_NODE
+    after = 1.0 + products / MACS_PER_NODE
     for operand in plan.operands:
         moved += math.prod(operand.shape) * item
         if operand.repeated is None:
@@ -418,10 +397,6 @@ def _rewrite(call: FusedCall, plan: _Plan) -> None:
     call.sources = (node,)
     if node.op_type in ALONG_AXIS:
         attributes["axis"] = rank - 1
-    elif node.op_type in REDUCTIONS and "axes" in attributes:
-        attributes["axes"] = [rank - 1]
-    elif node.op_type in REDUCTIONS:
-        inputs[1] = call.integers([rank - 1])
     new = call.add(node.op_type, inputs, attributes)
     # Repeat the result, unless its readers see no difference
     axes = [
