@@ -12,7 +12,6 @@ from me2e_compress.graph.nodes import (
     Array,
     graphs_of,
     input_at,
-    is_read,
     is_standard,
     nodes_in,
     opset_of,
@@ -24,6 +23,7 @@ from me2e_compress.graph.rewrite.edits import (
     put,
     remove_dead,
     remove_node,
+    remove_unread,
     replace_value,
     value_names,
 )
@@ -35,7 +35,7 @@ ROUNDS = 16
 
 @dataclasses.dataclass(frozen=True)
 class Facts:
-    """What a check may ask for besides the match.
+    """What may be asked for besides the match.
 
     Attributes:
         opset: the version of ONNX's own operators.
@@ -141,17 +141,14 @@ class Fusion:
     Attributes:
         name: what the report counts it as.
         pattern: the expression.
-        rewrite: edits the graph; or returns a reason and leaves it alone, where only
-            the computed result tells (weights that would overflow).
-        check: returns the reason why a match may not be fused, which is reported;
-            None if it may.
+        rewrite: edits the graph; or leaves it alone and returns the reason, which is
+            reported.
         where: whether a match is one at all; what it leaves out is not counted.
     """
 
     name: str
     pattern: Pattern
     rewrite: Callable[[Match, Kit], str | None]
-    check: Callable[[Match, Facts], str | None] | None = None
     where: Callable[[Match, Facts], bool] | None = None
 
 
@@ -192,7 +189,7 @@ def fuse(model: ir.Model, fusions: Sequence[Fusion], *, by: str) -> Fused:
     pattern wants for itself. Shapes must be inferred; bodies are rewritten too, all in
     place. ``by`` is the pass's name.
     """
-    table: dict[tuple[str, str], list[Fusion]] = {}
+    table: dict[str, list[Fusion]] = {}
     for fusion in fusions:
         for root in sorted(fusion.pattern.roots()):
             table.setdefault(root, []).append(fusion)
@@ -220,14 +217,13 @@ class _Run:
     facts: Facts
     by: str
     names: set[str]
-    table: Mapping[tuple[str, str], Sequence[Fusion]]
+    table: Mapping[str, Sequence[Fusion]]
 
     def round(self, body: ir.Graph, refused: Counter[str]) -> Counter[str]:
         """Try every node once; count what was done, and enter what was refused."""
         done: Counter[str] = Counter()
         for node in list(body):
-            domain = "" if is_standard(node) else node.domain
-            for fusion in self.table.get((domain, node.op_type), ()):
+            for fusion in self.table.get(node.op_type, ()):
                 if node.graph is body and self._attempt(fusion, node, body, refused):
                     done[fusion.name] += 1
                     break
@@ -239,18 +235,9 @@ class _Run:
         matched = match(fusion.pattern, node)
         if matched is None or (fusion.where and not fusion.where(matched, self.facts)):
             return False
-        reason = fusion.check(matched, self.facts) if fusion.check else None
-        if reason is None:
-            reason = fusion.rewrite(matched, Kit(body, matched, self.by, self.names))
+        reason = fusion.rewrite(matched, Kit(body, matched, self.by, self.names))
         if reason is not None:
             refused[reason] += 1
             return False
-        # The nodes of the match that nothing reads any more go, readers first
-        while dead := [
-            each
-            for each in matched.nodes
-            if each.graph is body and not any(map(is_read, each.outputs))
-        ]:
-            for each in dead:
-                remove_node(each)
+        remove_unread(each.outputs[0] for each in matched.nodes)
         return True

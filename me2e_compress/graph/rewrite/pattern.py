@@ -8,13 +8,13 @@
 An expression is matched from its last operator upwards. One object stands for one
 value wherever it occurs, so the two ``x`` must be the same. Operands of commutative
 operators match in either order. What an inner operator makes must be read inside the
-expression alone, in the same graph, and be no output, unless it is ``shared``.
+expression alone, in the same graph, and be no output.
 """
 
 import abc
 import dataclasses
 import itertools
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from typing import TypeAlias
 
 import numpy as np
@@ -27,7 +27,7 @@ from me2e_compress.graph.nodes import (
     Numbers,
     array_of,
     is_read,
-    is_standard,
+    maker,
 )
 
 _IN_ANY_ORDER = frozenset(
@@ -43,8 +43,8 @@ class Pattern(abc.ABC):
     def ways(self, value: ir.Value) -> Iterator["Way"]:
         """Walk the ways in which a value may be this: what must match then."""
 
-    def roots(self) -> frozenset[tuple[str, str]]:
-        """List the domain and type of the operators that can end the expression.
+    def roots(self) -> frozenset[str]:
+        """List the types of the operators that can end the expression.
 
         Raises:
             GraphError: it does not end in an operator, so nothing could be replaced.
@@ -106,27 +106,19 @@ class OperatorPattern(Pattern):
     types: tuple[str, ...]
     inputs: tuple[Pattern, ...] = ()
     more: bool = False
-    shared: bool = False
-    where: Callable[[ir.Node], bool] | None = None
-    domain: str = ""
 
-    def roots(self) -> frozenset[tuple[str, str]]:
+    def roots(self) -> frozenset[str]:
         """List its own types."""
-        return frozenset((self.domain, op_type) for op_type in self.types)
+        return frozenset(self.types)
 
     def ways(self, value: ir.Value) -> Iterator[Way]:
         """Look at the maker; try the operands in each order that means the same."""
-        node = value.producer()
-        if node is None or node.op_type not in self.types or value.index() != 0:
+        node = maker(value, *self.types)
+        if node is None or value.index() != 0:
             return
-        if self.domain != ("" if is_standard(node) else node.domain):
-            return
-        if self.where is not None and not self.where(node):
-            return
-        inner = () if self.shared else (value,)
         for operands in self._orders(node):
             goals = tuple(zip(self.inputs, operands, strict=True))
-            yield Way(goals, (node,), inner)
+            yield Way(goals, (node,), (value,))
 
     def _orders(self, node: ir.Node) -> Iterator[tuple[ir.Value, ...]]:
         given = list(node.inputs)
@@ -137,7 +129,7 @@ class OperatorPattern(Pattern):
         operands = tuple(value for value in given if value is not None)
         if not len(operands) == len(given) == len(self.inputs):
             return
-        if node.op_type in _IN_ANY_ORDER and is_standard(node):
+        if node.op_type in _IN_ANY_ORDER:
             yield from itertools.permutations(operands)
         else:
             yield operands
@@ -149,7 +141,7 @@ class Either(Pattern):
 
     options: tuple[Pattern, ...]
 
-    def roots(self) -> frozenset[tuple[str, str]]:
+    def roots(self) -> frozenset[str]:
         """Unite those of the options."""
         return frozenset().union(*(option.roots() for option in self.options))
 
@@ -173,21 +165,14 @@ def constant(*, scalar: bool = False, floating: bool = True) -> Constant:
 
 
 def op(
-    types: str | tuple[str, ...],
-    *inputs: Pattern,
-    more: bool = False,
-    shared: bool = False,
-    where: Callable[[ir.Node], bool] | None = None,
-    domain: str = "",
+    types: str | tuple[str, ...], *inputs: Pattern, more: bool = False
 ) -> OperatorPattern:
     """Build the pattern of the first output of an operator, or of one of several.
 
-    ``more`` operands may follow that the pattern does not look at. Others may read what
-    a ``shared`` one makes: it stays for them. ``where`` says what else must hold of the
-    node, of its attributes say. The domain is that of ONNX by default.
+    ``more`` operands may follow that the pattern does not look at.
     """
     names = (types,) if isinstance(types, str) else types
-    return OperatorPattern(names, inputs, more, shared, where, domain)
+    return OperatorPattern(names, inputs, more)
 
 
 def either(*options: Pattern) -> Either:
@@ -280,11 +265,11 @@ def _solve(
 
 
 def _is_inside(value: ir.Value, match: Match) -> bool:
-    maker = value.producer()
+    node = value.producer()
     return (
-        maker is not None
-        and maker.graph is match.root.graph
+        node is not None
+        and node.graph is match.root.graph
         and not value.is_graph_output()
-        and not any(is_read(other) for other in maker.outputs[1:])
+        and not any(is_read(other) for other in node.outputs[1:])
         and all(reader in match.nodes for reader in value.consumers())
     )

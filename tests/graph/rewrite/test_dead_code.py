@@ -64,8 +64,8 @@ ONCE = Fusion(
     "Relu of Relu", op("Relu", op("Relu", X)), lambda m, kit: kit.put("Relu", [m[X]])
 )
 DROP = Fusion(
-    "Mul of Neg",
-    op("Mul", X, op("Neg", Y, shared=True)),
+    "Mul",
+    op("Mul", X, Y),
     lambda m, kit: kit.put("Abs", [m[X]]),
 )
 

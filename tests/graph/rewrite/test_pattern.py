@@ -7,7 +7,6 @@ import pytest
 
 from me2e_compress.errors import GraphError
 from me2e_compress.graph.rewrite import (
-    Facts,
     Fusion,
     Match,
     Pattern,
@@ -70,13 +69,11 @@ def test_a_wrong_first_choice_is_taken_back() -> None:
 TWICE = op("Relu", op("Relu", X))
 
 
-def test_what_others_read_is_not_inner_unless_it_is_shared() -> None:
-    shared = op("Relu", op("Relu", X, shared=True))
+def test_what_others_read_is_not_inner() -> None:
     read_too = graph_of("a = Relu(x)", "y = Relu(a)", "b = Neg(a)", outputs="y b")
     given = graph_of("a = Relu(x)", "y = Relu(a)", outputs="y a")
     for model in (read_too, given):
         assert match(TWICE, model.graph[1]) is None
-        assert match(shared, model.graph[1]) is not None
 
 
 @pytest.mark.parametrize(
@@ -111,11 +108,7 @@ def test_alternatives_are_tried_in_order_and_told_apart() -> None:
     assert with_cast[X].name == without[X].name == "x"
 
 
-CLIP, OVER = {"low": np.float32(0)}, "y = Softmax<axis = {}>(x)"
-
-
-def of_axis_1(node: ir.Node) -> bool:
-    return node.attributes.get_int("axis", -1) == 1
+CLIP = {"low": np.float32(0)}
 
 
 @pytest.mark.parametrize(
@@ -123,15 +116,10 @@ def of_axis_1(node: ir.Node) -> bool:
     [
         (op("Clip", X), "y = Clip(x, low)", False),
         (op("Clip", X, more=True), "y = Clip(x, low)", True),
-        (op("Softmax", X, where=of_axis_1), OVER.format(1), True),
-        (op("Softmax", X, where=of_axis_1), OVER.format(0), False),
         (op("Relu", X), "y = own.Relu(x)", False),
-        (op("Relu", X, domain="own"), "y = own.Relu(x)", True),
     ],
 )
-def test_more_operands_attributes_and_domains(
-    pattern: Pattern, line: str, matches: bool
-) -> None:
+def test_more_operands_and_domains(pattern: Pattern, line: str, matches: bool) -> None:
     weights = CLIP if "low" in line else {}
     assert (last(pattern, line, **weights) is not None) == matches
 
@@ -150,17 +138,14 @@ def test_a_pattern_ends_in_an_operator() -> None:
 ONCE = Fusion("Relu of Relu", TWICE, lambda m, kit: kit.put("Relu", [m[X]]))
 
 
-def test_what_a_check_refuses_is_counted_with_its_reason() -> None:
-    def check(found: Match, facts: Facts) -> str | None:
-        return f"no Relu at opset {facts.opset}"
-
-    refused = dataclasses.replace(ONCE, check=check)
+def test_what_a_rewrite_refuses_is_counted_with_its_reason() -> None:
+    refused = dataclasses.replace(ONCE, rewrite=lambda match, kit: "no Relu today")
     model = graph_of("a = Relu(x)", "y = Relu(a)")
 
     found = fuse(model, [refused], by="test")
 
     assert ops(model) == ["Relu", "Relu"]
-    assert found.notes() == ("left 1: no Relu at opset 17",)
+    assert found.notes() == ("left 1: no Relu today",)
 
 
 def test_a_fusion_may_complete_another() -> None:
