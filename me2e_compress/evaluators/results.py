@@ -19,8 +19,6 @@ from me2e_compress.simulator.routes import VERSION, check_version, is_route_id
 
 MANIFEST = "evaluation.json"
 ROUTES = "routes"
-DEFAULTS = {"drive_on": False}
-"""What a manifest of 0.2 may say, and today's lacks."""
 MEASURED = "latency_samples"
 """Key of a manifest: number of samples that latencies were drawn from. It is
 derived data, and not compared."""
@@ -68,7 +66,7 @@ class ResultsFolder:
         # all that decides the results must agree
         both = folder.made_by, made_by
         for key in sorted({*made_by, *folder.made_by} - {MEASURED}):
-            old, new = (each.get(key, DEFAULTS.get(key)) for each in both)
+            old, new = (each.get(key) for each in both)
             if old != new:
                 raise EvaluationError(
                     f"{path}: holds the results of another evaluation: its {key} is "

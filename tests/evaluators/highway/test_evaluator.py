@@ -145,17 +145,6 @@ def test_results_of_another_evaluation_are_not_mixed(
 
 
 @pytest.mark.usefixtures("here")
-def test_results_that_drove_on_after_collisions_are_of_old(results: Path) -> None:
-    file = results / "evaluation.json"
-    manifest = json.loads(file.read_text())
-    file.write_text(json.dumps({**manifest, "drive_on": False}))
-    driven(results, TWO)
-    file.write_text(json.dumps({**manifest, "drive_on": True}))
-    with pytest.raises(EvaluationError, match="its drive_on is true, this one's false"):
-        driven(results, TWO)
-
-
-@pytest.mark.usefixtures("here")
 def test_measured_latency_drives_alone_and_warns(tmp_path: Path) -> None:
     warnings = list[str]()
 
