@@ -148,8 +148,12 @@ class RouteSummary:
 
     def rounded(self) -> Self:
         """Return it with as many digits as files keep."""
-        floats = {k: v for k, v in vars(self).items() if isinstance(v, float)}
-        return replace(self, **{name: round(v, DIGITS) for name, v in floats.items()})
+        floats: dict[str, Any] = {
+            name: round(value, DIGITS)
+            for name, value in vars(self).items()
+            if isinstance(value, float)
+        }
+        return replace(self, **floats)
 
 
 POINTS = "points"

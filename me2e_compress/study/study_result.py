@@ -74,10 +74,6 @@ class StudyResult(Result):
         slower = f"a device {scale:.3g} times slower"
         return condition.described("this machine" if scale == 1.0 else slower)
 
-    def under(self, condition: Condition) -> tuple[DriveRecord, ...]:
-        """Return the drives under one condition."""
-        return tuple(each for each in self.drives if each.condition == condition.name)
-
     @cached_property
     def pairs(self) -> tuple[Comparison, ...]:
         """Comparisons of the pairs that the study names."""

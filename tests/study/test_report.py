@@ -126,7 +126,8 @@ def test_the_answer_has_a_row_a_variant_and_a_mark_a_drive(found: StudyResult) -
     ):
         assert drawn.count(f">{words}</text>") == count, words
     # a drive that was not made, and one condition alone
-    row = tuple(replace(each, scores=None) for each in found.under(IDEAL))
+    ideal = [each for each in found.drives if each.condition == IDEAL.name]
+    row = tuple(replace(each, scores=None) for each in ideal)
     study = replace(found.study, conditions=(IDEAL,))
     assert (
         str(answer(replace(found, study=study, drives=row))).count(">not driven<") == 4
@@ -231,7 +232,8 @@ def test_a_scoreboard_has_a_row_a_drive(found: StudyResult) -> None:
         "ideal: latency none; slow: latency fps:2. 2 of 220 routes."
     )
     # its numbers are those of the drives
-    scores = found.under(IDEAL)[3].scores
+    ideal = [each for each in found.drives if each.condition == IDEAL.name]
+    scores = ideal[3].scores
     assert scores is not None
     blind, _, again, row, *_ = board.rows
     assert row[1] == estimate_cell(scores.driving_score)

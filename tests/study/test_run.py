@@ -65,7 +65,7 @@ def test_the_scores_are_those_of_the_results(found: StudyResult, folder: Path) -
     folder = folder / "results" / "fast.slow"
     episodes = tuple(ResultsFolder.open(folder).episodes().values())
 
-    drive = found.under(SLOW)[-1]
+    drive = [each for each in found.drives if each.condition == SLOW.name][-1]
 
     assert drive.scores == score(episodes, 220)
     assert drive.scores is not None
@@ -75,7 +75,8 @@ def test_the_scores_are_those_of_the_results(found: StudyResult, folder: Path) -
 def test_the_same_model_does_not_differ_and_the_baseline_is_not_compared(
     found: StudyResult,
 ) -> None:
-    blind, slow, again, fast = (each.difference for each in found.under(IDEAL))
+    ideal = [each for each in found.drives if each.condition == IDEAL.name]
+    blind, slow, again, fast = (each.difference for each in ideal)
 
     assert slow is None
     assert again is not None

@@ -22,7 +22,6 @@ from me2e_compress.driving.input_sources import (
     InputSource,
     Observed,
 )
-from me2e_compress.driving.input_sources.sources import NavigationCommand
 from me2e_compress.errors import FORMER, EvaluationError
 from me2e_compress.graph.recurrence import RECURRENT, declared_pairs
 from me2e_compress.registry import documents
@@ -153,14 +152,6 @@ class Feed(BaseModel):
         """Name the sources with their element counts, for messages."""
         parts = ((p.source.name, p.source.value(seen).size) for p in self.parts)
         return ", ".join(f"{name} {size}" for name, size in parts)
-
-    @property
-    def command(self) -> NavigationCommand | None:
-        """The navigation command, if the feed is nothing else."""
-        source = self.parts[0].source
-        if len(self.parts) > 1 or not isinstance(source, NavigationCommand):
-            return None
-        return source
 
 
 Contract: TypeAlias = Literal["img", "lidar2img", "can_bus", "command", "timestamp"]

@@ -206,14 +206,10 @@ class NavigationCommand(InputSource):
 
     def value(self, seen: Observed) -> Array:
         """Return int64 [], or float32 [classes]."""
-        number = self.number(seen.observation.command)
+        number = self.numbers[seen.observation.command]
         if not self.one_hot:
             return np.asarray(number, np.int64)
         return np.asarray(np.eye(self.one_hot)[number], np.float32)
-
-    def number(self, command: int) -> int:
-        """Return the model's number of a command 0 to 5."""
-        return self.numbers[command]
 
 
 @dataclass(frozen=True)
