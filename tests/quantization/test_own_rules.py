@@ -168,7 +168,7 @@ def test_a_target_that_knows_no_costs_keeps_everything() -> None:
     [
         ({A, B, C}, 0.0),  # made and read in int8
         ({B}, 1.0),  # quantized for its reader
-        ({A}, 2.0),  # dequantized for its readers
+        ({A}, 4.0),  # dequantized for each of its readers
         ({A, B}, 2.0),  # dequantized for one of them
         (set(), 0.0),
     ],
