@@ -10,29 +10,13 @@ from me2e_compress.driving.policies import POLICIES
 from me2e_compress.graph.modules.module_map import ModuleMap
 from me2e_compress.passes.base import Context
 from me2e_compress.workflows import checks
-from tests import profiles
+from tests.support import profiles
+from tests.support.command import cli, command, dense, files
+from tests.support.in_process import here, short
+from tests.support.nets import DRIVER, DRIVER_MAP
+from tests.support.stand_in import weights
 
-DRIVER = """
-<ir_version: 9, opset_import: ["" : 17]>
-driver (float[1,4] camera) => (float[1,4] plan) {
-    ["/backbone/Relu"] features = Relu(camera)
-    ["/occ_head/Sigmoid"] occupancy = Sigmoid(features)
-    ["/plan_head/Add"] plan = Add(features, occupancy)
-}
-"""
-
-DRIVER_MAP = """
-[modules.backbone]
-role = "feature"
-optional = ["backbone"]
-[modules.occ]
-role = "prediction"
-optional = ["occ_head"]
-[modules.planner]
-role = "prediction"
-optional = ["plan_head"]
-"""
-
+__all__ = ["cli", "command", "dense", "files", "here", "short", "weights"]
 
 profiles.register()
 # the cheapest driver, which tests alone know by this name

@@ -100,7 +100,7 @@ def without(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     """What fails without each extra: modules, public names, `--help` of commands."""
     cases = tmp_path_factory.mktemp("bare") / "cases.json"
     cases.write_text(json.dumps(CASES))
-    script = Path(__file__).with_name("blocked_imports.py")
+    script = Path(__file__).parent / "support" / "blocked_imports.py"
     done = subprocess.run(
         [sys.executable, script, cases],
         capture_output=True,

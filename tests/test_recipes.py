@@ -21,9 +21,9 @@ from me2e_compress.graph.modules.module_map import ModuleMap
 from me2e_compress.manager import PassManager, recipe
 from me2e_compress.passes import Context, Pass, PassResult
 from me2e_compress.runtime.session import Session, replay, run_once
-from tests.installed import install
-from tests.nets import net
-from tests.stand_in import OUTPUTS, record_driver, write_model
+from tests.support.installed import install
+from tests.support.nets import net
+from tests.support.stand_in import OUTPUTS, record_driver, write_model
 
 
 @dataclass(frozen=True)

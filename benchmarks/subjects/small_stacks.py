@@ -19,7 +19,7 @@ from models.tests.tcp.small import small_spec as tcp_spec
 from models.tests.tcp.small import small_tcp
 from models.tests.uniad.small import small_frames, small_spec, small_uniad
 from models.tests.vad.sizes import SIZES
-from tests.frames import record
+from tests.support.frames import record
 
 OPSET = 17
 

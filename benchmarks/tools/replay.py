@@ -28,9 +28,9 @@ from pathlib import Path
 
 from benchmarks.tools.masks import masked
 from me2e_compress.shipped.drivers import SHIPPED
-from tests.frames import record
 from tests.fuzz.exact.drawing import draw
 from tests.fuzz.exact.running import RefusedError, Runner, drawn_inputs, open_sizes
+from tests.support.frames import record
 
 ROOT = Path(__file__).parents[2]
 SUBJECTS = ("driver", "stacks", "drawn")

@@ -12,7 +12,7 @@ import onnxruntime as ort
 import pytest
 import torch
 
-from benchmarks.measure import gpu, uniad
+from benchmarks.measure import gpu
 from benchmarks.measure.energy import COUNTER, FRAMES_MS, conditions, held
 from benchmarks.measure.gpu import ROWS, Bench, provider_or_reason
 from benchmarks.measure.int8_shapes import FORMS as INT8_FORMS
@@ -25,22 +25,17 @@ from benchmarks.measure.levers import (
     measured,
     opened,
 )
-from benchmarks.measure.runtime import Row, table
-from benchmarks.measure.stacks import print_parted
 from benchmarks.subjects.original_patterns import FORMS, restored
 from benchmarks.subjects.runtime_files import REFERENCE
 from benchmarks.subjects.subject import Subject
-from benchmarks.tools import run_on_provider
 from benchmarks.tools.gpu_table import Found
 from benchmarks.tools.gpu_table import table as gpu_table
 from me2e_compress.runtime.energy.energy_counter import EnergySchedule
-from me2e_compress.runtime.energy.energy_result import Absent
 from me2e_compress.runtime.providers import CPU, CpuProvider, Provider, TensorRtProvider
-from models.stacks import UNIAD_TINY
 from models.tests.vad.sizes import SIZES
 from models.vad.stack import VadTiny
-from tests.frames import record
-from tests.nets import save_text
+from tests.support.frames import record
+from tests.support.nets import save_text
 
 
 @pytest.fixture
@@ -113,26 +108,6 @@ def test_a_file_that_cannot_be_made_is_a_row(
     assert found.reason.startswith(reason)
 
 
-MISSING = "examples/energy_counters is not installed"
-
-
-@pytest.mark.parametrize(
-    ("provider", "reason"),
-    [
-        (CPU, f"rapl: {MISSING}"),
-        (TensorRtProvider(device=1), f"nvml:1 is silent; ina3221: {MISSING}"),
-    ],
-)
-def test_energy_is_that_of_the_device_which_runs(
-    provider: Provider, reason: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(
-        run_on_provider, "open_counter", lambda name: Absent(f"{name} is silent")
-    )
-
-    assert run_on_provider.energy(lambda: None, provider).reason == reason
-
-
 @pytest.mark.slow
 def test_the_driver_on_the_cpu(tmp_path: Path) -> None:
     words = "--providers cpu --subjects highway --frames 2 --runs 5 --warm-up 1"
@@ -196,62 +171,6 @@ def test_every_lever_answers_as_none_does(tmp_path: Path) -> None:
     feeds = {"x": x, "prev_x": x}
     for lever in LEVERS.values():
         assert np.allclose(answer(feeds, Lever()), answer(feeds, lever), atol=1e-5)
-
-
-def test_the_table_compares_with_the_first_row() -> None:
-    ours = Row([1.0, 2.0], [0.5], 900.0, {"ego_fut_preds": 30.0, "bev": 20.0})
-    eager = Row([10.0, 9.0], [5.0], 1700.0, {"ego_fut_preds": 99.0, "bev": 99.0})
-
-    rows = {"PyTorch, eager": eager, "ours": ours}
-    line = table(rows, {"ours": 0.4}, "ego_fut_preds").splitlines()[-1]
-
-    assert line.split(" | ")[1:4] == ["1.00", "1.50", "9.00"]
-    assert line.endswith("20.0 | 30.0 | 40% |")
-
-
-def test_outputs_that_part_by_6_db_are_listed(
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    runs = [
-        {"stack": "a", "target": "onnxruntime", "sqnr_db": {"x": 52.0, "y": 20.0}},
-        {"stack": "a", "target": "tensorrt", "sqnr_db": {"x": 15.5, "y": 26.0}},
-    ]
-    others = [{**runs[0], "seed": 1}, {**runs[1], "seed": 2, "sqnr_db": {}}]
-    print_parted([*({**run, "seed": 0} for run in runs), *others])
-    assert capsys.readouterr().out == (
-        "a, seed 0: placed for onnxruntime, x keeps 52.0 dB; as placed for tensorrt"
-        " 15.5 dB\n"
-    )
-
-
-def test_frames_that_uniad_has_run_are_kept_on_request_and_compared(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    ran = list[uniad.Outputs]()
-
-    def runtime(feeds: uniad.Outputs) -> uniad.Outputs:
-        ran.append(feeds)
-        seen = np.float32(feeds["timestamp"].item())
-        return dict.fromkeys(UNIAD_TINY.outputs, np.array([seen]))
-
-    def drive(frames: int, name: str, *, resume: bool) -> int:
-        words = {"out": tmp_path, "frames": frames, "resume": resume}
-        given = argparse.Namespace(stack=UNIAD_TINY.name, **words)
-        before = len(ran)
-        uniad.drive(given, name, runtime)
-        return len(ran) - before
-
-    def frames(_: object, count: int) -> list[uniad.Outputs]:
-        return [{"timestamp": np.array([each + 1.0])} for each in range(count)]
-
-    monkeypatch.setattr(uniad, "_frames", frames)
-
-    assert drive(2, "torch", resume=True) == 2
-    drive(3, "onnxruntime", resume=True)
-    said = uniad.errors_of(tmp_path, UNIAD_TINY, 3)  # as far as both have run
-    assert [(each["frame"], each["error"]) for each in said] == [(0, 0.0), (1, 0.0)]
-    assert drive(5, "torch", resume=True) == 3
-    assert drive(5, "torch", resume=False) == 5
 
 
 def test_the_forms_of_the_original_compute_what_those_of_models_do() -> None:

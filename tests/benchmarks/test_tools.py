@@ -16,9 +16,7 @@ from benchmarks.tools.masks import MASKS, Mask, masked, masked_name
 from benchmarks.tools.mutate import Fate, main, run, table
 from benchmarks.tools.mutations import mutations
 from benchmarks.tools.written_files import differences, manifest
-from tests.command import Cli, cli, command
-
-__all__ = ["cli", "command"]
+from tests.support.command import Cli
 
 
 @pytest.mark.parametrize(

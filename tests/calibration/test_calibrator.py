@@ -17,8 +17,8 @@ from me2e_compress.errors import FramesError, GraphError, RecipeError
 from me2e_compress.runtime.frames import Array, Frame
 from me2e_compress.runtime.providers import CPU, CpuProvider, Provider
 from me2e_compress.runtime.session import Session, replay
-from tests.frames import record
-from tests.nets import conv_attention, image, parsed
+from tests.support.frames import record
+from tests.support.nets import conv_attention, image, parsed
 
 TENSORS = ("image", "a", "r", "seen", "q", "scores", "p", "mixed")
 

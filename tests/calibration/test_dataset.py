@@ -9,9 +9,9 @@ from me2e_compress.calibration import dataset
 from me2e_compress.calibration.dataset import CalibrationSet, load_arrays, synthetic
 from me2e_compress.calibration.sample import draw, hold_out
 from me2e_compress.errors import FramesError, PreconditionError
-from tests.frames import record
 from tests.fuzz.frames import archive, broken_frames, member
-from tests.nets import parsed
+from tests.support.frames import record
+from tests.support.nets import parsed
 
 MODEL = """
 model (float[1,2] x, int64[1] command, float[1,2] memory)

@@ -11,7 +11,7 @@ from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.calibration.engine_dump import EngineDump
 from me2e_compress.errors import FramesError
 from me2e_compress.runtime.frames import Array
-from tests.frames import record
+from tests.support.frames import record
 
 ANSWERS: list[dict[str, Any]] = [
     {

@@ -13,8 +13,8 @@ from me2e_compress.calibration.ranges import IMPORTED, Ranges
 from me2e_compress.errors import FramesError, RecipeError
 from me2e_compress.graph import digest, provenance
 from me2e_compress.graph.provenance import Provenance
-from tests.frames import tensorrt_cache
-from tests.profiles import scaled
+from tests.support.frames import tensorrt_cache
+from tests.support.profiles import scaled
 
 NAMES = ("/head/MatMul output", "a: b", "image")
 

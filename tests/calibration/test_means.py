@@ -13,9 +13,9 @@ from me2e_compress.calibration.means import token_means
 from me2e_compress.errors import FramesError, GraphError
 from me2e_compress.runtime.frames import Frame
 from me2e_compress.runtime.session import run_once
-from tests.frames import record
-from tests.nets import conv_attention, image, parsed
-from tests.profiles import scaled
+from tests.support.frames import record
+from tests.support.nets import conv_attention, image, parsed
+from tests.support.profiles import scaled
 
 KINDS = """
 kinds (float[1,4] x) => (float[1,4] y) <float limit = {0.0}> {

@@ -14,8 +14,8 @@ from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.calibration.statistics import BINS
 from me2e_compress.runtime.probing import READINGS, insert_probes
 from me2e_compress.runtime.session import Session
-from tests.frames import record
-from tests.nets import conv_attention, image, parsed
+from tests.support.frames import record
+from tests.support.nets import conv_attention, image, parsed
 
 TENSORS = ("image", "a", "r", "seen", "q", "scores", "p", "mixed")
 

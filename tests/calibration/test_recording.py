@@ -14,8 +14,8 @@ from me2e_compress.calibration.recording import Begin, Source, write_recording
 from me2e_compress.errors import FramesError
 from me2e_compress.registry.drafts import IN_JSON
 from me2e_compress.runtime.frames import Frame
-from tests.frames import record
-from tests.nets import parsed
+from tests.support.frames import record
+from tests.support.nets import parsed
 
 
 def drawn(count: int, seed: int = 0) -> Iterator[Frame]:

@@ -30,10 +30,10 @@ from me2e_compress.calibration.review import review
 from me2e_compress.calibration.statistics import BINS, Statistics
 from me2e_compress.errors import FramesError, RecipeError
 from me2e_compress.graph import infer_shapes
-from tests.frames import record
-from tests.installed import install
-from tests.nets import conv_attention, image, parsed
-from tests.profiles import scaled
+from tests.support.frames import record
+from tests.support.installed import install
+from tests.support.nets import conv_attention, image, parsed
+from tests.support.profiles import scaled
 
 GOOD = Ranges(
     {"a": (-1.0, 4.0), "b": (0.0, 2.0)},

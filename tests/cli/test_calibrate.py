@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from me2e_compress import graph
-from tests.command import Cli
 from tests.docs.pages import ROOT
-from tests.frames import record, tensorrt_cache
-from tests.nets import MAP_TEXT, conv_attention, image
+from tests.support.command import Cli
+from tests.support.frames import record, tensorrt_cache
+from tests.support.nets import MAP_TEXT, conv_attention, image
 
 MAP = "--map map.toml"
 RANGES = f"calibrate dense.onnx scenes {MAP}"

@@ -13,11 +13,11 @@ from me2e_compress.manager import recipe
 from me2e_compress.workflows.frames import FramesResult
 from me2e_compress.workflows.listing import KINDS, REGISTRIES
 from me2e_compress.workflows.options import FramesOptions
-from tests.command import Cli, strict
 from tests.docs.documents import faults
 from tests.docs.pages import ROOT
-from tests.installed import install
-from tests.nets import parsed, save_text
+from tests.support.command import Cli, strict
+from tests.support.installed import install
+from tests.support.nets import parsed, save_text
 from tests.targets.onnxruntime.lowered import MATMUL_RELU
 
 NAMES = sorted(COMMANDS)

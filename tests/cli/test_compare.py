@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from me2e_compress import graph
-from tests.command import Cli
-from tests.frames import record
-from tests.nets import conv_attention, image, save_text, turn_softmax
+from tests.support.command import Cli
+from tests.support.frames import record
+from tests.support.nets import conv_attention, image, save_text, turn_softmax
 from tests.targets.onnxruntime.rewritten import Drawn
 
 

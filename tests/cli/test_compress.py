@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from me2e_compress import graph
-from tests.command import Cli, write_frames
-from tests.frames import record
-from tests.nets import parsed, save_text, stored
+from tests.support.command import Cli, write_frames
+from tests.support.frames import record
+from tests.support.nets import parsed, save_text, stored
 
 ABLATE = "compress in.onnx --passes ablate-modules{drop=[occ]} --map map.toml"
 INT8 = "--scheme full --frames frames --map map.toml"

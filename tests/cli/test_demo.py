@@ -8,11 +8,8 @@ import pytest
 from me2e_compress import graph
 from me2e_compress.study import demo
 from me2e_compress.workflows.frames import FramesResult
-from tests.command import Cli
-from tests.stand_in import weights
-from tests.support.in_process import Here, here
-
-__all__ = ["here", "weights"]
+from tests.support.command import Cli
+from tests.support.in_process import Here
 
 DEMO = "demo --out out"
 

@@ -5,9 +5,9 @@ from pathlib import Path
 import onnx_ir as ir
 import pytest
 
-from tests.command import Cli
-from tests.frames import record
-from tests.nets import conv_attention, image
+from tests.support.command import Cli
+from tests.support.frames import record
+from tests.support.nets import conv_attention, image
 
 M = "../models/m.onnx"
 FROM_ELSEWHERE = (

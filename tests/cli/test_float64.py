@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.command import Cli, write_frames
-from tests.nets import save_text
+from tests.support.command import Cli, write_frames
+from tests.support.nets import save_text
 
 SAMPLED = """
     <ir_version: 9, opset_import: ["" : 16]>

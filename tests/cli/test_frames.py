@@ -12,9 +12,9 @@ from me2e_compress.calibration.dataset import CalibrationSet, PixelInput
 from me2e_compress.calibration.recording import LOGS, Begin, DriveLog, LogRequest
 from me2e_compress.driving.shipped_adapters import adapter_file
 from me2e_compress.runtime.frames import Array, Frame
-from tests.command import Cli
-from tests.installed import install
-from tests.nets import save_text
+from tests.support.command import Cli
+from tests.support.installed import install
+from tests.support.nets import save_text
 
 MODEL = "camera (float[1,3,2,2] img) => (float[1,3,2,2] plan) { plan = Relu(img) }"
 PIXELS = PixelInput(mean=(1, 1, 1), std=(2, 2, 2), order="rgb", rows=2, columns=2)

@@ -7,9 +7,9 @@ import pytest
 
 from me2e_compress import graph
 from me2e_compress.graph.runtime_operators import newest_opset
-from tests.command import Cli
 from tests.graph.test_opset import written
-from tests.nets import conv_attention, save_text
+from tests.support.command import Cli
+from tests.support.nets import conv_attention, save_text
 
 IN = "inspect in.onnx --map map.toml"
 

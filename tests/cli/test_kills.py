@@ -16,7 +16,7 @@ import pytest
 
 import me2e_compress
 from me2e_compress import graph
-from tests.command import Cli, contents
+from tests.support.command import Cli, contents
 
 WRITES = ("replace", "link", "unlink", "rmdir")
 COMMANDS = {

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.command import Cli, contents
+from tests.support.command import Cli, contents
 
 F = "dense.onnx frames --map map.toml"
 

@@ -16,7 +16,7 @@ from me2e_compress.errors import FramesError, GraphError
 from me2e_compress.graph import rewrite
 from me2e_compress.runtime.frames import Frame
 from models.state_dict import read_state_dict
-from tests.command import Cli
+from tests.support.command import Cli
 
 M, F = "dense.onnx", "dense.onnx frames"
 INT8 = f"{M} --scheme full --frames frames"

@@ -11,8 +11,8 @@ import me2e_compress as me2e
 from me2e_compress import graph
 from me2e_compress.quantization.decision import KeptFloat, load_plan, plan_of, save_plan
 from me2e_compress.registry.drafts import IN_JSON
-from tests.command import Cli
-from tests.nets import net
+from tests.support.command import Cli
+from tests.support.nets import net
 
 MAP = "--map map.toml"
 MADE = f"compress dense.onnx --scheme prediction --frames frames {MAP} -o out.onnx"

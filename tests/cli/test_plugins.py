@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from me2e_compress import graph
-from tests.command import Cli
-from tests.frames import record
-from tests.plugins import exported
+from tests.support.command import Cli
+from tests.support.frames import record
+from tests.support.plugins import exported
 
 FRAME = {
     "image": np.ones((1, 16, 8, 8), np.float32),

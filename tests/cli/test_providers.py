@@ -8,7 +8,7 @@ import pytest
 import me2e_compress as me2e
 from me2e_compress.cli.app import COMMANDS, options_of
 from me2e_compress.runtime.providers import CpuProvider
-from tests.command import Cli
+from tests.support.command import Cli
 
 STUDY = """
 title = "Try"

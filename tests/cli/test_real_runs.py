@@ -5,7 +5,6 @@ from pathlib import Path
 import pytest
 
 from tests.cli.test_drive import scored
-from tests.command import Cli
 from tests.evaluators.bench2drive.files import (
     RAMMED,
     checkpoint,
@@ -15,6 +14,7 @@ from tests.evaluators.bench2drive.files import (
     speed,
     write,
 )
+from tests.support.command import Cli
 
 GOOD = record(1711, min_speed_infractions=[speed(50.0), speed(1500.0)])
 FAILED = record(

@@ -12,8 +12,8 @@ import pytest
 from me2e_compress import graph
 from me2e_compress.graph import rewrite
 from me2e_compress.simulator.routes import ROAD_VERSION, VERSION
-from tests.command import Cli, write_frames
-from tests.nets import parsed, save_text, stored
+from tests.support.command import Cli, write_frames
+from tests.support.nets import parsed, save_text, stored
 
 F = "dense.onnx frames --map map.toml"
 EXACT = "in.onnx --map map.toml -o out.onnx --passes fold-constants"

@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import pytest
 
 from me2e_compress import graph
-from tests.command import Cli
+from tests.support.command import Cli
 
 F = "dense.onnx frames --map map.toml -o r.toml"
 

@@ -11,12 +11,9 @@ from me2e_compress.registry.drafts import IN_JSON
 from me2e_compress.shipped import drivers as shipped
 from me2e_compress.simulator.routes import save_routes
 from me2e_compress.workflows.checks import model_path
-from tests.command import Cli
 from tests.evaluators.highway.drivers import EXIT, straight_on
-from tests.stand_in import record_driver, weights, write_model
-from tests.support.in_process import here, short
-
-__all__ = ["here", "short", "weights"]
+from tests.support.command import Cli
+from tests.support.stand_in import record_driver, write_model
 
 pytestmark = pytest.mark.usefixtures("weights")
 

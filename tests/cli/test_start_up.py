@@ -9,7 +9,7 @@ import onnx_ir as ir
 import pytest
 
 from me2e_compress import graph
-from tests.conftest import DRIVER
+from tests.support.nets import DRIVER
 
 HEAVY = frozenset(
     [

@@ -18,11 +18,8 @@ from me2e_compress.runtime.providers import CudaProvider
 from me2e_compress.simulator.routes import save_routes
 from me2e_compress.workflows.lint import asked_of
 from me2e_compress.workflows.options import LintOptions
-from tests.command import Cli, write_frames
 from tests.evaluators.highway.drivers import PARKED, slow_here, straight_on
-from tests.support.in_process import here, short
-
-__all__ = ["here", "short"]
+from tests.support.command import Cli, write_frames
 
 CONVOLUTIONS = """
     <ir_version: 9, opset_import: ["" : 17]>

@@ -17,7 +17,7 @@ from me2e_compress.cli.console import (
 )
 from me2e_compress.display import Cell, Table, duration, table
 from me2e_compress.version import __version__
-from tests.command import Cli
+from tests.support.command import Cli
 
 
 @pytest.fixture(autouse=True)

@@ -17,13 +17,10 @@ from me2e_compress.errors import GraphError
 from me2e_compress.registry import Registry
 from me2e_compress.testing import check_form
 from me2e_compress.workflows import listing
-from tests.command import Cli, cli, command
 from tests.docs.conftest import run, write_model
 from tests.docs.pages import EXAMPLE, PAGES, ROOT, WRITING, Block, blocks
-from tests.installed import install
-from tests.support.in_process import here, short
-
-__all__ = ["cli", "command", "here", "short"]
+from tests.support.command import Cli
+from tests.support.installed import install
 
 pytestmark = pytest.mark.xdist_group("installed")
 # the script of engine-dumps runs where an engine does; it has a test of its own

@@ -8,10 +8,8 @@ from pathlib import Path
 import pytest
 
 from me2e_compress.shipped.drivers import SHIPPED
-from tests.command import Cli, cli, command
 from tests.docs.pages import ROOT, blocks
-
-__all__ = ["cli", "command"]
+from tests.support.command import Cli
 
 README = ROOT / "README.md"
 MOST_BYTES = 15_000_000

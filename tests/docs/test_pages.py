@@ -23,16 +23,13 @@ from me2e_compress.runtime.frames import Array
 from me2e_compress.runtime.session import DTYPES, Session, replay
 from me2e_compress.shipped.drivers import sample_frames, shipped
 from me2e_compress.workflows.inspect import inspect
-from tests.command import Cli, cli, command
 from tests.docs.pages import ROOT, Block, blocks
 from tests.driving.observed import motion, observation
 from tests.evaluators.highway.drivers import straight_on
-from tests.frames import record
-from tests.nets import save_text
-from tests.stacks import dense_frames, write_dense
-from tests.stand_in import weights
-
-__all__ = ["cli", "command", "weights"]
+from tests.support.command import Cli
+from tests.support.frames import record
+from tests.support.nets import save_text
+from tests.support.stacks import dense_frames, write_dense
 
 DOCS = ROOT / "docs"
 CAMERA = ROOT / "examples" / "front_camera"

@@ -16,9 +16,6 @@ from me2e_compress.workflows.frames import record_frames
 from me2e_compress.workflows.options import FramesOptions
 from tests.driving.observed import RIG, motion, observation
 from tests.evaluators.highway.drivers import straight_on
-from tests.stand_in import weights
-
-__all__ = ["weights"]
 
 STATE = """
 axes = "forward-right"

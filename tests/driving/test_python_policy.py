@@ -14,7 +14,7 @@ from me2e_compress.errors import EvaluationError
 from me2e_compress.evaluators.highway.drivers import OnnxDriver
 from me2e_compress.testing import check_policy
 from models.driver.expert.blind import Blind, BlindDriver
-from tests.installed import install
+from tests.support.installed import install
 
 Write = Callable[[str], str]
 

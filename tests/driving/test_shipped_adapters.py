@@ -19,9 +19,6 @@ from me2e_compress.workflows.options import FramesOptions
 from models.stacks import STACKS, TCP, VAD_TINY
 from tests.driving.observed import motion, observation
 from tests.evaluators.highway.drivers import EXIT, straight_on
-from tests.stand_in import weights
-
-__all__ = ["weights"]
 
 ACTION = 6
 """Throttle 0.7, steer 0.1 of Bench2DriveZoo's 39."""

@@ -15,8 +15,8 @@ from me2e_compress.evaluators import EVALUATORS, Drive, Evaluator
 from me2e_compress.evaluators.contract import Listener
 from me2e_compress.metrics.episode import Episode, InferenceRecord
 from tests.evaluators.highway.asked import observation, planned
-from tests.installed import install
 from tests.metrics.drives import drive as by_hand
+from tests.support.installed import install
 
 DRIVEN: list[tuple[str, str]] = []
 """Policy and lane of every drive."""

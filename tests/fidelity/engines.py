@@ -8,7 +8,7 @@ import onnx_ir as ir
 
 from me2e_compress.runtime.frames import Frame
 from me2e_compress.runtime.session import Session
-from tests.nets import parsed, stored
+from tests.support.nets import parsed, stored
 
 Arrays: TypeAlias = dict[str, Any]
 SCENES = (0, 4)

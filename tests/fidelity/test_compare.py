@@ -25,8 +25,8 @@ from me2e_compress.runtime.plan_adapter import PlanAdapter
 from me2e_compress.runtime.session import Session
 from me2e_compress.workflows.compare import compare as compare_files
 from me2e_compress.workflows.options import CompareOptions
-from tests.command import write_frames
-from tests.nets import parsed, save_text
+from tests.support.command import write_frames
+from tests.support.nets import parsed, save_text
 
 SCALED = """
 scaled (float[1,2] x, float[1,2] s) => (float[1,2] y, float[1,2] s_out)

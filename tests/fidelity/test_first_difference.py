@@ -17,7 +17,7 @@ from me2e_compress.fidelity.first_difference import (
 from me2e_compress.graph import provenance
 from me2e_compress.graph.provenance import Provenance
 from me2e_compress.runtime.session import Session
-from tests.nets import conv_attention, image_frames, parsed, turn_softmax
+from tests.support.nets import conv_attention, image_frames, parsed, turn_softmax
 
 Change = Callable[[ir.Model], object]
 

@@ -13,9 +13,9 @@ from me2e_compress.fidelity.compare import compare
 from me2e_compress.fidelity.liveness import Liveness, LivenessTally, OutputTally
 from me2e_compress.runtime.frames import Array, Frame
 from me2e_compress.runtime.session import Session
-from tests.command import Command, command
-from tests.frames import record
-from tests.nets import parsed
+from tests.support.command import Command
+from tests.support.frames import record
+from tests.support.nets import parsed
 
 DRIVER = """
 driver (float[1,2,3,16,16] img, float[1,4] can_bus, int64[1] command, float[1,2] prev)
@@ -43,8 +43,6 @@ HEALTHY = {
     "SEEN": "1.0, 1.0", "TURNS": "1.0", "HISTORY": "0.5", "GAIN": "1.0",
     "SCALE": "0.1", "CEILING": "1000000.0",
 }  # fmt: skip
-__all__ = ["command"]
-
 FED = {"prev": "prev_out"}
 """The state, as the metadata pair it."""
 

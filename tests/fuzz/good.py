@@ -7,10 +7,10 @@ from pathlib import Path
 
 from me2e_compress.metrics.episode import Episode
 from me2e_compress.simulator.routes import load_routes, save_routes
-from tests.frames import record
 from tests.fuzz import frames, graphs
 from tests.metrics.drives import cruise, drive
-from tests.nets import MAP_TEXT
+from tests.support.frames import record
+from tests.support.nets import MAP_TEXT
 
 Command = Callable[..., int]
 

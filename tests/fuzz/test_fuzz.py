@@ -5,9 +5,9 @@ from pathlib import Path
 
 import pytest
 
-from tests.command import contents, run
 from tests.fuzz.cases import GROUPS, Case
 from tests.fuzz.good import write_good
+from tests.support.command import contents, run
 
 
 @pytest.fixture(scope="session")

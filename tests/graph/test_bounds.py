@@ -13,8 +13,8 @@ from me2e_compress.errors import GraphError
 from me2e_compress.graph.shapes import can_carry, infer_shapes, static_shape
 from me2e_compress.graph.summary import macs
 from me2e_compress.manager.equivalence import random_outputs
-from tests.calls import calls
-from tests.nets import parsed
+from tests.support.calls import calls
+from tests.support.nets import parsed
 
 OPSETS = 'opset_import: ["" : 17, "own" : 1]'
 

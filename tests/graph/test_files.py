@@ -10,7 +10,7 @@ from me2e_compress import graph
 from me2e_compress.errors import GraphError
 from me2e_compress.graph import files
 from me2e_compress.registry.drafts import BYTES
-from tests.nets import parsed, stored
+from tests.support.nets import parsed, stored
 
 
 def weighted(rows: int = 64) -> ir.Model:

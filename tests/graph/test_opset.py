@@ -14,7 +14,7 @@ from me2e_compress.graph.runtime_operators import newest_ir, newest_opset
 from me2e_compress.runtime.session import Session
 from me2e_compress.targets.onnxruntime import OnnxRuntime
 from me2e_compress.targets.tensorrt import TensorRT
-from tests.frames import record
+from tests.support.frames import record
 
 
 def written(folder: Path, body: str, *, opset: int = 28, version: int = 15) -> Path:

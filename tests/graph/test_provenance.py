@@ -9,7 +9,7 @@ from me2e_compress.errors import GraphError
 from me2e_compress.graph import provenance
 from me2e_compress.graph.provenance import ORIGINS, Provenance
 from me2e_compress.registry.documents import MalformedError
-from tests.nets import parsed
+from tests.support.nets import parsed
 
 
 @pytest.fixture

@@ -8,7 +8,7 @@ import pytest
 from me2e_compress.errors import FramesError, GraphError
 from me2e_compress.graph.recurrence import SessionPort, not_fed_back, recurrence
 from me2e_compress.runtime.session import Session
-from tests.nets import conv_attention
+from tests.support.nets import conv_attention
 
 STATE = SessionPort("tensor(float)", (1, 8))
 FLAG = SessionPort("tensor(bool)", (1,))

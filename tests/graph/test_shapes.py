@@ -6,7 +6,7 @@ from me2e_compress import graph
 from me2e_compress.graph.modules.module_map import ModuleMap
 from me2e_compress.manager import PassManager, recipe
 from me2e_compress.passes import Context
-from tests.nets import parsed
+from tests.support.nets import parsed
 
 CHAIN = """
 six (float[BATCH,6,8] x) => (float["Addy_dim_0","Addy_dim_1",8] y, float[one,48] z)

@@ -16,8 +16,16 @@ from me2e_compress.manager import PassManager, recipe
 from me2e_compress.passes import Context
 from me2e_compress.runtime.frames import Array, Frame
 from me2e_compress.runtime.session import Session, replay
-from tests.nets import parsed
-from tests.stacks import DENSE, HEAD, TWO_PARTS, joined, ones, write_dense, write_stack
+from tests.support.nets import parsed
+from tests.support.stacks import (
+    DENSE,
+    HEAD,
+    TWO_PARTS,
+    joined,
+    ones,
+    write_dense,
+    write_stack,
+)
 
 
 def bevs(path: Path, *starts: bool) -> list[float]:

@@ -6,7 +6,7 @@ import pytest
 
 from me2e_compress.errors import GraphError
 from me2e_compress.graph.stack.join import JoinedStack
-from tests.stacks import HEAD, TWO_PARTS, write_stack
+from tests.support.stacks import HEAD, TWO_PARTS, write_stack
 
 OTHER_FEATS = HEAD.replace("float[1,4] feats", "float[1,5] feats")
 OLD = '<ir_version: 9, opset_import: ["" : 11]>'

@@ -5,7 +5,7 @@ import onnx_ir as ir
 
 from me2e_compress.graph import rewrite
 from me2e_compress.graph.validity import refusal
-from tests.plugins import exported
+from tests.support.plugins import exported
 
 
 def test_an_output_without_a_shape_is_valid() -> None:

@@ -17,7 +17,7 @@ from me2e_compress.passes.fold_constants import FoldConstants
 from me2e_compress.passes.import_normalize import ImportNormalize
 from me2e_compress.runtime.frames import Frames
 from tests.manager import passes
-from tests.nets import parsed
+from tests.support.nets import parsed
 
 CHAIN = """
 chain (float[1,8] x) => (float[1,8] y)

@@ -18,10 +18,10 @@ from me2e_compress.passes.attach_bodies import AttachBodies
 from me2e_compress.passes.base import Context
 from me2e_compress.passes.quantize_int8 import QuantizeInt8
 from me2e_compress.runtime.frames import Frame
-from tests.frames import record
 from tests.manager.transformer import transformer
 from tests.passes.small import EVERYTHING, read
 from tests.passes.test_attach_bodies import ALIKE
+from tests.support.frames import record
 
 SHIFT = 4e-6
 """What a pass that only rounds moves a sum by, of numbers up to 255."""

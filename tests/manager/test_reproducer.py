@@ -7,9 +7,8 @@ import pytest
 
 from me2e_compress.manager import reproducer
 from me2e_compress.manager.reproducer import shrink
-from tests.conftest import DRIVER
-from tests.nets import parsed
 from tests.passes.small import ops, read
+from tests.support.nets import DRIVER, parsed
 
 OPERATORS = ("Abs", "Neg", "Exp", "Tanh", "Cos", "Sin", "Erf")
 

@@ -24,7 +24,7 @@ from me2e_compress.operators.deformable_attention import (
 from me2e_compress.operators.raw_attention import RawOwnForm
 from me2e_compress.testing.check_operator import DrawnCall, dialect_reference
 from tests.operators.running import body_and_reference, graph_of, in_float32, run
-from tests.profiles import scaled
+from tests.support.profiles import scaled
 
 OPERATOR = DeformableAttention()
 SHAPES = ["spatial_shapes", "level_start_index"]

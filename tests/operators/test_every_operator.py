@@ -22,7 +22,7 @@ from me2e_compress.testing.check_operator import DrawnCall, dialect_reference
 from tests.operators.drawn import DRAWS, Drawn, aggregation, attention, rotate, sampler
 from tests.operators.running import body_and_reference, graph_of, run
 from tests.operators.test_deformable_attention import CALL, arrays_of
-from tests.profiles import scaled
+from tests.support.profiles import scaled
 
 ROWS = [
     (operator, dialect)

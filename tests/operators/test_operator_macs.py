@@ -7,7 +7,7 @@ import pytest
 from me2e_compress.graph import infer_shapes, macs, static_shape
 from me2e_compress.graph.shapes import Dims
 from me2e_compress.operators import OPERATORS
-from tests.nets import parsed
+from tests.support.nets import parsed
 
 Shapes = list[Dims | None]
 

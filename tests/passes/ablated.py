@@ -7,7 +7,7 @@ from me2e_compress.graph.modules.module_map import ModuleMap
 from me2e_compress.passes.ablate_modules import AblateModules
 from me2e_compress.passes.base import Context
 from me2e_compress.runtime.session import run_once
-from tests.nets import map_text
+from tests.support.nets import map_text
 
 STACK = """
 stack (float[1,4] camera) => (float[1,4] plan, float[1,2,2] lanes)

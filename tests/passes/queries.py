@@ -8,7 +8,7 @@ from me2e_compress import graph
 from me2e_compress.graph.modules.module_map import ModuleMap
 from me2e_compress.passes.base import Context
 from me2e_compress.passes.edges import Edge
-from tests.nets import map_text, net
+from tests.support.nets import map_text, net
 
 Numbers = npt.NDArray[np.float32]
 

@@ -18,7 +18,7 @@ from me2e_compress.passes.base import Context, Pass, PassResult
 from me2e_compress.passes.fold_constants import ENTRY_BYTES
 from me2e_compress.passes.fuse_basic import FuseBasic
 from me2e_compress.passes.import_normalize import ImportNormalize
-from tests.nets import net
+from tests.support.nets import net
 
 NO_MODULES = Context(ModuleMap("none", ()))
 EVERYTHING = ModuleMap.parse(

@@ -16,8 +16,6 @@ from me2e_compress.errors import (
 from me2e_compress.graph import provenance
 from me2e_compress.passes.ablate_modules import AblateModules
 from me2e_compress.runtime.session import run_once
-from tests.frames import record
-from tests.nets import net
 from tests.passes.ablated import (
     CAMERA,
     NO_AGENTS,
@@ -29,6 +27,8 @@ from tests.passes.ablated import (
     substitute,
 )
 from tests.passes.small import ops
+from tests.support.frames import record
+from tests.support.nets import net
 
 
 @pytest.fixture

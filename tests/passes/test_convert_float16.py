@@ -20,9 +20,9 @@ from me2e_compress.passes.convert_float16 import ConvertFloat16
 from me2e_compress.runtime.providers import CpuProvider
 from me2e_compress.runtime.session import run_once
 from me2e_compress.testing import check_pass
-from tests.frames import record
-from tests.nets import MODULES, conv_attention, parsed, stored
 from tests.passes.small import bare, casts, compute, fed, types_of
+from tests.support.frames import record
+from tests.support.nets import MODULES, conv_attention, parsed, stored
 
 OPSET = '<ir_version: 9, opset_import: ["" : 17, "trt" : 1]>\n'
 HALF, FLOAT = ir.DataType.FLOAT16, ir.DataType.FLOAT

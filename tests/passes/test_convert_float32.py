@@ -12,8 +12,8 @@ from me2e_compress.passes import Context
 from me2e_compress.passes.convert_float16 import ConvertFloat16
 from me2e_compress.passes.convert_float32 import ConvertFloat32
 from me2e_compress.testing import check_pass
-from tests.nets import MODULES, conv_attention
 from tests.passes.small import apply, bare, ops, read, types_of
+from tests.support.nets import MODULES, conv_attention
 
 HEAD = '<ir_version: 9, opset_import: ["" : 17, "own" : 1]>\n'
 HALF, FLOAT = ir.DataType.FLOAT16, ir.DataType.FLOAT

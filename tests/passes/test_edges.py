@@ -17,11 +17,11 @@ from me2e_compress.passes.ablate_modules import AblateModules
 from me2e_compress.passes.edges import Edge, carry
 from me2e_compress.passes.parts import stretched
 from me2e_compress.runtime.session import run_once
-from tests.nets import net
 from tests.passes.hoisted import integers
 from tests.passes.queries import KEYS, STACK, Numbers, context, stack, weights
 from tests.passes.small import read
-from tests.profiles import scaled
+from tests.support.nets import net
+from tests.support.profiles import scaled
 
 CAMERA = np.random.default_rng(1).normal(size=(1, 5, 8)).astype("f")
 

@@ -10,7 +10,7 @@ from me2e_compress import graph
 from me2e_compress.graph.modules.module_map import ModuleMap
 from me2e_compress.manager import PassManager, Report, recipe
 from me2e_compress.passes import Context
-from tests.nets import parsed
+from tests.support.nets import parsed
 
 
 def exact(model: ir.Model) -> Report:

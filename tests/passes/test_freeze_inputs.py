@@ -14,8 +14,8 @@ from me2e_compress.manager.report import Report
 from me2e_compress.passes import Context
 from me2e_compress.passes.fold_constants import FoldConstants
 from me2e_compress.passes.freeze_inputs import FreezeInputs, advice
-from tests.frames import record
 from tests.passes.small import compute, ops, read
+from tests.support.frames import record
 
 NET = """g (float[cameras,2,2] lidar2img, float[3,2] x) => (float[cameras,3,2] y) {
     pillars = MatMul(points, lidar2img)

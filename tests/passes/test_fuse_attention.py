@@ -11,7 +11,7 @@ from me2e_compress.passes.fuse_kernels import FuseKernels
 from me2e_compress.runtime import runnable
 from me2e_compress.runtime.session import Session
 from tests.passes.small import apply, compute, fed, ops, read
-from tests.profiles import scaled
+from tests.support.profiles import scaled
 
 Q, K, H, C = 9, 70, 2, 16
 HEAD = '<ir_version: 9, opset_import: ["" : 17]>'

@@ -15,7 +15,7 @@ from me2e_compress.graph import array_of, infer_shapes, opset_of, static_shape
 from me2e_compress.operators import expand
 from me2e_compress.passes.fuse_kernels import FuseKernels
 from tests.passes.small import apply, compute, read
-from tests.profiles import scaled
+from tests.support.profiles import scaled
 
 RAW, OWN = "RawDeformableAttention", "MultiScaleDeformableAttention"
 

@@ -14,7 +14,7 @@ from me2e_compress.passes import work
 from me2e_compress.passes.hoist_linear import HoistLinear, repeats
 from tests.passes.hoisted import graph_of, integers
 from tests.passes.small import NO_MODULES, RANDOM, compute, read
-from tests.profiles import scaled
+from tests.support.profiles import scaled
 
 STEPS = (
     *("expand", "tile", "merge", "split", "turn", "unary", "sum", "softmax"),

@@ -8,9 +8,9 @@ import pytest
 
 from me2e_compress.graph import infer_shapes, provenance
 from me2e_compress.passes.hoist_linear import HoistLinear
-from tests.calls import calls
 from tests.passes.hoisted import graph_of, hoist, integers, products
 from tests.passes.small import NO_MODULES, apply, normal, ops, read
+from tests.support.calls import calls
 
 ROWS, TIMES, WIDE = 101, 60, 32
 

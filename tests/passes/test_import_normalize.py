@@ -17,7 +17,7 @@ from me2e_compress.passes.import_normalize import (
     with_own_domains,
 )
 from tests.passes.small import EVERYTHING, compute, normalise, settled, unstamped
-from tests.plugins import exported
+from tests.support.plugins import exported
 
 
 @pytest.mark.parametrize(

@@ -30,8 +30,8 @@ from me2e_compress.runtime.session import Session
 from me2e_compress.targets.onnxruntime import int8_layers, unranged
 from me2e_compress.targets.tensorrt import TensorRT
 from me2e_compress.testing import check_pass
-from tests.frames import record
-from tests.nets import MODULES, conv_attention, image, net, parsed
+from tests.support.frames import record
+from tests.support.nets import MODULES, conv_attention, image, net, parsed
 
 PAPER = QuantizeInt8(rules="paper", target="tensorrt")
 TENSORS = ("image", "q", "seen", "p", "mixed")

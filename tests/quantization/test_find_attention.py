@@ -13,7 +13,7 @@ from me2e_compress.quantization.plan import make_plan
 from me2e_compress.quantization.rules import RULE_SETS
 from me2e_compress.quantization.scheme import QuantScheme
 from me2e_compress.targets import TARGETS
-from tests.nets import MODULES, net
+from tests.support.nets import MODULES, net
 
 HEAD = '<ir_version: 9, opset_import: ["" : 17, "com.microsoft" : 1, "trt" : 1]>\n'
 

@@ -12,7 +12,7 @@ from me2e_compress.quantization.plan import make_plan
 from me2e_compress.quantization.rules import RULE_SETS
 from me2e_compress.quantization.rules.rule_sets import Geometry
 from me2e_compress.quantization.scheme import QuantScheme
-from tests.nets import MODULES, by_output, net
+from tests.support.nets import MODULES, by_output, net
 
 HEAD = QuantScheme.of(("head",), MODULES)
 OPSETS = '<ir_version: 9, opset_import: ["" : 17, "trt" : 1]>\n'

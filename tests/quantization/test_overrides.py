@@ -11,7 +11,7 @@ from me2e_compress.graph.provenance import Provenance
 from me2e_compress.quantization.decision import Overrides, QuantPlan
 from me2e_compress.quantization.plan import make_plan
 from me2e_compress.quantization.scheme import QuantScheme
-from tests.nets import FULL, MODULES, PAPER, conv_attention
+from tests.support.nets import FULL, MODULES, PAPER, conv_attention
 
 
 def planned(text: str, scheme: str = "full") -> QuantPlan:

@@ -20,8 +20,8 @@ from me2e_compress.quantization.plan import make_plan
 from me2e_compress.quantization.rules import RULE_SETS, Rule, RuleFacts, RuleSet
 from me2e_compress.quantization.rules.rule_sets import PaperRules
 from me2e_compress.quantization.scheme import QuantScheme
-from tests.installed import install
-from tests.nets import MODULES, by_output, conv_attention, net, planned
+from tests.support.installed import install
+from tests.support.nets import MODULES, by_output, conv_attention, net, planned
 
 
 @dataclasses.dataclass(frozen=True)

@@ -21,8 +21,8 @@ from me2e_compress.quantization.rules import RuleSet
 from me2e_compress.quantization.rules.rule_sets import PaperRules, SafeRules
 from me2e_compress.quantization.scheme import QuantScheme
 from me2e_compress.workflows.int8_outcome import float_bytes
-from tests.calls import calls
-from tests.nets import FULL, MODULES, PAPER, conv_attention, net
+from tests.support.calls import calls
+from tests.support.nets import FULL, MODULES, PAPER, conv_attention, net
 
 HEAD = QuantScheme.of(("head",), MODULES)
 

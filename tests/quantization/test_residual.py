@@ -9,7 +9,7 @@ from me2e_compress.graph.rewrite import add_constant
 from me2e_compress.quantization.decision import Decision, Overrides, QuantPlan
 from me2e_compress.quantization.plan import make_plan, share_scales
 from me2e_compress.quantization.rules import RULE_SETS
-from tests.nets import FULL, PAPER, net
+from tests.support.nets import FULL, PAPER, net
 
 BLOCK = """
 block (float[1,16,8,8] x, float[16,16,1,1] w1, float[16,16,1,1] w2,

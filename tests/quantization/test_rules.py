@@ -10,7 +10,7 @@ from me2e_compress.quantization.rules import RULE_SETS
 from me2e_compress.quantization.scheme import QuantScheme
 from me2e_compress.targets.onnxruntime import OnnxRuntime
 from me2e_compress.targets.tensorrt import TensorRT
-from tests.nets import MODULES, by_output, net, planned
+from tests.support.nets import MODULES, by_output, net, planned
 
 HEAD = QuantScheme.of(("head",), MODULES)
 OPSETS = '<ir_version: 9, opset_import: ["" : 17, "trt" : 1]>\n'

@@ -8,8 +8,8 @@ import pytest
 
 from me2e_compress.errors import MissingExtraError, StudyError
 from me2e_compress.registry import Registry, describe
-from tests.installed import install
 from tests.registry.shapes import GROUP, SHAPES, Point, Shape, Square
+from tests.support.installed import install
 
 
 class Undecorated(Square):

@@ -11,10 +11,8 @@ from me2e_compress.errors import FORMER, RecipeError
 from me2e_compress.manager import recipe
 from me2e_compress.quantization.rules import RULE_SETS
 from me2e_compress.registry import Registry
-from tests.command import Cli, cli, command
-from tests.installed import install
-
-__all__ = ["cli", "command"]
+from tests.support.command import Cli
+from tests.support.installed import install
 
 
 @pytest.mark.parametrize(

@@ -18,7 +18,7 @@ from me2e_compress.runtime.frames import Frame
 from me2e_compress.runtime.latency_trace import LatencyTrace, shares
 from me2e_compress.runtime.optimized import optimized, origins, with_unique_names
 from me2e_compress.runtime.providers import CPU, CudaProvider, Provider
-from tests.nets import net
+from tests.support.nets import net
 
 TEXT = """
 m (float[1,4,8,8] image, float[4,4,3,3] k, float[4] b, float[64,8] w, float[8] c)

@@ -25,10 +25,10 @@ from me2e_compress.runtime.profile import TimedSession
 from me2e_compress.runtime.providers import CPU
 from me2e_compress.runtime.runnable import int8_entry, runnable
 from me2e_compress.runtime.session import Session
-from tests.frames import record
 from tests.manager.transformer import transformer
-from tests.nets import parsed, stored
 from tests.passes.small import EVERYTHING, read
+from tests.support.frames import record
+from tests.support.nets import parsed, stored
 from tests.targets.onnxruntime.rewritten import Drawn
 
 LAYER = """

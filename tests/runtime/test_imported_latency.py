@@ -8,10 +8,8 @@ from me2e_compress.errors import EvaluationError
 from me2e_compress.runtime.imported_latency import read_import
 from me2e_compress.runtime.latency_trace import LatencyTrace
 from me2e_compress.workflows.profile import import_profile
-from tests.command import Cli, cli, command
 from tests.evaluators.highway.drivers import straight_on
-
-__all__ = ["cli", "command"]
+from tests.support.command import Cli
 
 TIMES = [
     {"startEnqMs": 0.1, "computeMs": 49.0, "latencyMs": 50.1234, "endToEndMs": 51.0},

@@ -11,8 +11,8 @@ from me2e_compress.graph.files import external_tensors
 from me2e_compress.graph.rewrite import add_constant
 from me2e_compress.runtime.kernel_types import without_kernel
 from me2e_compress.runtime.session import Session, open_graph
-from tests.nets import net, parsed, stored
 from tests.passes import onnx_cases
+from tests.support.nets import net, parsed, stored
 
 TEXT = """
 block (float[1,8,9,9] x, float[16,8,3,3] w, float[16] b, float[16] m, float[16] v,

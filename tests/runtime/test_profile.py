@@ -18,8 +18,8 @@ from me2e_compress.runtime.profile import (
     record_traces,
 )
 from me2e_compress.runtime.session import replay
-from tests.command import write_frames
-from tests.nets import save_text
+from tests.support.command import write_frames
+from tests.support.nets import save_text
 
 MODEL = """counter (float[2] x, float[2] total) => (float[2] total_out)
 { total_out = Add (x, total) }"""

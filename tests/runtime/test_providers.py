@@ -27,7 +27,7 @@ from me2e_compress.runtime.providers import (
     provider_named,
 )
 from me2e_compress.runtime.session import Session
-from tests.nets import parsed, save_text
+from tests.support.nets import parsed, save_text
 
 NEGATE = "m (float[2] x) => (float[2] y) { y = Neg(x) }"
 RTX = TensorRtRtxProvider.package

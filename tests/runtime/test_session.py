@@ -12,7 +12,7 @@ from me2e_compress.runtime.frames import Array, Frame
 from me2e_compress.runtime.runnable import endless, unsupported
 from me2e_compress.runtime.session import Session, feed_forward, replay
 from me2e_compress.targets.weights import evaluate_constants
-from tests.nets import parsed
+from tests.support.nets import parsed
 
 COUNTER = """
 counter (float[1,2] x, float[1,2] memory) => (float[1,2] y, float[1,2] memory_out) {

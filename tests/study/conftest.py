@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from me2e_compress.evaluators.highway import runner
 from me2e_compress.study import (
     Condition,
     Study,
@@ -15,8 +16,8 @@ from me2e_compress.study import (
     Variant,
     run_study,
 )
-from tests.command import write_frames
 from tests.evaluators.highway.drivers import CROSSING, PARKED, straight_on
+from tests.support.command import write_frames
 from tests.support.in_process import Here
 
 ROUTES = (CROSSING, PARKED)
@@ -56,8 +57,10 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="session")
 def found(models: Path, folder: Path) -> StudyResult:
-    """What the study finds."""
-    return run_study(asked(models), folder, Here())
+    """What the study finds in the first seconds of its routes."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(runner, "TIMEOUT_US", 16_000_000)
+        return run_study(asked(models), folder, Here())
 
 
 def asked(models: Path) -> Study:

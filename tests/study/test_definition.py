@@ -15,9 +15,9 @@ from me2e_compress.study.definition import StudyBlock
 from me2e_compress.study.drive_record import DriveRecord
 from me2e_compress.study.workload import held_frames, workload
 from tests.docs.pages import EXAMPLE
-from tests.installed import install
 from tests.study.conftest import BLIND, FASTER, IDEAL, ROUTES, SLOW, Make
 from tests.support.in_process import Here
+from tests.support.installed import install
 
 
 @pytest.mark.parametrize(
@@ -155,6 +155,7 @@ def test_own_latencies_may_be_limited_and_grow_with_the_scene() -> None:
     assert found == LimitedLatency(HostStageLatency(samples, 3_000), 10.0)
 
 
+@pytest.mark.usefixtures("short")
 def test_every_option_reaches_the_drive(make: Make, tmp_path: Path) -> None:
     condition = Condition(
         "all", "limited{source=fps:20, fps=8}", latency_model="fifo", dt_ms=25.0,
@@ -194,6 +195,7 @@ ASKED = Study(
 )
 
 
+@pytest.mark.usefixtures("short")
 def test_a_block_drives_its_variants_and_the_rest_is_left(tmp_path: Path) -> None:
     before, engine = workload(ASKED, tmp_path, 2), Here()
 

@@ -11,8 +11,8 @@ from me2e_compress.runtime.profile import describe_machine
 from me2e_compress.runtime.providers import CpuProvider
 from me2e_compress.study import Study, StudyResult, Timing, load_study, run_study
 from me2e_compress.study.report.page import write_study
-from me2e_compress.study.workload import PlannedDrive, Workload, workload
-from tests.evaluators.lanes import DRIVEN, install_lanes
+from me2e_compress.study.workload import PlannedDrive, Workload
+from tests.evaluators.lanes import install_lanes
 from tests.study.conftest import IDEAL, ROUTES, Make
 from tests.support.in_process import Here
 
@@ -67,17 +67,6 @@ def test_another_evaluator_drives_a_study(asked: Path, tmp_path: Path) -> None:
     document = json.loads(written.record.read_text(encoding="utf-8"))
     assert document["evaluator"] == "lanes{count=5}"
     assert document["routes"] == {"driven": 3, "set": 5}
-
-
-def test_what_was_kept_is_not_driven_again(asked: Path, tmp_path: Path) -> None:
-    ahead = workload(load_study(asked), tmp_path / "out")
-    run_study(asked, tmp_path / "out")
-    run_study(asked, tmp_path / "out")
-
-    assert ahead.headline.startswith("Lanes: 4 drives, 12 routes, 0 of them driven")
-    assert len(DRIVEN) == 12
-    left = workload(load_study(asked), tmp_path / "out")
-    assert "12 of them driven" in left.headline
 
 
 @pytest.mark.parametrize(
@@ -138,6 +127,7 @@ def opened(monkeypatch: pytest.MonkeyPatch) -> list[tuple[Path, ...]]:
     return found
 
 
+@pytest.mark.usefixtures("short")
 def test_every_session_of_a_study_is_on_its_provider(
     provided: Study, opened: list[tuple[Path, ...]], tmp_path: Path
 ) -> None:

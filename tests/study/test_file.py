@@ -17,8 +17,8 @@ from me2e_compress.shipped.drivers import shipped
 from me2e_compress.simulator.routes import load_routes, save_routes
 from me2e_compress.study import Condition, load_study
 from me2e_compress.study.definition import FramesToRecord, StudyBlock
-from tests.command import write_frames
 from tests.evaluators.highway.drivers import CROSSING, PARKED
+from tests.support.command import write_frames
 
 GOOD = """
 title = "Try"

@@ -12,10 +12,10 @@ from me2e_compress.study import Listener, Study, Variant
 from me2e_compress.study.prepared import PreparedVariant, prepare_variant
 from me2e_compress.study.workspace import Workspace
 from me2e_compress.workflows.result import SILENT
-from tests.command import write_frames
 from tests.evaluators.highway.drivers import slow_here, straight_on
-from tests.stand_in import write_model
 from tests.study.conftest import Make
+from tests.support.command import write_frames
+from tests.support.stand_in import write_model
 
 
 @pytest.fixture
@@ -43,6 +43,7 @@ def made(study: Study, folder: Path) -> PreparedVariant:
     return prepare_variant(study, study.variants[0], Workspace(folder), SILENT)
 
 
+@pytest.mark.usefixtures("weights")
 def test_passes_are_run_on_a_model_that_ships(make: Make, tmp_path: Path) -> None:
     variant = Variant("small", "highway", recipe.parse("eliminate-redundant"))
     study = make(variants=(variant,), baseline="small")

@@ -149,7 +149,7 @@ def test_of_many_drives_the_answer_has_one_condition(found: StudyResult) -> None
 def test_what_is_sure_is_filled(found: StudyResult) -> None:
     drawn = str(differences(found))
 
-    assert f">{MINUS}25.4 ({MINUS}83.3 to +72.0)</text>" in drawn
+    assert f">+3.6 ({MINUS}76.8 to +78.5)</text>" in drawn
     assert ">fast, slow</text>" in drawn
     assert f"fill: {ACCENT}" not in drawn
     assert drawn.count(f"fill: #ffffff; stroke: {MUTED}") == 3 * len(found.drives) - 6

@@ -17,8 +17,8 @@ from me2e_compress.study.outcome import Clock, time_all
 from me2e_compress.study.prepared import prepare_variant
 from me2e_compress.study.workspace import Workspace
 from me2e_compress.workflows.result import SILENT
-from tests.command import write_frames
 from tests.study.conftest import BLIND, IDEAL, Make
+from tests.support.command import write_frames
 
 DEVICE = Condition("device", "trace")
 SAMPLES = (100, 110, 120, 130, 140)

@@ -8,8 +8,6 @@ import pytest
 from me2e_compress.driving.policies import Driver
 from me2e_compress.evaluators import Drive
 from me2e_compress.evaluators.contract import Driven
-from me2e_compress.evaluators.highway import runner
-from me2e_compress.evaluators.highway.engine import LocalEngine
 from me2e_compress.simulator.routes import Route
 
 
@@ -22,6 +20,9 @@ class Here:
     def drive(
         self, policy: Driver, drive: Drive, routes: Sequence[Route]
     ) -> Iterator[Driven]:
+        # highway-env takes a second to import: only who drives needs it
+        from me2e_compress.evaluators.highway import runner
+
         for route in routes:
             self.driven.append((policy.label, route.id))
             yield Driven(runner.drive(route, policy.open(), drive), 0.0, 0)
@@ -31,12 +32,14 @@ class Here:
 def here(monkeypatch: pytest.MonkeyPatch) -> Here:
     """Let routes that processes of this machine would drive be driven here."""
     here = Here()
-    monkeypatch.setattr(LocalEngine, "drive", lambda self, *words: here.drive(*words))
+    engine = "me2e_compress.evaluators.highway.engine.LocalEngine.drive"
+    monkeypatch.setattr(engine, lambda self, *words: here.drive(*words))
     return here
 
 
 @pytest.fixture
 def short(here: Here, monkeypatch: pytest.MonkeyPatch) -> Here:
     """The same, a second of each route: for who asks whether it drives, not how."""
-    monkeypatch.setattr(runner, "TIMEOUT_US", 1_000_000)
+    runner = "me2e_compress.evaluators.highway.runner"
+    monkeypatch.setattr(f"{runner}.TIMEOUT_US", 1_000_000)
     return here

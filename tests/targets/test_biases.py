@@ -24,8 +24,8 @@ from me2e_compress.targets.weights import (
     weights_of,
     with_room,
 )
-from tests.nets import FULL, drawn, net, placed
-from tests.profiles import scaled
+from tests.support.nets import FULL, drawn, net, placed
+from tests.support.profiles import scaled
 
 DEAD = """
 <ir_version: 9, opset_import: ["" : 19]>

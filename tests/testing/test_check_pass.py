@@ -11,7 +11,7 @@ from me2e_compress.passes.ablate_modules import AblateModules
 from me2e_compress.registry import options_of
 from me2e_compress.testing import check_pass
 from tests.manager import passes
-from tests.nets import parsed
+from tests.support.nets import parsed
 
 EXACT = [
     cls

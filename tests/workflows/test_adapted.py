@@ -28,8 +28,8 @@ from me2e_compress.workflows.options import (
 )
 from me2e_compress.workflows.profile import profile
 from me2e_compress.workflows.search import measure_sensitivity
-from tests.frames import record
-from tests.nets import parsed
+from tests.support.frames import record
+from tests.support.nets import parsed
 
 MINE = """
 mine (float[1,8,12] seen, float[1,8,12] memory)

@@ -14,12 +14,10 @@ from me2e_compress.errors import EvaluationError, GraphError
 from me2e_compress.runtime.session import Session
 from me2e_compress.workflows.compare_dump import DumpResult, compare_dump
 from me2e_compress.workflows.options import CompareOptions
-from tests.command import Command, command
 from tests.fidelity.engines import Arrays, drive, frames, noisy, stack
-from tests.frames import record
-from tests.nets import parsed
-
-__all__ = ["command"]
+from tests.support.command import Command
+from tests.support.frames import record
+from tests.support.nets import parsed
 
 QUANTIZED = """
 small (float[1,8] x) => (float[1,8] y)

@@ -17,9 +17,9 @@ from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.runtime.providers import CPU
 from me2e_compress.workflows.measured_loss import ADVICE
 from me2e_compress.workflows.written import larger, slower
-from tests.command import Command
-from tests.frames import record
-from tests.nets import MAP_TEXT, conv_attention, map_text, net
+from tests.support.command import Command
+from tests.support.frames import record
+from tests.support.nets import MAP_TEXT, conv_attention, map_text, net
 
 PROJECTION = """
 net (float[1,8,64] img, float[6,4,4] lidar2img, float[4,256] points,

@@ -21,8 +21,8 @@ from me2e_compress.workflows import checks
 from me2e_compress.workflows.checks import shortcomings, try_first
 from me2e_compress.workflows.compress import compress
 from me2e_compress.workflows.result import SILENT, Listener
-from tests.nets import save_text
-from tests.stacks import write_stack
+from tests.support.nets import save_text
+from tests.support.stacks import write_stack
 
 pytestmark = pytest.mark.opens_apart
 

@@ -10,10 +10,8 @@ import me2e_compress as me2e
 from me2e_compress import graph
 from me2e_compress.errors import GraphError
 from me2e_compress.manager import recipe
-from tests.command import Cli, cli, command
-from tests.stacks import BACKBONE, dense_frames, write_dense, write_stack
-
-__all__ = ["cli", "command"]
+from tests.support.command import Cli
+from tests.support.stacks import BACKBONE, dense_frames, write_dense, write_stack
 
 TWO_MODULES = """
 [modules.a]

@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.command import Cli, write_frames
-from tests.nets import save_text
+from tests.support.command import Cli, write_frames
+from tests.support.nets import save_text
 
 TEXT = """m (float[batch,4] x, float[batch,4] h) => (float[batch,4] y, float[batch,4] n)
 { n = Add(x, h) y = Tanh(n) }"""

@@ -9,9 +9,9 @@ import me2e_compress as me2e
 from me2e_compress import graph
 from me2e_compress.errors import PreconditionError
 from me2e_compress.workflows.result import Listener
-from tests.command import write_frames
-from tests.frames import record
-from tests.nets import image, parsed, save_text, stored
+from tests.support.command import write_frames
+from tests.support.frames import record
+from tests.support.nets import image, parsed, save_text, stored
 
 
 def test_nothing_int8_is_said_first_and_last_where_it_is_allowed(

@@ -12,8 +12,8 @@ from me2e_compress import graph
 from me2e_compress.registry import drafts
 from me2e_compress.runtime.atomic import write_bytes
 from me2e_compress.workflows import compress
-from tests.command import Command, contents
-from tests.nets import parsed
+from tests.support.command import Command, contents
+from tests.support.nets import parsed
 
 COMPRESS = ("compress", "in.onnx", "-o", "out.onnx", "--passes")
 

@@ -6,7 +6,7 @@ import pytest
 from me2e_compress import graph
 from me2e_compress.manager import recipe
 from me2e_compress.workflows.plan import PreparedGraph
-from tests.nets import conv_attention
+from tests.support.nets import conv_attention
 
 
 @pytest.mark.parametrize(

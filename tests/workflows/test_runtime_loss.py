@@ -9,8 +9,8 @@ import pytest
 
 import me2e_compress as me2e
 from me2e_compress import graph
-from tests.frames import record
-from tests.nets import net
+from tests.support.frames import record
+from tests.support.nets import net
 
 DEAD = """
 net (float[1,32,8,8] x, float[32,32,3,3] first, float[32] b, float[32,32,1,1] second)

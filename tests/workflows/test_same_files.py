@@ -12,7 +12,7 @@ from me2e_compress.manager import recipe
 from me2e_compress.registry.drafts import IN_JSON
 from me2e_compress.workflows.files import export_stack
 from me2e_compress.workflows.result import Result
-from tests.command import Command
+from tests.support.command import Command
 
 Call = Callable[[], object]
 MAP = "map.toml"
@@ -112,6 +112,7 @@ CASES: dict[str, tuple[str, Call]] = {
 }
 
 
+@pytest.mark.usefixtures("weights")
 @pytest.mark.parametrize("name", CASES)
 def test_a_workflow_is_silent_and_writes_what_its_command_writes(
     command: Command,
@@ -129,10 +130,13 @@ def test_a_workflow_is_silent_and_writes_what_its_command_writes(
     capfd.readouterr()
 
     monkeypatch.chdir(other)
-    call()
+    result = call()
 
     assert capfd.readouterr() == ("", "")
     assert written(other) == written(dense)
+    if isinstance(result, Result):
+        assert "\n" not in result.headline
+        assert result.headline in repr(result)
 
 
 def test_a_profile_is_silent_and_its_trace_may_be_charged(
@@ -151,6 +155,7 @@ def test_a_profile_is_silent_and_its_trace_may_be_charged(
     assert len(found.trace.samples_us) == 3
 
 
+@pytest.mark.usefixtures("short")
 def test_results_that_are_there_are_scored_silently(
     tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
@@ -176,21 +181,6 @@ def test_who_listens_hears_every_stage(dense: Path) -> None:
     )
 
     assert list(dict.fromkeys(heard)) == ["calibrate", "modules"]
-
-
-@pytest.mark.parametrize(
-    "name", ["compress", "calibrate", "plan", "compare", "inspect", "lint", "search"]
-)
-def test_a_result_shows_itself(
-    dense: Path, monkeypatch: pytest.MonkeyPatch, name: str
-) -> None:
-    monkeypatch.chdir(dense)
-
-    found = CASES[name][1]()
-
-    assert isinstance(found, Result)
-    assert "\n" not in found.headline
-    assert found.headline in repr(found)
 
 
 def written(folder: Path) -> dict[str, object]:

@@ -19,8 +19,8 @@ from me2e_compress.runtime.energy import EnergyResult
 from me2e_compress.simulator.routes import ROAD_VERSION, VERSION
 from me2e_compress.workflows.options import Joules
 from me2e_compress.workflows.score_eer import score_eer
-from tests.command import Cli
 from tests.metrics.drives import cruise, drive, infraction
+from tests.support.command import Cli
 
 CRASH = infraction(InfractionKind.COLLISION_VEHICLE)
 

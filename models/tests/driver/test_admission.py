@@ -108,7 +108,7 @@ LATE = DryRun((), Ending.BLOCKED, True, False, 75.0)
 @pytest.mark.parametrize(
     "route",
     [
-        pytest.param(route, id=route.id, marks=pytest.mark.slow if index % 3 else ())
+        pytest.param(route, id=route.id, marks=pytest.mark.slow if index % 6 else ())
         for index, route in enumerate(SAMPLE)
     ],
 )

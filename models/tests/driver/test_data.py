@@ -15,7 +15,7 @@ from me2e_compress.simulator.scene import Ego
 from models.driver.data import Episodes, Sequences
 from models.driver.errors import TrainingError
 from models.tests.driver.made import SIZE, arrays_of, write
-from tests.profiles import scaled
+from tests.support.profiles import scaled
 
 LENGTHS = (3, 9, 1, 14)
 

@@ -41,7 +41,7 @@ from tests.evaluators.highway.tiny_world import (
     ego_at,
     straight,
 )
-from tests.profiles import scaled
+from tests.support.profiles import scaled
 
 
 def look(path: RoutePath, *actors: Actor, intents: tuple[Intent, ...] = ()) -> Forecast:

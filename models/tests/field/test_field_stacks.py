@@ -23,7 +23,7 @@ from me2e_compress.workflows.lint import lint
 from me2e_compress.workflows.options import CompressOptions, LintOptions
 from models.tests.field.diffusion_drive import DIFFUSION_DRIVE
 from models.tests.field.transfuser import LEAD, FieldStack
-from tests.frames import record
+from tests.support.frames import record
 
 STACKS = {"lead": LEAD, "diffusion-drive": DIFFUSION_DRIVE}
 TARGETS = ("onnxruntime", "tensorrt")

@@ -36,7 +36,7 @@ from me2e_compress.targets.tensorrt.rtx_check import check
 from models.synthetic_frames import frames as drive
 from models.tests.vad.sizes import VadSize
 from models.vad.config import AGENT_MODES
-from tests.frames import record
+from tests.support.frames import record
 
 pytestmark = pytest.mark.xdist_group("vad")
 

@@ -22,9 +22,9 @@ from me2e_compress.study import Condition, Study, Timing, Variant, load_study, r
 from me2e_compress.study.definition import StudyBlock
 from me2e_compress.workflows.result import SILENT
 from tests.benchmarks.paper.made import write_records
-from tests.command import write_frames
 from tests.evaluators.highway.drivers import straight_on
 from tests.study.conftest import IDEAL
+from tests.support.command import write_frames
 from tests.support.in_process import Here
 
 CRASHED = Route("crashed", "Accident", 1)

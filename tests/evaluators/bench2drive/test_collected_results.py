@@ -24,7 +24,7 @@ from tests.evaluators.bench2drive.files import (
     recording,
     write,
 )
-from tests.profiles import scaled
+from tests.support.profiles import scaled
 
 OTHER = record(2082, "Accident", score=(60.0, 1.0, 60.0), status="Failed - TickRuntime")
 CRASHED = record(2084, status="Failed - Simulation crashed", score=(0, 1.0, 0))

@@ -29,7 +29,7 @@ from tests.evaluators.highway.tiny_world import (
     ego_at,
     straight,
 )
-from tests.profiles import scaled
+from tests.support.profiles import scaled
 
 LENGTH_M = 5.0
 AHEAD = np.array([[4.0 * k, 0.0] for k in range(1, 7)])

@@ -13,7 +13,7 @@ from me2e_compress.runtime.session import replay
 from me2e_compress.simulator.camera_rig import CameraRig
 from me2e_compress.simulator.routes import SCENARIO_ABILITIES, Route
 from tests.evaluators.highway.drivers import straight_on
-from tests.stand_in import write_model
+from tests.support.stand_in import write_model
 
 SIZE = (16, 24)
 

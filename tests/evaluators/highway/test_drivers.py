@@ -12,7 +12,7 @@ from me2e_compress.errors import EvaluationError
 from me2e_compress.evaluators.highway.drivers import OnnxDriver, image_size_of
 from models.driver.expert.blind import Blind
 from tests.evaluators.highway.drivers import straight_on
-from tests.installed import install
+from tests.support.installed import install
 
 
 def test_drivers_by_name() -> None:

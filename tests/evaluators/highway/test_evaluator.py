@@ -1,5 +1,4 @@
 import json
-import re
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -18,12 +17,10 @@ from me2e_compress.registry.drafts import is_marked
 from me2e_compress.simulator.routes import Route
 from me2e_compress.workflows.result import Listener
 from models.driver.expert.blind import BlindDriver
-from tests.command import contents
-from tests.evaluators.highway.drivers import CROSSING, EXIT, GREEN, PARKED, ROUTES
+from tests.evaluators.highway.drivers import CROSSING, EXIT, PARKED, ROUTES
 from tests.evaluators.highway.evaluations import TRACED, driven, made_by
-from tests.support.in_process import Here, here
-
-__all__ = ["here"]
+from tests.support.command import contents
+from tests.support.in_process import Here
 
 TWO = (CROSSING, PARKED)
 FASTER = BlindDriver(9.0)
@@ -174,15 +171,3 @@ def test_long_types_begin_in_whatever_order_they_come() -> None:
 
     assert [route.id for route in ordered] == ["green", "exit", "crossing", "parked"]
     assert longest_first(ROUTES[::-1]) == ordered
-
-
-@pytest.mark.usefixtures("here")
-def test_progress_runs_with_the_scores(tmp_path: Path) -> None:
-    reports = list[tuple[str, int, int, str]]()
-    listener = Listener(lambda *report: reports.append(report))
-
-    driven(tmp_path / "r", (PARKED, GREEN), listener=listener)
-
-    assert reports[0] == ("evaluate", 0, 2, "")
-    assert [done for _, done, *_ in reports] == [0, 1, 2]
-    assert re.fullmatch(r"DS [1-9]\d\.\d  SR \d+\.\d %", reports[-1][3])

@@ -19,12 +19,9 @@ from me2e_compress.evaluators import Drive
 from me2e_compress.evaluators.results import ResultsFolder
 from me2e_compress.metrics.episode import Ending, Episode
 from me2e_compress.simulator.routes import Route, save_routes
-from tests.command import contents
 from tests.evaluators.highway.drivers import CROSSING, EXIT, PARKED, MisbehavingDriver
 from tests.evaluators.highway.evaluations import driven, made_by
-from tests.support.in_process import here
-
-__all__ = ["here"]
+from tests.support.command import contents
 
 BLIND = "models.driver.expert:Blind"
 

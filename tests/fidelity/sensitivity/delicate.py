@@ -12,8 +12,8 @@ from me2e_compress.passes import Context
 from me2e_compress.passes.quantize_int8 import QuantizeInt8
 from me2e_compress.quantization.rules import RULE_SETS
 from me2e_compress.targets import TARGETS
-from tests.frames import record
-from tests.nets import MODULES, net
+from tests.support.frames import record
+from tests.support.nets import MODULES, net
 
 LAYERS = 6
 

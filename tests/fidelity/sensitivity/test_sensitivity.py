@@ -29,7 +29,7 @@ from me2e_compress.runtime.frames import Frame
 from me2e_compress.runtime.session import Session
 from me2e_compress.workflows.search import SearchResult
 from tests.fidelity.sensitivity.delicate import delicate, trials
-from tests.nets import MODULES, parsed
+from tests.support.nets import MODULES, parsed
 
 
 @pytest.mark.parametrize("bad", [2, 3, 5])

@@ -32,7 +32,6 @@ from me2e_compress.manager.pass_manager import PassManager
 from me2e_compress.manager.report import Report
 from me2e_compress.manager.reproducer import shrink
 from me2e_compress.passes import Context, Pass
-from tests.frames import record
 from tests.fuzz.exact import pipelines as texts
 from tests.fuzz.exact.drawing import drawing
 from tests.fuzz.exact.int8 import HALF, WHOLE, StrippingError, constants, stripped
@@ -43,6 +42,7 @@ from tests.fuzz.exact.running import (
     drawn_inputs,
     open_sizes,
 )
+from tests.support.frames import record
 
 Kind = Literal[
     "right", "unchanged", "refused", "wrong", "crash", "does-not-load",

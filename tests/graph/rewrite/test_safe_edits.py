@@ -14,7 +14,7 @@ from me2e_compress import graph
 from me2e_compress.errors import GraphError
 from me2e_compress.graph import rewrite
 from me2e_compress.manager.attempt import check_valid
-from tests.nets import parsed
+from tests.support.nets import parsed
 
 X = np.array([[-2.0, 0.5, 3.0]], np.float32)
 

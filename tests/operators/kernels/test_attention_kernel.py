@@ -14,7 +14,7 @@ from me2e_compress.operators.multi_head_attention import FusedMultiHeadAttention
 from me2e_compress.runtime import runnable
 from me2e_compress.runtime.session import Session
 from tests.operators.running import graph_of
-from tests.profiles import scaled
+from tests.support.profiles import scaled
 
 pytestmark = pytest.mark.skipif(
     kernels.why_not() is not None, reason=str(kernels.why_not())

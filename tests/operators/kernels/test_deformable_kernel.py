@@ -17,7 +17,7 @@ from me2e_compress.runtime.session import Session
 from me2e_compress.testing.check_operator import DrawnCall, dialect_reference
 from tests.operators.running import graph_of, in_float32
 from tests.operators.test_deformable_attention import arrays_of
-from tests.profiles import scaled
+from tests.support.profiles import scaled
 
 pytestmark = pytest.mark.skipif(
     kernels.why_not() is not None, reason=str(kernels.why_not())

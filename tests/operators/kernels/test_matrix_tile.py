@@ -9,7 +9,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from me2e_compress.operators import kernels
-from tests.profiles import scaled
+from tests.support.profiles import scaled
 
 pytestmark = pytest.mark.skipif(
     kernels.why_not() is not None, reason=str(kernels.why_not())

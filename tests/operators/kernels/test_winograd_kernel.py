@@ -15,7 +15,7 @@ from me2e_compress.operators import kernels
 from me2e_compress.operators.winograd_convolution import WinogradConvolution
 from me2e_compress.runtime.session import Session
 from tests.operators.running import graph_of
-from tests.profiles import scaled
+from tests.support.profiles import scaled
 
 pytestmark = pytest.mark.skipif(
     kernels.why_not() is not None, reason=str(kernels.why_not())

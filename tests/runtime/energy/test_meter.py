@@ -14,11 +14,11 @@ from me2e_compress.graph import sha256_of
 from me2e_compress.runtime.energy.energy_counter import EnergySchedule, Recorded
 from me2e_compress.runtime.energy.energy_result import EnergyResult
 from me2e_compress.runtime.energy.meter import EnergyMeter, measure_energy
-from tests.installed import install
 from tests.runtime.energy.clockwork import Clock
 from tests.runtime.energy.opened import Driver
 from tests.runtime.energy.world import World
 from tests.runtime.test_profile import FRAMES, model
+from tests.support.installed import install
 
 __all__ = ["model"]
 

@@ -22,8 +22,8 @@ from me2e_compress.simulator.cameras.ground import GroundTexture, paint_texture
 from me2e_compress.simulator.cameras.renderer import Cameras
 from me2e_compress.simulator.plane_geometry import Roadmap
 from me2e_compress.simulator.scene import Ego, SignalState
-from tests.profiles import scaled
 from tests.simulator.cameras import town
+from tests.support.profiles import scaled
 
 FRONT = CAMERA_NAMES.index("FRONT")
 

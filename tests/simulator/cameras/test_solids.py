@@ -14,8 +14,8 @@ from me2e_compress.simulator.scene import (
     ActorKind,
     SignalState,
 )
-from tests.profiles import scaled
 from tests.simulator.cameras import town
+from tests.support.profiles import scaled
 
 Floats = npt.NDArray[np.float64]
 FRONT, FRONT_LEFT, FRONT_RIGHT, BACK = (

@@ -10,7 +10,7 @@ from onnx_ir import convenience
 
 from me2e_compress.graph import rewrite
 from me2e_compress.runtime.session import Session
-from tests.nets import parsed
+from tests.support.nets import parsed
 from tests.targets.onnxruntime.lowered import Floats
 
 Draw = Callable[[np.random.Generator], tuple[dict[str, object], list[object]]]

@@ -17,8 +17,8 @@ from me2e_compress.calibration.ranges import Ranges
 from me2e_compress.quantization.plan import make_plan
 from me2e_compress.runtime.session import Session
 from me2e_compress.targets.onnxruntime import OnnxRuntime
-from tests.frames import record
-from tests.nets import FULL, PAPER, drawn, placed
+from tests.support.frames import record
+from tests.support.nets import FULL, PAPER, drawn, placed
 
 Floats = npt.NDArray[np.float32]
 Feeds = Mapping[str, Floats]

@@ -7,7 +7,7 @@ import numpy as np
 import onnx_ir as ir
 
 from me2e_compress import graph
-from tests.nets import parsed, stored
+from tests.support.nets import parsed, stored
 
 SIZE = 8
 """Channels and columns."""

@@ -9,7 +9,7 @@ from me2e_compress.graph.nodes import scalar_of
 from me2e_compress.quantization.plan import make_plan
 from me2e_compress.targets.onnxruntime import OnnxRuntime, convert, unranged
 from me2e_compress.targets.tensorrt import TensorRT
-from tests.nets import FULL, PAPER, drawn, net
+from tests.support.nets import FULL, PAPER, drawn, net
 from tests.targets.onnxruntime.lowered import (
     calibrated,
     feeds,

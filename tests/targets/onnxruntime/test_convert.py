@@ -8,7 +8,7 @@ from me2e_compress.errors import PreconditionError
 from me2e_compress.quantization.plan import make_plan
 from me2e_compress.targets.onnxruntime import convert, unranged
 from me2e_compress.targets.tensorrt import TensorRT
-from tests.nets import FULL, PAPER, conv_attention, drawn, parsed
+from tests.support.nets import FULL, PAPER, conv_attention, drawn, parsed
 from tests.targets.onnxruntime.lowered import (
     IMAGE,
     TOKENS,

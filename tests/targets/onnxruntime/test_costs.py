@@ -15,7 +15,7 @@ from me2e_compress.quantization.scheme import QuantScheme
 from me2e_compress.runtime.optimized import optimized
 from me2e_compress.targets.onnxruntime import OnnxRuntime
 from me2e_compress.targets.onnxruntime.costs import work_of
-from tests.nets import FULL, MODULES, drawn, net
+from tests.support.nets import FULL, MODULES, drawn, net
 from tests.targets.onnxruntime.lowered import Feeds, feeds, measured, ran, sqnr_db
 
 HEAD = QuantScheme.of(("head",), MODULES)

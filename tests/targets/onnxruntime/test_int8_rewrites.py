@@ -10,8 +10,8 @@ from me2e_compress.graph import array_of
 from me2e_compress.runtime.optimized import optimized
 from me2e_compress.runtime.session import Session
 from me2e_compress.targets.onnxruntime import OnnxRuntime, int8_layers, int8_rewrites
-from tests.nets import net, placed
-from tests.profiles import scaled
+from tests.support.nets import net, placed
+from tests.support.profiles import scaled
 from tests.targets.onnxruntime.rewritten import SIZE, STEP, Drawn
 
 FAR_DB, ROUNDED_DB = 26.0, 60.0

@@ -17,8 +17,8 @@ from me2e_compress.targets.onnxruntime.lower import (
 )
 from me2e_compress.targets.weights import QuantizedWeight
 from me2e_compress.targets.writer import Writer
-from tests.nets import FULL, drawn, net
-from tests.profiles import scaled
+from tests.support.nets import FULL, drawn, net
+from tests.support.profiles import scaled
 from tests.targets.onnxruntime.lowered import (
     calibrated,
     feeds,

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from me2e_compress.targets.onnxruntime import OnnxRuntime
-from tests.nets import net, parsed, placed
+from tests.support.nets import net, parsed, placed
 
 
 @pytest.mark.parametrize(

@@ -3,7 +3,7 @@
 import pytest
 
 from me2e_compress.targets.onnxruntime.region import objection
-from tests.nets import parsed
+from tests.support.nets import parsed
 
 GRAPH = """g (float[1,2,4,4] x) => (float[1,2,4,4] y)
 <float[2,2,1,1] w = {1,2,3,4}, float two = {2}> {

@@ -13,7 +13,7 @@ from me2e_compress.targets.onnxruntime.region import (
     is_move,
     never_negative,
 )
-from tests.calls import calls
+from tests.support.calls import calls
 from tests.targets.onnxruntime.draws import (
     AVERAGED,
     MOVED,

@@ -10,7 +10,7 @@ from me2e_compress.graph import provenance
 from me2e_compress.quantization.plan import make_plan
 from me2e_compress.runtime.optimized import optimized
 from me2e_compress.targets.onnxruntime import OnnxRuntime, int8_layers
-from tests.nets import FULL, PAPER, conv_attention, drawn, placed
+from tests.support.nets import FULL, PAPER, conv_attention, drawn, placed
 from tests.targets.onnxruntime.lowered import (
     IMAGE,
     TOKENS,

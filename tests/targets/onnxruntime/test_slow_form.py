@@ -21,7 +21,7 @@ from me2e_compress.runtime.providers import (
     TensorRtRtxProvider,
 )
 from me2e_compress.targets.onnxruntime import OnnxRuntime, slow_here
-from tests.nets import conv_attention, drawn, parsed, placed, save_text
+from tests.support.nets import conv_attention, drawn, parsed, placed, save_text
 from tests.targets.onnxruntime.lowered import (
     MATMUL_RELU,
     calibrated,

@@ -2,7 +2,7 @@
 
 import onnx_ir as ir
 
-from tests.nets import drawn
+from tests.support.nets import drawn
 
 LAYERS = """
 <ir_version: 9, opset_import: ["" : %d]>

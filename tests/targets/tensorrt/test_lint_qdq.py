@@ -13,8 +13,8 @@ import pytest
 from me2e_compress.graph import rewrite
 from me2e_compress.targets import LintFinding
 from me2e_compress.targets.tensorrt import TensorRT
-from tests.nets import conv_attention, net, parsed, placed
 from tests.passes.small import read
+from tests.support.nets import conv_attention, net, parsed, placed
 
 RUNTIME = TensorRT(version="10.7")
 

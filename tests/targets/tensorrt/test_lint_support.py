@@ -7,7 +7,7 @@ import pytest
 from me2e_compress.targets import TARGETS, LintFinding
 from me2e_compress.targets.tensorrt import TensorRT
 from me2e_compress.targets.tensorrt.lint.support import LATER, SUPPORTED, UNSUPPORTED
-from tests.plugins import exported
+from tests.support.plugins import exported
 
 
 def found(text: str, opset: int = 17) -> list[LintFinding]:

@@ -18,9 +18,9 @@ from me2e_compress.quantization.scheme import QuantScheme
 from me2e_compress.runtime.session import Session, run_once
 from me2e_compress.targets.tensorrt import TensorRT
 from me2e_compress.targets.tensorrt.rtx_check import check
-from tests import nets
-from tests.nets import FULL, MODULES, conv_attention, drawn, net
-from tests.profiles import scaled
+from tests.support import nets
+from tests.support.nets import FULL, MODULES, conv_attention, drawn, net
+from tests.support.profiles import scaled
 from tests.targets.tensorrt.layers import SHAPES, layers
 
 PARTS = ("int8", "scale", "zero")

@@ -21,7 +21,7 @@ from me2e_compress.targets.tensorrt.rtx_check import (
     check,
     cut,
 )
-from tests.nets import FULL, conv_attention, net, parsed, placed
+from tests.support.nets import FULL, conv_attention, net, parsed, placed
 from tests.targets.tensorrt.layers import layers
 
 RTX = pytest.mark.skipif(

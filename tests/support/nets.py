@@ -43,6 +43,28 @@ net (float[1,3,8,8] image, float[1,8,64] memory,
 """
 
 
+DRIVER = """
+<ir_version: 9, opset_import: ["" : 17]>
+driver (float[1,4] camera) => (float[1,4] plan) {
+    ["/backbone/Relu"] features = Relu(camera)
+    ["/occ_head/Sigmoid"] occupancy = Sigmoid(features)
+    ["/plan_head/Add"] plan = Add(features, occupancy)
+}
+"""
+
+DRIVER_MAP = """
+[modules.backbone]
+role = "feature"
+optional = ["backbone"]
+[modules.occ]
+role = "prediction"
+optional = ["occ_head"]
+[modules.planner]
+role = "prediction"
+optional = ["plan_head"]
+"""
+
+
 def map_text(**roles: str) -> str:
     """Write a map of modules, each of the nodes below its own name."""
     return "".join(

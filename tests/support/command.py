@@ -13,10 +13,9 @@ import pytest
 
 from me2e_compress import graph
 from me2e_compress.cli import main
-from tests.conftest import DRIVER, DRIVER_MAP
 from tests.docs.documents import faults
-from tests.frames import record
-from tests.nets import parsed, stored
+from tests.support.frames import record
+from tests.support.nets import DRIVER, DRIVER_MAP, parsed, stored
 
 Command = Callable[..., int]
 

@@ -10,8 +10,8 @@ from me2e_compress.graph import rewrite
 from me2e_compress.graph.stack.join import JoinedStack
 from me2e_compress.runtime.frames import Frame
 from me2e_compress.runtime.session import Session
-from tests.frames import record
-from tests.nets import parsed
+from tests.support.frames import record
+from tests.support.nets import parsed
 
 BACKBONE = """
 backbone (float[1,4] img) => (float[1,4] feats) <float[1] two = {2}>

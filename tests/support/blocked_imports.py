@@ -1,6 +1,6 @@
 """What fails where packages are missing: run as a script, each case in a process.
 
-python tests/blocked_imports.py CASES.json
+python tests/support/blocked_imports.py CASES.json
 
 CASES.json maps a name to the modules that are not there. Printed is, by name, the error
 of every module of ours that cannot be imported, that of every public name that cannot

@@ -11,7 +11,7 @@ from onnx import numpy_helper
 
 from me2e_compress.shipped import drivers
 from me2e_compress.shipped.drivers import SHIPPED
-from tests.frames import record
+from tests.support.frames import record
 
 WIDTH = 8
 BODY = """

@@ -1,3 +1,0 @@
-from tests.command import cli, command, dense, files
-
-__all__ = ["cli", "command", "dense", "files"]
