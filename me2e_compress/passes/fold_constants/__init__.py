@@ -13,18 +13,17 @@ and asked again. A group that shrinks the weights always goes.
 """
 
 import dataclasses
-import hashlib
 import math
 from collections import Counter
 from collections.abc import Container, Iterable
 from typing import ClassVar
 
-import numpy as np
 import onnx_ir as ir
 
 from me2e_compress import graph as graphs
 from me2e_compress.display import counted
 from me2e_compress.graph import provenance
+from me2e_compress.graph.digest import digest_of_tensor
 from me2e_compress.graph.nodes import Array, graphs_of
 from me2e_compress.graph.rewrite import (
     add_constant,
@@ -333,7 +332,7 @@ def _commit(
     # Names of the removed nodes are free again
     leave = {value.name for one in gone for n in one.nodes for value in n.outputs}
     names = value_names(graph) - leave
-    stored: dict[tuple[str, tuple[int, ...], bytes], ir.Value] = {}
+    stored: dict[bytes, ir.Value] = {}
     place = {
         value: (one, index)
         for one in gone
@@ -345,8 +344,7 @@ def _commit(
         is_output = any(node.outputs[index].is_graph_output() for node in one.nodes)
         label = f"{value.name}_value" if is_output else value.name or ""
         array = arrays[value]
-        content = hashlib.blake2b(np.ascontiguousarray(array).tobytes(), digest_size=16)
-        key = (str(array.dtype), array.shape, content.digest())
+        key = digest_of_tensor(ir.tensor(array))
         if key not in stored:
             stored[key] = add_constant(graph, array, label, names)
         weight = stored[key]
