@@ -72,6 +72,7 @@ class Highway(Evaluator):
         if policy is None:
             raise EvaluationError(f"{self.name} drives a policy: name one")
         need_extra("highway", "driving")
+        image_size = image_size_of(opened(policy))  # before its file is read
         made = drive.conditions()
         weather = made.pop("weather")
         return {
@@ -79,7 +80,7 @@ class Highway(Evaluator):
             "version": __version__,
             "policy": policy.fingerprint(),
             **made,
-            "image_size": list(image_size_of(opened(policy))),
+            "image_size": list(image_size),
             "weather": weather,
             "frame_limit_s": drive.frame_limit_s,
             "set_size": drive.set_size,
