@@ -18,7 +18,6 @@ from me2e_compress.passes.base import PassResult
 from me2e_compress.passes.fuse_operators import FuseOperators, numeric_check
 from tests.passes.decomposed import FUSED, Sizes, decomposed, inferred, plain
 from tests.passes.small import NO_MODULES, apply, compute, fed, ops, read
-from tests.support.nets import stored
 from tests.support.profiles import scaled
 
 SEED = 3

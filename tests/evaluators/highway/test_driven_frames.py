@@ -11,7 +11,7 @@ from me2e_compress.evaluators.highway.driven_frames import driven_frames, fresh_
 from me2e_compress.runtime.frames import Frame
 from me2e_compress.runtime.session import replay
 from me2e_compress.simulator.camera_rig import CameraRig
-from me2e_compress.simulator.routes import SCENARIO_ABILITIES, Route
+from me2e_compress.simulator.routes import Route
 from tests.evaluators.highway.drivers import straight_on
 from tests.support.stand_in import write_model
 
@@ -123,7 +123,7 @@ def test_the_types_take_turns_and_another_seed_has_other_routes(
 
 
 def bare(scenario: str, seed: int, name: str) -> Route:
-    return Route(name, scenario, SCENARIO_ABILITIES[scenario][0], seed)
+    return Route(name, scenario, seed)
 
 
 def test_no_route_is_one_that_drivers_are_judged_on(
