@@ -37,8 +37,7 @@ class Writer:
 
     def call(self, before: ir.Node, sources: Sequence[ir.Node]) -> FusedCall:
         """Return what inserts nodes in front of one; they stand for the sources."""
-        opset = graph.opset_of(self.graph)
-        call = FusedCall(before, opset=opset, by=BY, names=self.names)
+        call = _SharingCall(self, before)
         call.sources = tuple(sources)
         return call
 
@@ -115,3 +114,18 @@ class Writer:
         node.outputs[0].type = steps.type
         self.graph.insert_before(reader, node)
         return node.outputs[0]
+
+
+class _SharingCall(FusedCall):
+    """Inserts nodes whose constants are the writer's, one for all of the same sizes."""
+
+    def __init__(self, writer: Writer, node: ir.Node) -> None:
+        opset = graph.opset_of(writer.graph)
+        super().__init__(node, opset=opset, by=BY, names=writer.names)
+        self._writer = writer
+
+    def constant(
+        self, array: npt.NDArray[np.generic], name: str = "constant"
+    ) -> ir.Value:
+        """Return the initializer of an array."""
+        return self._writer.constant(array, name)
