@@ -8,7 +8,7 @@ import importlib
 import os
 from typing import TYPE_CHECKING
 
-from me2e_compress.extras import explained
+from me2e_compress.extras import with_install_hint
 from me2e_compress.version import __version__ as __version__
 
 # onnxruntime (1.31), as soon as it is loaded, would write a device id and a database
@@ -101,21 +101,21 @@ if not TYPE_CHECKING:  # else every name would be one for a type checker
     __all__ = sorted([*_HOMES, "__version__", "graph"])
 
     def __getattr__(name: str) -> object:
-        """Load a public name when it is asked for: a worker pays for what it uses."""
+        """Import a public name on first use: a worker loads only what it uses."""
         if name in _MODULES:
             return importlib.import_module(f"me2e_compress.{name}")
         if name in _HOMES:
             try:
                 home = importlib.import_module(f"me2e_compress.{_HOMES[name]}")
             except ImportError as error:
-                if (told := explained(error)) is error:
+                if (hint := with_install_hint(error)) is error:
                     raise
-                raise told from error
+                raise hint from error
             return getattr(home, name)
         raise AttributeError(f"me2e_compress has no {name}")
 
 
 def __dir__() -> list[str]:
-    """List the public names and what is loaded, for completion."""
+    """List the public names and those already loaded, for completion."""
     dunders = (name for name in globals() if name.startswith("__"))
     return sorted({*_HOMES, *_MODULES, *dunders})

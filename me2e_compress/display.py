@@ -1,4 +1,4 @@
-"""Tables, and how numbers and counts are written in them."""
+"""Tables, and how numbers, counts and names are written in them and in messages."""
 
 import html
 import math
@@ -6,10 +6,10 @@ import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
-AT_LEAST = "≥ or -: plugins and open shapes are not counted; inspect names them"
-"""What a table says of MACs that are a lower bound."""
+LOWER_BOUND = "≥ or -: plugins and open shapes are not counted; inspect names them"
+"""The note of a table some of whose MACs are a lower bound."""
 
-_UNSEEN = re.compile(
+_UNPRINTABLE = re.compile(
     "[\x00-\x09\x0b-\x1f\x7f-\x9f\u200b-\u200f\u2028-\u202e\u2060-\u206f"
     "\ud800-\udfff\ufeff\ufff9-\ufffb]"
 )
@@ -17,9 +17,9 @@ _UNSEEN = re.compile(
 and halves of characters: they steer a terminal, or no file can hold them."""
 
 
-def printable(text: str) -> str:
-    """Write what cannot be seen in a text, but ends of lines, as escapes."""
-    return _UNSEEN.sub(
+def escape_controls(text: str) -> str:
+    """Return a text with what cannot be seen, but ends of lines, as escapes."""
+    return _UNPRINTABLE.sub(
         lambda match: match.group().encode("unicode_escape").decode(), text
     )
 
@@ -28,7 +28,7 @@ def printable(text: str) -> str:
 class Cell:
     """A number or words as shown, and its interval, if any, in smaller type.
 
-    ``reason`` is why there is no number; empty if there is one.
+    ``reason`` is why there is no number; empty where there is one.
     """
 
     text: str
@@ -38,16 +38,16 @@ class Cell:
 
 @dataclass(frozen=True)
 class Table:
-    """Rows of one thing each: the first columns are words, the others are numbers.
+    """A table: the first columns are words, the others are numbers.
 
     Attributes:
-        title: Heads it.
-        columns: With their units.
-        rows: As wide as the columns.
-        note: What a reader must know; a few sentences, or a few lines.
-        strong: Name of the row that the others are held against.
-        words: How many of the first columns are words.
-        details: Lines for who wants to know more; ``-v`` shows them.
+        title: the line above it.
+        columns: headings, with their units.
+        rows: a cell for each column.
+        note: what a reader must know; a few sentences, or a few lines.
+        strong: name of the row that the others are compared with.
+        words: how many of the first columns are words.
+        details: lines below it that ``-v`` shows.
     """
 
     title: str
@@ -58,27 +58,27 @@ class Table:
     words: int = 1
     details: str = ""
 
-    def printable(self) -> "Table":
-        """Return it with what cannot be seen as escapes; a name is on one line."""
+    def escape_controls(self) -> "Table":
+        """Return it with what cannot be seen as escapes, titles and cells on a line."""
         rows = (
-            tuple(replace(each, text=_on_one_line(each.text)) for each in row)
+            tuple(replace(each, text=_escape_newlines(each.text)) for each in row)
             for row in self.rows
         )
         return replace(
             self,
-            title=_on_one_line(self.title),
+            title=_escape_newlines(self.title),
             rows=tuple(rows),
-            note=printable(self.note),
-            details=printable(self.details),
+            note=escape_controls(self.note),
+            details=escape_controls(self.details),
         )
 
     def markdown(self) -> str:
-        """Write it as GitHub shows it, intervals in brackets, every name escaped."""
+        """Return GitHub's Markdown, intervals in brackets, every text escaped."""
         rule = "|---|" + "---:|" * (len(self.columns) - 1)
-        rows = [[in_markdown(in_words(cell)) for cell in row] for row in self.rows]
-        lines = [_line(self.columns), rule, *map(_line, rows)]
-        title = f"**{in_markdown(self.title)}**"
-        parts = [title, "\n".join(lines), *filter(None, [in_markdown(self.note)])]
+        rows = [[escape_markdown(cell_text(cell)) for cell in row] for row in self.rows]
+        lines = [_markdown_row(self.columns), rule, *map(_markdown_row, rows)]
+        title = f"**{escape_markdown(self.title)}**"
+        parts = [title, "\n".join(lines), *filter(None, [escape_markdown(self.note)])]
         return "\n\n".join(parts) + "\n"
 
 
@@ -90,102 +90,105 @@ def table(
     words: int = 1,
     details: str = "",
 ) -> Table:
-    """Build a table of plain texts."""
+    """Build a table whose cells are plain texts."""
     cells = tuple(tuple(map(Cell, row)) for row in rows)
     return Table(title, tuple(columns), cells, note, words=words, details=details)
 
 
-def number(value: float | None, form: str = ",.0f") -> str:
-    """Write a number, or a dash for what was not measured; never a negative zero."""
+def format_number(value: float | None, form: str = ",.0f") -> str:
+    """Write a number, never as a negative zero; a dash for what was not measured.
+
+    ``form`` is a format without fill, alignment or width, such as ``+.1f``.
+    """
     if value is None:
         return "-"
     sign = "+" if form.startswith("+") else ""
     return format(value, f"{sign}z{form.removeprefix('+')}")
 
 
-def significant(value: float | None, digits: int = 4) -> str:
-    """Write a number in so many digits, but no powers of ten: 4,778,000 and 0.00012.
+def format_significant(value: float | None, digits: int = 4) -> str:
+    """Write a number in so many digits, without an exponent: 4,778,000 and 0.00012.
 
-    Digits before the point are all written, and no zeros at the end of the others.
+    All digits before the point are written, and no zeros at the end behind it.
     """
     if value is None or not math.isfinite(value):
-        return number(value)
+        return format_number(value)
     before = math.floor(math.log10(abs(value))) + 1 if value else 1
-    text = number(value, f",.{max(0, digits - before)}f")
+    text = format_number(value, f",.{max(0, digits - before)}f")
     return text.rstrip("0").rstrip(".") if "." in text else text
 
 
-def counted(count: float, noun: str) -> str:
-    """Write how many there are: ``1 thread``, ``2,000 routes``, ``1.67 decisions``."""
-    text = f"{count:,}" if isinstance(count, int) else significant(count)
+def plural(count: float, noun: str) -> str:
+    """Write a count of things: ``1 thread``, ``2,000 routes``, ``1.67 decisions``."""
+    text = f"{count:,}" if isinstance(count, int) else format_significant(count)
     return f"{text} {noun}{'' if text == '1' else 's'}"
 
 
-def some_of(names: Sequence[str], most: int = 5) -> str:
-    """Write the first of many names, and how many more there are."""
+def join_names(names: Sequence[str], most: int = 5) -> str:
+    """Write at most so many names, and how many more there are."""
     more = f" and {len(names) - most:,} more" if len(names) > most else ""
     return ", ".join(names[:most]) + more
 
 
-def duration(seconds: float) -> str:
-    """Write a time as people say it: ``40 s``, ``3 min``, ``2 h 5 min``."""
+def format_duration(seconds: float) -> str:
+    """Write a duration: ``40 s``, ``3 min``, ``2 h 5 min``."""
     if seconds < 90:
         return f"{max(seconds, seconds > 0):.0f} s"
     hours, minutes = divmod(round(seconds / 60), 60)
     return f"{hours} h {minutes} min" if hours else f"{minutes} min"
 
 
-def prefixed(name: str, text: str) -> str:
-    """Write who says something before it, once."""
+def with_prefix(name: str, text: str) -> str:
+    """Put a name and a colon before a text that does not begin with them."""
     return text if text.startswith(f"{name}:") else f"{name}: {text}"
 
 
-def reason(error: BaseException) -> str:
-    """Write on one line why something failed; its kind where it says no more."""
+def error_line(error: BaseException) -> str:
+    """Return an error's message, on one line of 200 characters at most, or its type."""
     return " ".join(str(error).split())[:200] or type(error).__name__
 
 
-def not_measured(reasons: Mapping[str, str]) -> str:
-    """Write why things have no number, for the note of their table; empty if all have.
+def missing_note(reasons: Mapping[str, str]) -> str:
+    """Return a table's note on what was not measured, empty without ``reasons``.
 
-    ``reasons`` are by the name of the row.
+    They are by the name of the row; rows of one reason are named together.
     """
-    rows = {why: list[str]() for why in reasons.values()}
-    for name, why in reasons.items():
-        rows[why].append(name.strip())
-    reasons_of = (f"{', '.join(names)} ({why})" for why, names in rows.items())
-    return f"Not measured: {'; '.join(reasons_of)}." if reasons else ""
+    names_by_reason = {reason: list[str]() for reason in reasons.values()}
+    for name, reason in reasons.items():
+        names_by_reason[reason].append(name.strip())
+    parts = (f"{', '.join(names)} ({why})" for why, names in names_by_reason.items())
+    return f"Not measured: {'; '.join(parts)}." if reasons else ""
 
 
-def megabytes(count: float) -> str:
-    """Write bytes as MB (1e6)."""
+def format_mb(count: float) -> str:
+    """Write bytes in MB (1e6 bytes), to two decimals."""
     return f"{count / 1e6:.2f}"
 
 
-def giga(macs: int | None, unknown: int | None = 0, form: str = ".2f") -> str:
-    """Write MACs in billions, as a lower bound where those of some nodes are unknown.
+def format_gmacs(macs: int | None, unknown: int | None = 0, form: str = ".2f") -> str:
+    """Write MACs in billions, with ≥ where ``unknown`` nodes are not counted.
 
-    ``macs`` is None if none are known.
+    A dash where none are known; ``form`` is a format.
     """
     if macs is None:
         return "-"
     return ("≥ " if unknown else "") + format(macs / 1e9, form)
 
 
-def in_markdown(text: str) -> str:
-    """Write a text so that Markdown shows it as it is: no HTML, no columns."""
-    lines = html.escape(printable(text), quote=False).splitlines()
+def escape_markdown(text: str) -> str:
+    """Return a text on one line that Markdown shows as it is: no HTML, no columns."""
+    lines = html.escape(escape_controls(text), quote=False).splitlines()
     return " ".join(lines).replace("|", "\\|")
 
 
-def _on_one_line(text: str) -> str:
-    return printable(text).replace("\n", "\\n")
+def _escape_newlines(text: str) -> str:
+    return escape_controls(text).replace("\n", "\\n")
 
 
-def _line(cells: Iterable[str]) -> str:
+def _markdown_row(cells: Iterable[str]) -> str:
     return "| " + " | ".join(cells) + " |"
 
 
-def in_words(cell: Cell) -> str:
+def cell_text(cell: Cell) -> str:
     """Write a cell on one line, its interval in brackets."""
     return f"{cell.text} ({cell.detail})" if cell.detail else cell.text

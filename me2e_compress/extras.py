@@ -20,7 +20,7 @@ _EXTRA_OF = {
 
 
 def missing_module(extras: str) -> str:
-    """Return the first module of these extras that is not installed; empty for none.
+    """Return the first module of these extras that is not installed, empty if all are.
 
     ``extras`` are names, separated by commas.
     """
@@ -28,20 +28,19 @@ def missing_module(extras: str) -> str:
     return next((module for module in wanted if util.find_spec(module) is None), "")
 
 
-def need_extra(extras: str, what: str) -> None:
-    """Raise a MissingExtraError unless these extras are installed.
+def require_extra(extras: str, user: str) -> None:
+    """Raise a MissingExtraError unless these extras are installed; import nothing.
 
-    ``extras`` are names, separated by commas; ``what`` needs them, for the message.
-    Nothing is imported.
+    ``extras`` are names, separated by commas; ``user``, for the message, needs them.
     """
     if module := missing_module(extras):
-        raise MissingExtraError(f"{module}, which {what} needs,", extras)
+        raise MissingExtraError(f"{module}, which {user} needs,", extras)
 
 
-def explained(error: Exception) -> Exception:
-    """Return what to tell the user of an error: of a failed import, what to install.
+def with_install_hint(error: Exception) -> Exception:
+    """Return an error that says what to install, for a failed import of an extra.
 
-    An error that has nothing to do with our extras is returned as it is.
+    Any other error is returned as it is.
     """
     if not isinstance(error, ImportError | OSError):
         return error

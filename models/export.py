@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING
 import onnx
 
 from me2e_compress import graph
-from me2e_compress.display import megabytes
+from me2e_compress.display import format_mb
 from me2e_compress.errors import GraphError, Me2eError, RecipeError
 from me2e_compress.graph import file_bytes
 from me2e_compress.operators.deformable_attention import DeformableAttention
@@ -289,7 +289,7 @@ def export_stack(
                 stack, options.weights, heads=options.heads, ema=options.ema
             )
         _written(stack, output, options, weights)
-    size = megabytes(file_bytes(output))
+    size = format_mb(file_bytes(output))
     line = f"{output}: {stack}, opset {options.opset}, {size} MB"
     said = () if weights is None else weights.record.lines()
     return (line, *said, *((IMAGES,) if said and stack == "vad-tiny" else ()))

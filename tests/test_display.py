@@ -3,12 +3,12 @@
 import pytest
 
 from me2e_compress.display import (
-    counted,
-    not_measured,
-    number,
-    prefixed,
-    reason,
-    significant,
+    error_line,
+    format_number,
+    format_significant,
+    missing_note,
+    plural,
+    with_prefix,
 )
 from me2e_compress.quantization.decision import Decision, QuantPlan
 from me2e_compress.quantization.scheme import QuantScheme
@@ -41,7 +41,7 @@ def test_a_plan_has_a_row_a_module_with_the_rules_that_kept_float() -> None:
 def test_no_number_is_a_negative_zero(
     value: float | None, form: str, text: str
 ) -> None:
-    assert number(value, form) == text
+    assert format_number(value, form) == text
 
 
 @pytest.mark.parametrize(
@@ -59,7 +59,7 @@ def test_no_number_is_a_negative_zero(
     ],
 )
 def test_no_number_is_in_powers_of_ten(value: float | None, text: str) -> None:
-    assert significant(value) == text
+    assert format_significant(value) == text
 
 
 @pytest.mark.parametrize(
@@ -70,21 +70,21 @@ def test_no_number_is_in_powers_of_ten(value: float | None, text: str) -> None:
     ],
 )
 def test_one_is_singular(count: float, text: str) -> None:
-    assert counted(count, "thread") == text
+    assert plural(count, "thread") == text
 
 
 def test_lines_say_who_and_why_once() -> None:
-    assert prefixed("battery", "none here") == "battery: none here"
-    assert prefixed("battery", "battery: none here") == "battery: none here"
-    assert reason(EOFError()) == "EOFError"
-    assert reason(ValueError("two\n lines")) == "two lines"
+    assert with_prefix("battery", "none here") == "battery: none here"
+    assert with_prefix("battery", "battery: none here") == "battery: none here"
+    assert error_line(EOFError()) == "EOFError"
+    assert error_line(ValueError("two\n lines")) == "two lines"
 
 
 def test_what_is_not_measured_is_told_once_a_reason() -> None:
     why = {"  Merging": "no route", "p99": "too few", "Give_Way": "no route"}
 
-    assert not_measured({}) == ""
+    assert missing_note({}) == ""
     assert (
-        not_measured(why)
+        missing_note(why)
         == "Not measured: Merging, Give_Way (no route); p99 (too few)."
     )

@@ -21,7 +21,7 @@ from me2e_compress.errors import (
     BrokenPackageError,
     MissingExtraError,
 )
-from me2e_compress.extras import MODULES, explained, need_extra
+from me2e_compress.extras import MODULES, require_extra, with_install_hint
 
 ROOT = Path(__file__).parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
@@ -209,7 +209,7 @@ def test_a_missing_extra_is_asked_for_before_work_starts(
         "importlib.util.find_spec", lambda name: None if name == first else object()
     )
     with pytest.raises(MissingExtraError) as caught:
-        need_extra(extra, "this")
+        require_extra(extra, "this")
     assert str(caught.value) == (
         f"{first}, which this needs, is not installed: pip install"
         f" 'me2e-compress[{extra}]'"
@@ -225,7 +225,7 @@ def test_a_missing_extra_is_asked_for_before_work_starts(
     ],
 )
 def test_what_has_nothing_to_do_with_an_extra_stays_as_it_is(error: Exception) -> None:
-    assert explained(error) is error
+    assert with_install_hint(error) is error
 
 
 def test_a_module_that_a_package_lacks_is_told_as_that_package(
@@ -239,7 +239,7 @@ def test_a_module_that_a_package_lacks_is_told_as_that_package(
     monkeypatch.delitem(sys.modules, "onnxslim", raising=False)
     with pytest.raises(ImportError) as caught:
         __import__("onnxslim")
-    told = explained(caught.value)
+    told = with_install_hint(caught.value)
     assert isinstance(told, BrokenPackageError)
     assert told.args == ("onnxslim", "bench", "No module named 'not_to_be_had'")
 

@@ -30,7 +30,7 @@ import numpy.typing as npt
 import onnx_ir as ir
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, PositiveInt
 
-from me2e_compress.display import reason
+from me2e_compress.display import error_line
 from me2e_compress.errors import FramesError, PreconditionError
 from me2e_compress.graph import array_of, static_shape
 from me2e_compress.graph.recurrence import not_fed_back, recurrent_inputs, sides
@@ -77,7 +77,7 @@ def declared(path: Path, what: str = "a readable .npz") -> Mapping[str, Declared
                     raise ValueError("an array is there twice")
                 arrays[name], total = about, total + size
     except UNREADABLE as error:
-        raise FramesError(f"{path}: not {what} ({reason(error)})") from error
+        raise FramesError(f"{path}: not {what} ({error_line(error)})") from error
     # A header could claim any size: check before reading.
     if total > LARGEST_BYTES:
         raise FramesError(
@@ -94,7 +94,7 @@ def load_arrays(path: Path, what: str = "a readable .npz") -> dict[str, Array]:
         with path.open("rb") as source, np.load(source, allow_pickle=False) as content:
             return {name: np.asarray(content[name]) for name in content}
     except UNREADABLE as error:
-        raise FramesError(f"{path}: not {what} ({reason(error)})") from error
+        raise FramesError(f"{path}: not {what} ({error_line(error)})") from error
 
 
 def archive_of(
@@ -322,7 +322,7 @@ class CalibrationSet:
                         for each in archive.infolist()
                     )
             except (OSError, zipfile.BadZipFile) as error:
-                line = reason(error)
+                line = error_line(error)
                 raise FramesError(f"{path}: not a readable .npz ({line})") from error
             digest.update(repr(entries).encode())
         return digest.hexdigest()

@@ -8,8 +8,8 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 from me2e_compress.calibration.dataset import CalibrationSet, declared, load_arrays
-from me2e_compress.display import counted
-from me2e_compress.errors import FORMER, FramesError
+from me2e_compress.display import plural
+from me2e_compress.errors import FORMER_NAMES, FramesError
 from me2e_compress.runtime.frames import Array
 
 _KEPT = 8
@@ -34,7 +34,7 @@ class EngineDump:
             raise FramesError(f"{self.path}: no such folder")
         self.stems = tuple(sorted(each.stem for each in self.path.glob("*.npz")))
         if not self.stems:
-            raise FramesError(f"{self.path}: {FORMER['dump json']}")
+            raise FramesError(f"{self.path}: {FORMER_NAMES['dump json']}")
         self._at = functools.lru_cache(maxsize=_KEPT)(self._read)
         self.names = tuple(self[0])
 
@@ -71,7 +71,7 @@ class EngineDump:
             lacking = [each for each in stems if each not in self.stems]
             first = f"{lacking[0]} is not answered: " if lacking else ""
             raise FramesError(
-                f"{self.path}: {first}answers to {counted(len(self), 'frame')},"
+                f"{self.path}: {first}answers to {plural(len(self), 'frame')},"
                 f" {frames.folder} has {len(frames)}: the dump is of other frames"
             )
         unknown = [each for each in self.stems if each not in stems]

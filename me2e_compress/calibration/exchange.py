@@ -12,7 +12,7 @@ import onnx_ir as ir
 
 from me2e_compress.calibration.observers import QUANT_MAX
 from me2e_compress.calibration.ranges import IMPORTED, LARGEST, Ranges
-from me2e_compress.display import counted, some_of
+from me2e_compress.display import join_names, plural
 from me2e_compress.errors import FramesError
 from me2e_compress.graph import digest, provenance
 
@@ -72,8 +72,8 @@ def taken_from(
     if len(bounds) < _LEAST * len(tensors):
         missing = [name for name in tensors if name not in bounds]
         raise FramesError(
-            f"{path}: a cache of another graph: of {counted(len(tensors), 'tensor')}"
-            f" it lacks {some_of(missing, 1)}; it has {next(iter(cache.tensors))}"
+            f"{path}: a cache of another graph: of {plural(len(tensors), 'tensor')}"
+            f" it lacks {join_names(missing, 1)}; it has {next(iter(cache.tensors))}"
         )
     return dataclasses.replace(cache, tensors=bounds, model=digest(model))
 

@@ -115,7 +115,7 @@ class HistogramObserver(Observer):
     def ranges(self, seen: Statistics) -> tuple[Bounds, Bounds]:
         """Clip every tensor at the edge of its histogram."""
         # A tensor without elements keeps all bins
-        edges = [self.edge(each) if each.any() else BINS for each in seen.counted()]
+        edges = [self.edge(each) if each.any() else BINS for each in seen.histograms()]
         reach = np.ldexp(np.array(edges, np.float64) / BINS, seen.exponents)
         return within(seen, reach.astype(np.float32))
 

@@ -11,7 +11,7 @@ import pydantic
 
 from me2e_compress.calibration.observers import OBSERVERS, Observer
 from me2e_compress.calibration.statistics import ALL_ZERO, NOT_FINITE, Statistics
-from me2e_compress.display import counted, some_of
+from me2e_compress.display import join_names, plural
 from me2e_compress.errors import FramesError
 from me2e_compress.registry import documents
 from me2e_compress.runtime.atomic import write_document
@@ -84,8 +84,8 @@ class Ranges:
     def headline(self) -> str:
         """The number of tensors, the method and the number of frames."""
         return (
-            f"{counted(len(self.tensors), 'tensor')}, {self.method},"
-            f" {counted(self.frames, 'frame')}"
+            f"{plural(len(self.tensors), 'tensor')}, {self.method},"
+            f" {plural(self.frames, 'frame')}"
         )
 
     @property
@@ -201,7 +201,7 @@ class Ranges:
             if self.method == IMPORTED:
                 again = "give the overrides that stand beside it (--overrides)"
             raise FramesError(
-                f"{named}: of {len(tensors)} tensors lacks {some_of(missing, 1)};"
+                f"{named}: of {len(tensors)} tensors lacks {join_names(missing, 1)};"
                 f" {again}"
             )
 

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Literal
 
 from me2e_compress.calibration.ranges import OUTLIER_CREST, Activity, Ranges
-from me2e_compress.display import counted
+from me2e_compress.display import plural
 
 ROUNDS_AWAY = 254
 """Crest factor from which half an int8 step (range / 254) exceeds the root mean square,
@@ -67,7 +67,7 @@ def review(ranges: Ranges) -> tuple[RangeFinding, ...]:
     if said := ranges.not_finite:
         findings.append(RangeFinding("not finite", "warning", said, advice=NOT_FINITE))
     if ranges.scenes is not None and ranges.scenes < FEW_SCENES:
-        said = f"{counted(ranges.frames, 'frame')} in {counted(ranges.scenes, 'scene')}"
+        said = f"{plural(ranges.frames, 'frame')} in {plural(ranges.scenes, 'scene')}"
         advice = (
             f"Frames of one scene look alike: record {FEW_SCENES} scenes or more, on"
             " other routes, in other traffic and light"
@@ -80,7 +80,7 @@ def not_in(cache: Path, missing: Sequence[str]) -> tuple[RangeFinding, ...]:
     """Name the tensors that an imported cache lacks."""
     if not missing:
         return ()
-    said = f"{counted(len(missing), 'tensor')} not in {cache}"
+    said = f"{plural(len(missing), 'tensor')} not in {cache}"
     advice = "What reads them stays float, as in TensorRT 10"
     return (
         RangeFinding("not in cache", "warning", said, tuple(missing), advice=advice),
@@ -182,5 +182,5 @@ def _named(
     if ratio_of:
         noun, rest = said.split(" ", 1)
         ratios = tuple(each for each in ratio_of.values() if each is not None)
-        line = f"{counted(len(ratio_of), noun)} {rest}"
+        line = f"{plural(len(ratio_of), noun)} {rest}"
         yield RangeFinding(kind, severity, line, tuple(ratio_of), ratios, advice)

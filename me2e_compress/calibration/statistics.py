@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 import onnx_ir as ir
 
-from me2e_compress.display import counted, some_of
+from me2e_compress.display import join_names, plural
 from me2e_compress.errors import FramesError
 from me2e_compress.graph.nodes import FLOATS, grid_of, reads_of
 from me2e_compress.runtime.frames import Array
@@ -108,7 +108,7 @@ class Statistics:
         """The least e for which 2^e exceeds the reach: int64 [tensors]."""
         return np.maximum(np.frexp(self.reach)[1], _SMALLEST).astype(np.int64)
 
-    def counted(self) -> npt.NDArray[np.int64]:
+    def histograms(self) -> npt.NDArray[np.int64]:
         """Return the histograms; FramesError if none were collected."""
         if self.counts is None:
             raise FramesError(
@@ -179,7 +179,7 @@ def first_maker(
             ends |= {str(each.name) for each in reads_of(node)} & names
     for value in made:
         if value.name in ends and (first := value.producer()) is not None:
-            behind = f"; {counted(len(ends) - 1, 'tensor')} behind it"
+            behind = f"; {plural(len(ends) - 1, 'tensor')} behind it"
             return (
                 f"{first.name or value.name} ({first.op_type}) is first to make NaN or"
                 f" infinity, in {value.name}{behind if len(ends) > 1 else ''}"
@@ -203,7 +203,7 @@ def check_finite(
     # Name the first tensor, and how many more there are.
     names = [tensors[at] for at in np.flatnonzero(bad).tolist()]
     kind = "NaN" if np.isnan(readings[bad][0]).any() else "infinite"
-    more = f", and of {len(tensors)} {some_of(names[1:], 4)}"
+    more = f", and of {len(tensors)} {join_names(names[1:], 4)}"
     raise FramesError(
         f"frame {place} makes tensor {names[0]} {kind}{more if len(names) > 1 else ''}:"
         " no range can be read from it"

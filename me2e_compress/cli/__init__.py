@@ -6,8 +6,8 @@ from collections.abc import Callable
 from pathlib import Path
 
 from me2e_compress.cli.signals import INTERRUPTED, TERMINATED, signals_in_order
-from me2e_compress.display import printable
-from me2e_compress.errors import Me2eError, OptionError, names_former
+from me2e_compress.display import escape_controls
+from me2e_compress.errors import Me2eError, OptionError, cites_old_name
 
 AGAIN = "run again to go on"
 RESUMES = {
@@ -54,7 +54,7 @@ def _run(run: Callable[[], None]) -> int:
     from cyclopts import CycloptsError
 
     from me2e_compress.cli.console import errors
-    from me2e_compress.extras import explained
+    from me2e_compress.extras import with_install_hint
 
     try:
         # file names that are not UTF-8, and a current folder that is gone
@@ -67,7 +67,7 @@ def _run(run: Callable[[], None]) -> int:
                 raise Me2eError(f"{word!a} is not UTF-8: rename the file")
         run()
     except (CycloptsError, Me2eError, OSError, ImportError) as error:
-        shown = explained(error)
+        shown = with_install_hint(error)
         if isinstance(shown, ImportError):
             raise  # of no optional package: a defect of ours, which needs its traceback
         # an error of the user's is one line, without a traceback; that of the system
@@ -75,8 +75,8 @@ def _run(run: Callable[[], None]) -> int:
         text = str(shown)
         if isinstance(shown, OSError) and shown.filename is not None and shown.strerror:
             text = f"{os.fsdecode(shown.filename)}: {shown.strerror}"
-        line = printable(" ".join(text.split()))
+        line = escape_controls(" ".join(text.split()))
         errors.print(f"me2e-compress: {line}", soft_wrap=True, markup=False)
-        usage = isinstance(error, CycloptsError | OptionError) or names_former(error)
+        usage = isinstance(error, CycloptsError | OptionError) or cites_old_name(error)
         return 2 if usage else 1
     return 0

@@ -8,7 +8,7 @@ from cyclopts import App, CycloptsError, Group, Parameter
 
 from me2e_compress.cli import commands, driving
 from me2e_compress.cli.console import printing
-from me2e_compress.errors import FORMER
+from me2e_compress.errors import FORMER_NAMES
 from me2e_compress.extras import missing_module
 from me2e_compress.version import __version__
 
@@ -97,13 +97,13 @@ def options_of(name: str) -> list[str]:
 def _refuse_former(words: Sequence[str]) -> None:
     """Refuse a command or an option that is gone, with what replaces it."""
     name, taken = next(iter(words), ""), set[str]()
-    if gone := FORMER.get(f"command {name}"):
+    if gone := FORMER_NAMES.get(f"command {name}"):
         raise CycloptsError(gone)
     if name in COMMANDS:
         arguments = app[name].assemble_argument_collection()
         taken = {flag for each in arguments if each.parse for flag in each.names}
     for flag in (word.partition("=")[0] for word in words[1:]):
-        gone = FORMER.get(f"{name} {flag}") or FORMER.get(flag)
+        gone = FORMER_NAMES.get(f"{name} {flag}") or FORMER_NAMES.get(flag)
         if gone and flag not in taken:
             raise CycloptsError(gone)
 

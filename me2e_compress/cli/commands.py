@@ -18,7 +18,7 @@ from me2e_compress.cli.console import (
     tell,
 )
 from me2e_compress.errors import EvaluationError, OptionError, RecipeError
-from me2e_compress.extras import need_extra
+from me2e_compress.extras import require_extra
 from me2e_compress.workflows.options import (
     CalibrateOptions,
     CompareOptions,
@@ -50,7 +50,7 @@ def demo(
     Args:
         output: the folder to write
     """
-    need_extra("highway", "driving in the demo")
+    require_extra("highway", "driving in the demo")
     from me2e_compress.study.demo import DemoResult, DriverDemo, figure
 
     steps = DriverDemo(output, writing.force).steps

@@ -19,7 +19,7 @@ from rich.progress import (
 from rich.table import Table as Shown
 from rich.text import Text
 
-from me2e_compress.display import Cell, Table, counted, duration, printable
+from me2e_compress.display import Cell, Table, escape_controls, format_duration, plural
 from me2e_compress.workflows.result import SILENT, Listener, Result
 
 console = Console(record=True, emoji=False)
@@ -92,7 +92,7 @@ def _warn(line: str) -> None:
 def tell(line: str) -> None:
     """Print a line on stderr without markup; nothing if quiet."""
     if not printing.quiet:
-        errors.print(printable(line), soft_wrap=True, markup=False)
+        errors.print(escape_controls(line), soft_wrap=True, markup=False)
 
 
 def show(result: Result, tables: Iterable[Table] | None = None) -> None:
@@ -109,7 +109,7 @@ def show(result: Result, tables: Iterable[Table] | None = None) -> None:
     for line in result.lines():
         say(line)
     for line in result.alerts():
-        console.print(Text(printable(line), "bold"), soft_wrap=True)
+        console.print(Text(escape_controls(line), "bold"), soft_wrap=True)
 
 
 def show_of(workflow: Callable[..., Result], *words: object) -> None:
@@ -122,7 +122,7 @@ def show_of(workflow: Callable[..., Result], *words: object) -> None:
 
 def say(line: str) -> None:
     """Print a line without markup."""
-    console.print(printable(line), soft_wrap=True, markup=False)
+    console.print(escape_controls(line), soft_wrap=True, markup=False)
 
 
 def print_table(content: Table) -> None:
@@ -131,7 +131,7 @@ def print_table(content: Table) -> None:
     Where the words do not fit side by side, a row becomes a few lines, so that no name
     is broken.
     """
-    content = content.printable()
+    content = content.escape_controls()
     # intervals are shown if the terminal is wide, or the table narrow
     room = console.width - _frame(content) - sum(_longest(content, True, False))
     intervals = _is_wide() or room >= 0
@@ -152,7 +152,7 @@ def print_table(content: Table) -> None:
     if not intervals and any(cell.detail for row in content.rows for cell in row):
         console.print(Text(f"Intervals: in a terminal of {WIDE} columns.", "dim"))
     if content.details:
-        lines = counted(content.details.count("\n") + 1, "note")
+        lines = plural(content.details.count("\n") + 1, "note")
         shown = content.details if printing.verbose else f"{lines} more: -v"
         console.print(Text(shown, "dim"), soft_wrap=True)
 
@@ -256,5 +256,5 @@ class ProgressLines:
         # how long the rest takes at the pace so far
         if 0 < done < total:
             left = (now - self._begun) / done * (total - done)
-            line += f", {duration(left)} left"
+            line += f", {format_duration(left)} left"
         self._write(line)

@@ -5,7 +5,7 @@ from pathlib import Path
 from me2e_compress.cli.commands import WRITING, Output
 from me2e_compress.cli.console import listening, printing, say, show, show_of, tell
 from me2e_compress.errors import OptionError
-from me2e_compress.extras import need_extra
+from me2e_compress.extras import require_extra
 from me2e_compress.metrics import BUDGET_MS
 from me2e_compress.workflows.options import (
     EvaluateOptions,
@@ -109,7 +109,7 @@ def study(
         provider: runs the graph: cpu, cuda, ...; not the study's
         trust_code: run Python and libraries that it names
     """
-    need_extra("highway", "a study")
+    require_extra("highway", "a study")
     from me2e_compress.evaluators.highway.engine import engine_named
     from me2e_compress.study import load_study
     from me2e_compress.study.report.page import write_study

@@ -12,7 +12,7 @@ from typing import Literal, TypeAlias
 
 import numpy as np
 
-from me2e_compress.display import Table, number, table
+from me2e_compress.display import Table, format_number, table
 from me2e_compress.fidelity import ALIVE
 from me2e_compress.runtime.frames import Array, Frame
 from me2e_compress.runtime.session import Session
@@ -97,7 +97,7 @@ class Liveness:
     def table(self) -> Table:
         """Return a row for each output."""
         rows = [
-            (each.output, each.verdict, number(each.moves, ".2f"))
+            (each.output, each.verdict, format_number(each.moves, ".2f"))
             for each in self.outputs
         ]
         note = (

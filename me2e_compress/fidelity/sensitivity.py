@@ -11,7 +11,7 @@ import onnx_ir as ir
 
 from me2e_compress import graph
 from me2e_compress.calibration.ranges import Ranges
-from me2e_compress.display import significant
+from me2e_compress.display import format_significant
 from me2e_compress.errors import EvaluationError
 from me2e_compress.fidelity.compare import (
     Fidelity,
@@ -484,7 +484,7 @@ def nothing_fits(
     def words(numbers: Iterable[float]) -> str:
         pairs = zip(numbers, budgets, strict=True)
         return " and ".join(
-            f"{significant(number, 6)} {budget.unit}" for number, budget in pairs
+            f"{format_significant(number, 6)} {budget.unit}" for number, budget in pairs
         )
 
     apart = "; each alone" if len(budgets) > 1 else ""

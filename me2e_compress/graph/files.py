@@ -13,7 +13,7 @@ import onnx_ir as ir
 import onnx_ir.passes.common as common
 from google.protobuf.message import DecodeError
 
-from me2e_compress.display import reason, some_of
+from me2e_compress.display import error_line, join_names
 from me2e_compress.errors import GraphError
 from me2e_compress.graph import provenance, structure
 from me2e_compress.graph.nodes import STANDARD, nodes_of
@@ -58,7 +58,7 @@ def load(path: str | Path) -> ir.Model:
         proto = onnx.load(path, format="protobuf", load_external_data=False)
     except DecodeError as error:
         raise GraphError(
-            f"{path}: not an ONNX file, or cut short ({reason(error)})"
+            f"{path}: not an ONNX file, or cut short ({error_line(error)})"
         ) from error
     try:
         in_order = structure.check(proto)
@@ -91,7 +91,7 @@ def _freeze_defaults(model: ir.Model) -> None:
     names = [str(each.name) for each in model.graph.inputs if each.is_initializer()]
     common.RemoveInitializersFromInputsPass()(model)
     if names and model.ir_version >= PLAIN_INITIALIZERS_SINCE_IR:
-        held = f"{some_of(names)} held a value: no input any more, but a constant"
+        held = f"{join_names(names)} held a value: no input any more, but a constant"
         way = "what is to stay one, take out of the initializers"
         note_change(model, f"{held}; {way}")
 
@@ -109,7 +109,7 @@ def _built(proto: onnx.ModelProto, in_order: bool) -> ir.Model:
         cause: BaseException = error
         while cause.__cause__ is not None:
             cause = cause.__cause__
-        raise GraphError(f"not a valid ONNX graph ({reason(cause)})") from error
+        raise GraphError(f"not a valid ONNX graph ({error_line(cause)})") from error
     return model
 
 

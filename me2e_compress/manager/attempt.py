@@ -10,7 +10,7 @@ import onnx
 import onnx_ir as ir
 
 from me2e_compress import graph
-from me2e_compress.display import counted
+from me2e_compress.display import plural
 from me2e_compress.errors import GraphError, Me2eError, PassError, VerificationError
 from me2e_compress.graph import provenance
 from me2e_compress.graph.nodes import has_subgraph, is_standard, nodes_in, opset_of
@@ -58,7 +58,7 @@ def _check(current: Pass, before: ir.Model, result: PassResult, known: str) -> s
     changed = digest != known
     if result.changes and not changed:
         raise VerificationError(
-            f"{name} claims {counted(result.changes, 'change')} but made none"
+            f"{name} claims {plural(result.changes, 'change')} but made none"
         )
     if changed and not result.changes:
         raise VerificationError(f"{name} changed the graph and denies it")

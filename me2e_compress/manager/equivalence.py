@@ -10,7 +10,7 @@ from typing import TypeAlias
 
 import onnx_ir as ir
 
-from me2e_compress.display import counted
+from me2e_compress.display import plural
 from me2e_compress.errors import FramesError, GraphError, Me2eError
 from me2e_compress.fidelity.first_difference import find_first_difference
 from me2e_compress.graph.nodes import bodies_of, draws, reads_of
@@ -153,7 +153,7 @@ def _by_pieces(
             worst = max(operands, key=lambda name: gaps[name])
             remark = (
                 "compared piece by piece, since behind a quantizer or a choice rounding"
-                f" alone is a whole step: {counted(len(operands), 'operand')} of such"
+                f" alone is a whole step: {plural(len(operands), 'operand')} of such"
                 f" nodes are the same (off by {gaps[worst]:.1e} of its range at"
                 f" most, {worst}; allowed {limits[worst]:.0e})"
             )

@@ -9,7 +9,7 @@ from pathlib import Path
 import onnx_ir as ir
 
 from me2e_compress import graph
-from me2e_compress.display import AT_LEAST, Table, giga, megabytes, table
+from me2e_compress.display import LOWER_BOUND, Table, format_gmacs, format_mb, table
 from me2e_compress.graph.summary import Size
 from me2e_compress.passes.base import Pass
 
@@ -200,14 +200,14 @@ def _steps_table(steps: Sequence[Step]) -> Table:
                 step.name,
                 str(step.changes),
                 f"{step.before.counted_nodes} → {step.after.counted_nodes}",
-                f"{megabytes(step.before.weight_bytes)} →"
-                f" {megabytes(step.after.weight_bytes)}",
-                giga(step.after.macs, step.after.unknown_macs_nodes),
+                f"{format_mb(step.before.weight_bytes)} →"
+                f" {format_mb(step.after.weight_bytes)}",
+                format_gmacs(step.after.macs, step.after.unknown_macs_nodes),
                 f"{step.seconds:.2f}",
             )
             for step in steps
         ],
-        AT_LEAST if partly else "",
+        LOWER_BOUND if partly else "",
         details="\n".join(notes),
     )
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 from statistics import fmean
 from typing import Any
 
-from me2e_compress.display import Table, counted, not_measured, number, table
+from me2e_compress.display import Table, format_number, missing_note, plural, table
 from me2e_compress.metrics import BUDGET_MS
 from me2e_compress.metrics.episode import FRAME_US, Episode
 from me2e_compress.metrics.measure import Measure, percentile, too_few
@@ -113,7 +113,7 @@ def deadlines_table(title: str, deadlines: Deadlines) -> Table:
     shown = {words: deadlines.measures[name] for name, words in names.items()}
     why = {words: each.reason for words, each in shown.items() if each.value is None}
     return table(
-        f"{title}: {counted(deadlines.count, 'decision')}",
+        f"{title}: {plural(deadlines.count, 'decision')}",
         ("latency", "", "unit"),
         [(words, number(e.value, ".2f"), e.unit) for words, e in shown.items()],
         not_measured(why),

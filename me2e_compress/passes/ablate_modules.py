@@ -7,7 +7,7 @@ from typing import ClassVar, Literal
 import onnx_ir as ir
 
 from me2e_compress import graph
-from me2e_compress.display import counted
+from me2e_compress.display import plural
 from me2e_compress.errors import PreconditionError, RecipeError
 from me2e_compress.graph import provenance, rewrite
 from me2e_compress.graph.modules.module_map import ModuleMap, Substitute
@@ -133,7 +133,7 @@ class AblateModules(Pass):
         self._check_sight(model, context.modules, seeing)
         removed = before - graph.node_count(model)
         verb = "removed" if removed >= 0 else "added"
-        notes.append(f"{counted(abs(removed), 'node')} {verb}")
+        notes.append(f"{plural(abs(removed), 'node')} {verb}")
         return PassResult(model, max(1, removed), tuple(notes), tuple(gone))
 
     def _check_sight(

@@ -5,7 +5,7 @@ from typing import ClassVar
 
 import onnx_ir as ir
 
-from me2e_compress.display import counted
+from me2e_compress.display import plural
 from me2e_compress.graph import rewrite
 from me2e_compress.passes.base import Context, Pass, PassResult
 from me2e_compress.passes.convert_float16.element_types import (
@@ -49,4 +49,4 @@ class ConvertFloat32(Pass):
         if changes:
             rewrite.sweep(model)
         computing = sum(node.op_type != "Cast" for node in nodes)
-        return PassResult(model, changes, (f"{counted(computing, 'node')} in float32",))
+        return PassResult(model, changes, (f"{plural(computing, 'node')} in float32",))

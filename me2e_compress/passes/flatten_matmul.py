@@ -69,9 +69,9 @@ class FlattenMatmul(Pass):
         if repeats or flattened:
             remove_dead(model.graph)
         notes = (
-            (flattened, f"flattened {counted(flattened, 'product')}"),
-            (repeats, f"{counted(repeats, 'repeated operand')} read unrepeated"),
-            (open_shapes, f"left {counted(open_shapes, 'product')} of unknown shape"),
+            (flattened, f"flattened {plural(flattened, 'product')}"),
+            (repeats, f"{plural(repeats, 'repeated operand')} read unrepeated"),
+            (open_shapes, f"left {plural(open_shapes, 'product')} of unknown shape"),
         )
         remarks = tuple(note for count, note in notes if count)
         return PassResult(model, repeats + flattened, remarks)

@@ -7,7 +7,7 @@ from typing import ClassVar
 import numpy as np
 import onnx_ir as ir
 
-from me2e_compress.display import counted
+from me2e_compress.display import plural
 from me2e_compress.graph import graphs_of, provenance
 from me2e_compress.graph.modules.assign import assign
 from me2e_compress.graph.nodes import array_of, is_plugin, nodes_in, nodes_of, opset_of
@@ -70,7 +70,7 @@ def demote(model: ir.Model, by: str) -> tuple[int, str]:
             count += 1
             if (made := value.producer()) is not None:
                 nodes[made] = None
-    return count, f"float64 became float32: {counted(len(nodes), 'node')}"
+    return count, f"float64 became float32: {plural(len(nodes), 'node')}"
 
 
 def _keeper(model: ir.Model) -> str:

@@ -8,7 +8,7 @@ import onnx_ir as ir
 
 from me2e_compress import graph
 from me2e_compress.calibration.observers import DEFAULT_METHOD
-from me2e_compress.display import counted
+from me2e_compress.display import plural
 from me2e_compress.graph import provenance
 from me2e_compress.passes.base import Context, Pass, PassResult
 from me2e_compress.quantization.decision import plan_of, stamp_plan
@@ -63,8 +63,8 @@ class LowerInt8(Pass):
             lowered,
             len(layers) or int(graph.digest(lowered) != graph.digest(model)),
             (
-                f"{counted(len(layers), 'layer')} in int8 for onnxruntime",
-                f"{counted(len(missing), 'tensor')} calibrated besides the graph's",
+                f"{plural(len(layers), 'layer')} in int8 for onnxruntime",
+                f"{plural(len(missing), 'tensor')} calibrated besides the graph's",
             ),
         )
 

@@ -10,7 +10,7 @@ import onnx_ir as ir
 
 from me2e_compress import graph
 from me2e_compress.calibration.means import token_means
-from me2e_compress.display import counted
+from me2e_compress.display import plural
 from me2e_compress.errors import FramesError, PreconditionError
 from me2e_compress.graph import provenance
 from me2e_compress.graph.modules.module_map import (
@@ -234,6 +234,6 @@ def means_of(
         raise FramesError(
             "fill=means needs recorded frames (--frames): a mean is never made up"
         )
-    count = counted(len(frames), "frame")
+    count = plural(len(frames), "frame")
     means = token_means(model, frames, names, provider=context.provider)
     return means, f"its mean over {count}"

@@ -8,7 +8,7 @@ from typing import ClassVar
 import onnx_ir as ir
 
 from me2e_compress.calibration.review import review
-from me2e_compress.display import counted
+from me2e_compress.display import plural
 from me2e_compress.errors import PreconditionError
 from me2e_compress.passes.base import Context, Pass, PassResult
 from me2e_compress.quantization.decision import (
@@ -92,8 +92,8 @@ class QuantizeInt8(Pass):
         # Place the quantizers and record the plan
         placed = target.place(model, plan, ranges)
         stamp_plan(placed, plan)
-        count, frames = len(ranges.tensors), counted(ranges.frames, "frame")
-        on = f"{counted(count, 'tensor')} calibrated on {frames}"
+        count, frames = len(ranges.tensors), plural(ranges.frames, "frame")
+        on = f"{plural(count, 'tensor')} calibrated on {frames}"
         notes = (plan.headline, on, *map(str, review(ranges)))
         return PassResult(placed, len(plan.placed), notes)
 

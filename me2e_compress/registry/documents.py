@@ -18,7 +18,7 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from me2e_compress.display import reason
+from me2e_compress.display import error_line
 
 LARGEST_BYTES = 64_000_000
 """The largest document that is read; a plan of 30,000 nodes has 15 MB. Read, it may
@@ -117,7 +117,7 @@ def from_json(text: bytes | str, *, finite: bool = True) -> Any:
     except RecursionError as error:
         raise MalformedError("nested too deeply") from error
     except ValueError as error:
-        raise MalformedError(reason(error)) from error
+        raise MalformedError(error_line(error)) from error
     _check_strings(document)
     return document
 
@@ -132,7 +132,7 @@ def from_toml(text: bytes | str) -> dict[str, Any]:
     except RecursionError as error:
         raise MalformedError("nested too deeply") from error
     except ValueError as error:
-        raise MalformedError(reason(error)) from error
+        raise MalformedError(error_line(error)) from error
 
 
 def _check_size(size: int, most: int) -> None:

@@ -10,7 +10,7 @@ from typing import Annotated, Any, Self, TypeAlias
 import psutil
 from pydantic import ConfigDict, Field, TypeAdapter, model_validator, with_config
 
-from me2e_compress.display import Table, counted, not_measured, table
+from me2e_compress.display import Table, missing_note, plural, table
 from me2e_compress.errors import EvaluationError
 from me2e_compress.metrics.measure import percentile, too_few
 from me2e_compress.registry import documents, drafts
@@ -156,7 +156,7 @@ def shares_table(title: str, what: str, parts: Microseconds) -> Table:
 def _missing_percentiles(count: int) -> str:
     """Say which percentiles need more samples."""
     why = {f"p{percent}": too_few(percent, count) for percent in PERCENTILES}
-    return not_measured({name: each for name, each in why.items() if each})
+    return missing_note({name: each for name, each in why.items() if each})
 
 
 Samples: TypeAlias = Annotated[
@@ -190,7 +190,7 @@ class LatencyTrace:
     @property
     def headline(self) -> str:
         """The number of inferences and the machine."""
-        return f"{counted(len(self.samples_us), 'inference')} on {self.machine}"
+        return f"{plural(len(self.samples_us), 'inference')} on {self.machine}"
 
     def tables(self) -> tuple[Table, ...]:
         """Return the percentiles in milliseconds, and the times of modules."""

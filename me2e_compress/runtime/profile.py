@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from itertools import chain, islice, repeat
 from pathlib import Path
 
-from me2e_compress.display import counted
+from me2e_compress.display import plural
 from me2e_compress.errors import EvaluationError
 from me2e_compress.graph import sha256_of
 from me2e_compress.runtime.frames import Array, Frames
@@ -51,7 +51,7 @@ def profile(
 def machine_words(threads: int, provider: Provider = CPU) -> str:
     """Describe the machine: processor, threads, provider."""
     runs = "" if provider == CPU else f", {PROVIDERS.text(provider)}"
-    on = counted(threads, "thread") if threads else "all threads"
+    on = plural(threads, "thread") if threads else "all threads"
     return f"{processor()}, onnxruntime on {on}{runs}"
 
 

@@ -7,7 +7,7 @@ from typing import Self
 
 import pydantic
 
-from me2e_compress.errors import FORMER, GraphError
+from me2e_compress.errors import FORMER_NAMES, GraphError
 from me2e_compress.registry import drafts
 from me2e_compress.registry.documents import reading
 from me2e_compress.runtime.atomic import write_bytes
@@ -93,8 +93,8 @@ def card(name: str) -> ModelCard:
     """
     if name not in SHIPPED:
         line = f"no model {name!r} ships; there is {', '.join(SHIPPED)}"
-        gone = FORMER.get(f"model {name}", FORMER.get(f"stack {name}", line))
-        raise GraphError(gone)
+        former = (FORMER_NAMES.get(f"{kind} {name}") for kind in ("model", "stack"))
+        raise GraphError(next(filter(None, former), line))
     return ModelCard.load(WEIGHTS / f"{name}.json")
 
 

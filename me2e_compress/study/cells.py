@@ -1,7 +1,6 @@
 """Cells of a study's tables: one content for the terminal, Markdown and HTML."""
 
-from me2e_compress.display import Cell
-from me2e_compress.display import number as plain_number
+from me2e_compress.display import Cell, format_number
 from me2e_compress.metrics.measure import FEWEST_TYPES, Estimate, Measure
 
 MISSING = "\N{EN DASH}"
@@ -44,4 +43,4 @@ def measure_cell(measure: Measure, form: str) -> Cell:
 
 def number(value: float, form: str) -> str:
     """Format a number with a true minus sign and no negative zero."""
-    return plain_number(value, form).replace("-", MINUS)
+    return format_number(value, form).replace("-", MINUS)

@@ -6,7 +6,7 @@ from functools import cached_property
 from itertools import chain
 from typing import Any
 
-from me2e_compress.display import Cell, Table, counted
+from me2e_compress.display import Cell, Table, plural
 from me2e_compress.metrics.bench2drive import ABILITIES
 from me2e_compress.metrics.route_summary import COLUMNS, PairedDifference, holm
 from me2e_compress.runtime.latency_trace import Load
@@ -100,9 +100,9 @@ class StudyResult(Result):
             *([str(self.load)] if self.load is not None and self.load.busy else []),
         )
         return Shown(
-            f"{study.title}: {counted(len(study.variants), 'variant')} under"
-            f" {counted(len(study.conditions), 'condition')} on {driven} of"
-            f" {counted(whole, 'route')}",
+            f"{study.title}: {plural(len(study.variants), 'variant')} under"
+            f" {plural(len(study.conditions), 'condition')} on {driven} of"
+            f" {plural(whole, 'route')}",
             chain.from_iterable(self.tables_by_section.values()),
             [f"{each.name}: {each.known}" for each in self.variants if each.known],
             alerts,
@@ -160,7 +160,7 @@ def scoreboard(result: StudyResult) -> Table:
     of = "" if driven == whole else f"{driven} of "
     note = (
         f"{'; '.join(map(result.described, study.conditions))}."
-        f" {of}{counted(whole, 'route')}. DS driving score, room kept to others, SR "
+        f" {of}{plural(whole, 'route')}. DS driving score, room kept to others, SR "
         "success rate, DE efficiency, DC comfort, both also in the arithmetic of "
         "Bench2Drive's tools (b2d), each with its 95 % interval over these scenario "
         f"types. {MISSING} means not measured."
@@ -242,7 +242,7 @@ def _differences_note(gaps: Sequence[PairedDifference]) -> str:
     note += "."
     # what so few routes cannot show
     if gaps:
-        on, least = counted(gaps[0].driving_score.n, "route"), gaps[0].smallest_shown
+        on, least = plural(gaps[0].driving_score.n, "route"), gaps[0].smallest_shown
         note += f" {on} cannot show a difference below {least:.1f} points."
     alike = [each for each in gaps if not each.differ]
     if alike:

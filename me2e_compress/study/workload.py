@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from me2e_compress.display import counted, duration, number, table
+from me2e_compress.display import format_duration, plural, table
 from me2e_compress.driving.latency import DecisionFacts
 from me2e_compress.driving.realtime import LatencyModel, skipped_decisions
 from me2e_compress.study.condition import Condition
@@ -45,15 +45,15 @@ class Workload(Result):
 
     def shown(self) -> Shown:
         """Return numbers of drives and routes, the time left, and a row per drive."""
-        headline = f"{self.title}: {counted(len(self.drives), 'drive')}"
+        headline = f"{self.title}: {plural(len(self.drives), 'drive')}"
         if self.set_size:
             routes = sum(each.routes for each in self.drives)
             done = sum(each.done for each in self.drives)
-            left = duration(3600 * sum(each.hours for each in self.drives))
+            left = format_duration(3600 * sum(each.hours for each in self.drives))
             how = "by this folder's logs" if self.measured else "an estimate"
             headline += (
-                f", {counted(routes, 'route')}, {number(done)} of them driven; about"
-                f" {left} on {counted(self.workers, 'worker')} ({how})"
+                f", {plural(routes, 'route')}, {done:,} of them driven; about"
+                f" {left} on {plural(self.workers, 'worker')} ({how})"
             )
         else:
             headline += ", of routes that the evaluator knows"
@@ -61,7 +61,7 @@ class Workload(Result):
         rows = [
             (
                 *(each.variant, each.condition, f"{each.done} of {each.routes}"),
-                duration(3600 * each.hours),
+                format_duration(3600 * each.hours),
             )
             for each in self.drives
         ]

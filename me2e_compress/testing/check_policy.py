@@ -16,7 +16,7 @@ from me2e_compress.driving.contract import (
     checked,
 )
 from me2e_compress.driving.policies import POLICIES, Driver
-from me2e_compress.extras import need_extra
+from me2e_compress.extras import require_extra
 from me2e_compress.testing.form import check_form, require
 
 ROUTE = "HighwayExit_R2_0"
@@ -40,7 +40,7 @@ def check_policy(driver: Driver) -> Answers:
         EvaluationError: it cannot be opened.
         MissingExtraError: the extra ``highway`` is not installed.
     """
-    need_extra("highway", "check_policy")
+    require_extra("highway", "check_policy")
     check_form(driver, POLICIES)
     name, prints = driver.name, {driver.fingerprint(), driver.fingerprint()}
     one = len(prints) == 1 and all(prints)

@@ -12,7 +12,7 @@ from me2e_compress.calibration.observers import OBSERVERS
 from me2e_compress.calibration.ranges import Ranges, rms_of
 from me2e_compress.calibration.review import RangeFinding, not_in, review
 from me2e_compress.calibration.sample import draw
-from me2e_compress.display import counted
+from me2e_compress.display import plural
 from me2e_compress.errors import FramesError
 from me2e_compress.manager import recipe
 from me2e_compress.quantization.decision import keep_readers, overrides_text
@@ -67,8 +67,8 @@ class CalibrateResult(Result):
         ranges = self.ranges
         how = f"compress --ranges {self.output} --overrides {self.overrides}"
         headline = (
-            f"{self.output}: {counted(len(ranges.tensors), 'tensor')}, {ranges.method},"
-            f" {counted(ranges.frames, 'frame')}"
+            f"{self.output}: {plural(len(ranges.tensors), 'tensor')}, {ranges.method},"
+            f" {plural(ranges.frames, 'frame')}"
         )
         return Shown(
             headline,

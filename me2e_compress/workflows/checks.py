@@ -32,9 +32,9 @@ import platformdirs
 
 from me2e_compress import graph
 from me2e_compress.calibration.dataset import CalibrationSet, archive_of
-from me2e_compress.display import counted
+from me2e_compress.display import plural
 from me2e_compress.driving.adapter.outputs import adapted, state_and_plan
-from me2e_compress.errors import FORMER, GraphError
+from me2e_compress.errors import FORMER_NAMES, GraphError
 from me2e_compress.graph.modules.assign import map_of
 from me2e_compress.graph.modules.module_map import ModuleMap
 from me2e_compress.graph.nodes import is_read, is_standard, nodes_of, opset_of
@@ -66,7 +66,7 @@ def model_path(text: str | Path, beside: Path = Path()) -> Path:
         return shipped(str(text))
     line = f"{text}: no such file; models that ship: {', '.join(SHIPPED)}"
     name = str(text).partition(":")[0]
-    gone = FORMER.get(f"model {name}", FORMER.get(f"stack {name}", line))
+    gone = FORMER_NAMES.get(f"model {name}", FORMER_NAMES.get(f"stack {name}", line))
     raise GraphError(gone)
 
 
@@ -134,7 +134,7 @@ def _in_functions(model: ir.Model) -> str:
         return ""
     names = ", ".join(dict.fromkeys(f"{e.domain}::{e.op_type}" for e in calls))
     return (
-        f"{counted(sum(calls.values()), 'layer')} in functions of the file ({names}),"
+        f"{plural(sum(calls.values()), 'layer')} in functions of the file ({names}),"
         f" which passes leave as they are; to write them out first: {_INLINE}"
     )
 

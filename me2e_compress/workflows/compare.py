@@ -12,7 +12,7 @@ from me2e_compress import graph
 from me2e_compress.calibration.calibrator import Extremes
 from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.calibration.statistics import first_maker, places_of
-from me2e_compress.display import Table, counted, number, table
+from me2e_compress.display import Table, plural, table
 from me2e_compress.errors import (
     EvaluationError,
     FramesError,
@@ -85,7 +85,7 @@ class CompareResult(Comparison, Result):
     def shown(self) -> Shown:
         """Return how far outputs, agents and the plan moved, and what is dead."""
         fidelity, liveness = self.fidelity, self.liveness
-        title = f"Fidelity over {counted(fidelity.frames, 'frame')}"
+        title = f"Fidelity over {plural(fidelity.frames, 'frame')}"
         outputs = outputs_table(title, fidelity, self.agents)
         faults = () if liveness is None else liveness.faults
         dead = "; ".join(faults)
@@ -135,7 +135,7 @@ def _plan_moved(fidelity: Fidelity) -> str:
         return f"plan displacement: not measured ({fidelity.plan_reason})"
     line = (
         f"plan displacement: mean {fidelity.plan.mean_m:.4f} m, largest"
-        f" {fidelity.plan.max_m:.4f} m over {counted(fidelity.frames, 'frame')}"
+        f" {fidelity.plan.max_m:.4f} m over {plural(fidelity.frames, 'frame')}"
     )
     if fidelity.same_choice is None:
         return line
@@ -146,7 +146,7 @@ def _agents(sets: SetFidelity | None) -> str:
     """Describe how outputs that are sets are compared; empty without any."""
     if sets is None:
         return ""
-    agents = counted(sets.agents, "agent")
+    agents = plural(sets.agents, "agent")
     return (
         "matched: agents with a score of 0.5 or more, each against the nearest. The"
         f" first graph has {agents} of such scores, the second one within 2 m of"
@@ -318,12 +318,12 @@ class FirstDifferenceResult(Result):
             if each.sqnr_db < known.sqnr_db:
                 worst[each.module] = each
         rows = [
-            (each.module or "-", each.value, each.node, number(each.sqnr_db, ".1f"))
+            (each.module or "-", each.value, each.node, f"{each.sqnr_db:z.1f}")
             for each in worst.values()
         ]
         columns = ("module", "worst value", "node", "SQNR dB")
         note = (
-            f"Of {counted(len(self.difference.values), 'value')} that modules hand on."
+            f"Of {plural(len(self.difference.values), 'value')} that modules hand on."
             f" {self.difference.unknown} of either graph have no namesake in the other."
         )
         modules = table("Modules", columns, rows, note, words=3)
@@ -337,11 +337,11 @@ def headline_of(difference: FirstDifference) -> str:
     below = sum(each.sqnr_db < difference.floor_db for each in difference.values)
     if not below:
         return (
-            f"no difference: {counted(len(difference.values), 'value')} at"
+            f"no difference: {plural(len(difference.values), 'value')} at"
             f" {difference.floor_db:g} dB or more"
         )
     return (
-        f"{below} of {counted(len(difference.values), 'value')} are below"
+        f"{below} of {plural(len(difference.values), 'value')} are below"
         f" {difference.floor_db:g} dB, but no output is"
     )
 

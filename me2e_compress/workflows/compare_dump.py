@@ -8,7 +8,7 @@ import onnx_ir as ir
 from me2e_compress import graph
 from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.calibration.engine_dump import EngineDump
-from me2e_compress.display import counted, number, table
+from me2e_compress.display import format_number, plural, table
 from me2e_compress.errors import EvaluationError
 from me2e_compress.fidelity.engine_loss import EngineRun, OutputLoss, losses
 from me2e_compress.fidelity.first_difference import (
@@ -62,10 +62,10 @@ class DumpResult(Result):
         rows = [
             (
                 each.name,
-                number(each.quantization_db, ".1f"),
-                number(each.compilation_db, ".1f"),
-                number(each.all_db, ".1f"),
-                number(each.moves, ".2f"),
+                format_number(each.quantization_db, ".1f"),
+                format_number(each.compilation_db, ".1f"),
+                format_number(each.all_db, ".1f"),
+                format_number(each.moves, ".2f"),
             )
             for each in self.outputs
         ]
@@ -76,7 +76,7 @@ class DumpResult(Result):
         )
         note = f"SQNR in dB; moves: a share of what it should; state: {self.state}. "
         columns = ("output", "quantization", "compilation", "all", "moves")
-        title = f"What the engine lost over {counted(self.frames, 'frame')}"
+        title = f"What the engine lost over {plural(self.frames, 'frame')}"
         inside = [] if self.inner is None else [f"inside: {headline_of(self.inner)}"]
         dead = tuple(each.dead for each in self.outputs if each.dead)
         return Shown(

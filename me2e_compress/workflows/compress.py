@@ -8,7 +8,7 @@ from typing import Any, TypeAlias
 
 from me2e_compress import graph
 from me2e_compress.calibration.review import NOT_FINITE
-from me2e_compress.display import megabytes
+from me2e_compress.display import format_mb
 from me2e_compress.errors import PreconditionError, RecipeError
 from me2e_compress.fidelity.floor import Floor
 from me2e_compress.graph.files import data_names
@@ -92,7 +92,7 @@ class CompressResult(Result):
     def size(self) -> str:
         """The size in MB, and its share of the source's."""
         share = self.output_bytes / self.source_bytes
-        return f"{megabytes(self.output_bytes)} MB, {share:.1%} of {self.source.name}"
+        return f"{format_mb(self.output_bytes)} MB, {share:.1%} of {self.source.name}"
 
     def shown(self) -> Shown:
         """Return passes and checks, what the outputs lost, time and size.

@@ -4,7 +4,7 @@ import dataclasses
 from pathlib import Path
 
 from me2e_compress import graph
-from me2e_compress.display import counted, megabytes, table
+from me2e_compress.display import format_mb, plural, table
 from me2e_compress.errors import GraphError
 from me2e_compress.graph import file_bytes
 from me2e_compress.graph.files import data_names
@@ -26,7 +26,7 @@ class ExportResult(Result):
     @property
     def headline(self) -> str:
         """The file, its model and size."""
-        return f"{self.output}: {self.stack}, {megabytes(file_bytes(self.output))} MB"
+        return f"{self.output}: {self.stack}, {format_mb(file_bytes(self.output))} MB"
 
 
 def export_stack(
@@ -78,7 +78,7 @@ class JoinResult(Result):
 
     def shown(self) -> Shown:
         """Return the file, its size and parts, and what feeds every input of a part."""
-        size, parts = megabytes(self.file_bytes), counted(len(self.parts), "part")
+        size, parts = format_mb(self.file_bytes), plural(len(self.parts), "part")
         rows = [dataclasses.astuple(each) for each in self.fed]
         columns = ("part", "input", "fed by", "form")
         return Shown(
@@ -121,7 +121,7 @@ class SplitResult(Result):
         """Return the folder, its files and the parts that are gone."""
         names = ", ".join(path.name for path in self.files.values())
         return Shown(
-            f"{self.output}: {counted(len(self.files), 'file')}: {names}",
+            f"{self.output}: {plural(len(self.files), 'file')}: {names}",
             alerts=[f"{each}: no output is left of it" for each in self.missing],
         )
 

@@ -16,13 +16,13 @@ from me2e_compress.calibration.recording import (
     partial_of,
     write_recording,
 )
-from me2e_compress.display import counted
+from me2e_compress.display import plural
 from me2e_compress.driving.adapter import Adapter
 from me2e_compress.driving.adapter.outputs import adapted
 from me2e_compress.driving.onnx_policy import OnnxPolicy
 from me2e_compress.driving.shipped_adapters import adapter_file
 from me2e_compress.errors import FramesError
-from me2e_compress.extras import need_extra
+from me2e_compress.extras import require_extra
 from me2e_compress.graph import load, sha256_of
 from me2e_compress.runtime.frames import Frame
 from me2e_compress.shipped.drivers import shipped
@@ -63,7 +63,7 @@ class FramesResult(Result):
     def headline(self) -> str:
         """The folder, its frames, the model, and the seed or log."""
         by = f"seed {self.seed}" if self.log is None else f"from {self.log}"
-        count = counted(self.frames, "frame")
+        count = plural(self.frames, "frame")
         return f"{self.output}: {count} of {self.stack}, {by}"
 
 
@@ -141,7 +141,7 @@ def _driven(
     metadata: Mapping[str, str],
     options: FramesOptions,
 ) -> Source:
-    need_extra("highway", "recording frames of a driver")
+    require_extra("highway", "recording frames of a driver")
     from me2e_compress.evaluators.highway.driven_frames import driven_frames
 
     loaded = None if adapter is None else Adapter.load(adapter)

@@ -7,7 +7,7 @@ from pathlib import Path
 import onnx_ir as ir
 
 from me2e_compress import graph
-from me2e_compress.display import giga, megabytes, number, table
+from me2e_compress.display import format_gmacs, format_mb, format_number, plural, table
 from me2e_compress.driving.adapter.outputs import adapted
 from me2e_compress.errors import GraphError
 from me2e_compress.graph import provenance
@@ -76,7 +76,7 @@ class InspectResult(Result):
         """Return the interface, the modules, what is lacking and the checkpoint."""
         more = f" and {', '.join(self.domains)}" if self.domains else ""
         read = f" ({self.lowered})" if self.lowered else ""
-        size = f"{megabytes(self.file_bytes)} MB"
+        size = f"{format_mb(self.file_bytes)} MB"
         headline = f"{self.file}: {size}, opset {self.opset}{more}{read}"
         ports = [
             (kind, port.name, port.type, port.shape)
@@ -86,10 +86,10 @@ class InspectResult(Result):
         rows = [
             (
                 item.module,
-                number(item.nodes),
-                number(item.parameters),
-                megabytes(item.weight_bytes),
-                giga(item.macs, item.unknown_macs_nodes, ".3f"),
+                format_number(item.nodes),
+                format_number(item.parameters),
+                format_mb(item.weight_bytes),
+                format_gmacs(item.macs, item.unknown_macs_nodes, ".3f"),
             )
             for item in self.modules
         ]
@@ -110,7 +110,7 @@ class InspectResult(Result):
         )
 
     def _total_macs(self) -> str:
-        total = giga(self.macs, 0, ".3f")
+        total = format_gmacs(self.macs, 0, ".3f")
         if not self.unknown_macs_nodes:
             return total
         known = "" if self.macs is None else f"at least {total}, "
@@ -119,10 +119,8 @@ class InspectResult(Result):
         ways = ""
         if self.open_dimensions:
             ways = f"; --set-dim NAME=SIZE for {', '.join(self.open_dimensions)}"
-        nodes = "node" if self.unknown_macs_nodes == 1 else "nodes"
-        return (
-            f"{known}{number(self.unknown_macs_nodes)} {nodes} not counted: {why}{ways}"
-        )
+        nodes = plural(self.unknown_macs_nodes, "node")
+        return f"{known}{nodes} not counted: {why}{ways}"
 
 
 _SHAPES = "import-normalize,fold-constants{through_compute=false}"

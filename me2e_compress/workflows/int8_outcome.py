@@ -7,7 +7,7 @@ from typing import Self
 
 import onnx_ir as ir
 
-from me2e_compress.display import counted, megabytes
+from me2e_compress.display import format_mb, plural
 from me2e_compress.graph import WEIGHTED
 from me2e_compress.manager import Report
 from me2e_compress.passes import Context
@@ -114,14 +114,14 @@ class Int8Outcome:
     @property
     def line(self) -> str:
         """How many nodes became int8, and which weights did not."""
-        line = f"int8: {counted(self.nodes, 'node')}"
+        line = f"int8: {plural(self.nodes, 'node')}"
         if self.float_bytes:
             rules = ", ".join(
-                f"{rule} {megabytes(count)}"
+                f"{rule} {format_mb(count)}"
                 for rule, count in self.float_bytes.items()
                 if count >= LEAST_SHOWN
             )
-            total = megabytes(sum(self.float_bytes.values()))
+            total = format_mb(sum(self.float_bytes.values()))
             line += f"; {total} MB of weights stay float"
             line += f", by rule: {rules}" if rules else ""
         return line
@@ -135,7 +135,7 @@ class Int8Outcome:
         parts = [f"{self.by} made nothing int8"]
         if self.layers is not None:
             of = "(convolutions, matrix products) in the graph"
-            parts.append(f"{counted(self.layers, 'layer')} {of}")
+            parts.append(f"{plural(self.layers, 'layer')} {of}")
         most = list(self.kept.items())[:2]
         parts += [f"{count} by rule {why}" for why, count in most]
         return "; ".join(parts)

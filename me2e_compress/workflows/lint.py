@@ -8,7 +8,7 @@ from pathlib import Path
 import onnx_ir as ir
 
 from me2e_compress import graph
-from me2e_compress.display import counted, table
+from me2e_compress.display import plural, table
 from me2e_compress.errors import PreconditionError, RecipeError
 from me2e_compress.passes import Pass
 from me2e_compress.passes.import_normalize import with_own_domains
@@ -80,7 +80,7 @@ class LintResult(Result):
             return None
         first, noun = matches[0], "error" if severity == "error" else "finding"
         return (
-            f"{self.model}: {what}, {counted(len(matches), noun)};"
+            f"{self.model}: {what}, {plural(len(matches), noun)};"
             f" {first.rule} {first.node!r}: {first.message}"
         )
 
@@ -127,7 +127,7 @@ class LintResult(Result):
         counts = Counter(each.severity for each in self.findings)
         always = ("error", "warning")
         parts = [
-            counted(counts[each], each) if each in always else f"{counts[each]} {each}"
+            plural(counts[each], each) if each in always else f"{counts[each]} {each}"
             for each in SEVERITIES
             if counts[each] or each in always
         ]

@@ -9,7 +9,7 @@ import onnx_ir as ir
 
 from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.calibration.sample import hold_out, spread
-from me2e_compress.display import Table, counted
+from me2e_compress.display import Table, plural
 from me2e_compress.errors import EvaluationError, FramesError, GraphError
 from me2e_compress.fidelity.compare import Fidelity, SetFidelity, SetTally, compare
 from me2e_compress.fidelity.floor import Floor, Shortfall, shown
@@ -98,7 +98,7 @@ class MeasuredLoss:
                 every = fidelity.seen and f" of {fidelity.frames + fidelity.seen}"
                 reach = f" ({reach} by frame{every or ''})" if reach else ""
                 parts.append(f"the noisiest output is {worst.name}, {noise}{reach}")
-            where = f"on {counted(fidelity.frames, 'frame')} {self.on}"
+            where = f"on {plural(fidelity.frames, 'frame')} {self.on}"
             yield f"{'; '.join(parts) or 'no output could be judged'} ({where})"
         elif self.on != NOT_ASKED:
             yield f"fidelity: not measured ({self.on})"
@@ -115,7 +115,7 @@ class MeasuredLoss:
             yield from self.liveness.faults
         if self.fidelity is not None and self.fidelity.frames < FEW:
             yield (
-                f"this verdict rests on {counted(self.fidelity.frames, 'frame')}:"
+                f"this verdict rests on {plural(self.fidelity.frames, 'frame')}:"
                 f" record {3 * FEW} or more, a third of which is measured on"
             )
         if self.fidelity is not None:
@@ -139,7 +139,7 @@ class MeasuredLoss:
             if each.discrete
         }
         verdicts |= dict.fromkeys(below, "below")
-        title = f"Fidelity on {counted(fidelity.frames, 'frame')} {self.on}"
+        title = f"Fidelity on {plural(fidelity.frames, 'frame')} {self.on}"
         return outputs_table(title, fidelity, self.agents, verdicts)
 
     def record(self) -> dict[str, object]:

@@ -4,7 +4,7 @@ import dataclasses
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
-from me2e_compress.display import Table, not_measured, number, some_of, table
+from me2e_compress.display import Table, format_number, join_names, missing_note, table
 from me2e_compress.errors import EvaluationError
 from me2e_compress.evaluators.bench2drive.real_results import (
     Bench2DriveResults,
@@ -49,12 +49,13 @@ class RealRun:
         Each figure is shown over the whole set, and over what was driven.
         """
         collected, off_rate = self.collected, self.collected.off_rate
+        broken = tuple(collected.broken)
         counts = [
             ("evaluated", "", str(len(collected.episodes))),
-            *((key, some_of(of), str(len(of))) for key, of in self._named().items()),
-            ("not at 20 Hz", some_of(tuple(off_rate)), str(len(off_rate))),
+            *((key, join_names(of), str(len(of))) for key, of in self._named().items()),
+            ("not at 20 Hz", join_names(tuple(off_rate)), str(len(off_rate))),
             ("unfinished files", "", str(len(collected.unfinished))),
-            ("broken", some_of(tuple(collected.broken)), str(len(collected.broken))),
+            ("broken", join_names(broken), str(len(broken))),
         ]
         # not every figure is both given by the simulator and computed here
         of = self.leaderboard
@@ -68,9 +69,9 @@ class RealRun:
         for label, key, unit in figures:
             both = [each.get(key, Quotients()) for each in (of.given, of.computed)]
             if unit == "%":  # a missing route has no penalty
-                values = [number(each.set, ".4f") for each in both]
+                values = [format_number(each.set, ".4f") for each in both]
                 rows.append((label, "set", *values, str(of.set_size), unit))
-            values = [number(each.driven, ".4f") for each in both]
+            values = [format_number(each.driven, ".4f") for each in both]
             rows.append((label, "driven", *values, str(of.driven), unit))
         real = f"{name}: real runs, Bench2Drive's routes"
         words = "given by the simulator, and computed with Bench2Drive's penalties"
@@ -280,8 +281,8 @@ def driving_score(scores: Scores) -> str:
 
 
 def _between(estimate: Estimate) -> str:
-    low, high = number(estimate.low, ".1f"), number(estimate.high, ".1f")
-    return f"{number(estimate.value, '.1f')} ({low} to {high})"
+    low, high = format_number(estimate.low, ".1f"), format_number(estimate.high, ".1f")
+    return f"{format_number(estimate.value, '.1f')} ({low} to {high})"
 
 
 def scores_table(name: str, scores: Scores) -> Table:
@@ -295,7 +296,7 @@ def scores_table(name: str, scores: Scores) -> Table:
         rows.append((label, *cells, unit))
     columns = ("score", "mean", "95 %", "95 %, other types", "n", "unit")
     why = {label: e.measure.reason for label, e in _each(scores) if e.value is None}
-    return table(f"{name}: {routes}{partial}", columns, rows, not_measured(why))
+    return table(f"{name}: {routes}{partial}", columns, rows, missing_note(why))
 
 
 def _each(scores: Scores) -> Iterator[tuple[str, Estimate]]:

@@ -7,10 +7,10 @@ from typing import Any
 
 from me2e_compress.display import (
     Table,
-    counted,
-    not_measured,
-    number,
-    significant,
+    format_number,
+    format_significant,
+    missing_note,
+    plural,
     table,
 )
 from me2e_compress.errors import EvaluationError
@@ -43,7 +43,7 @@ class EerScores:
         """Return the scores and their weights."""
         scores, scale = self.result.scores, self.result.scale
         rows = [[n, *estimate_cells(each, ".2f")] for n, each in scores.items()]
-        why = not_measured(
+        why = missing_note(
             {
                 f"EER_AV of {name}": each.measure.reason
                 for name, each in scores.items()
@@ -56,8 +56,8 @@ class EerScores:
             return (points,)
         # a measure is scaled so that its offset is 0 and offset plus span is 1
         rows = [
-            [measure, f"{weight:.3f}", significant(low), significant(low + span), unit]
-            for measure, weight, low, span, unit in zip(
+            [name, f"{weight:.3f}", *map(format_significant, (low, low + span)), unit]
+            for name, weight, low, span, unit in zip(
                 MEASURES, scale.weights, scale.offset, scale.span, UNITS, strict=True
             )
         ]
@@ -145,7 +145,7 @@ def _variants(
         fitting = [each for each in folders if name in (each, Path(each).name)]
         if len(fitting) != 1:
             raise EvaluationError(
-                f"energy of {name}: {counted(len(fitting), 'folder')} of that name;"
+                f"energy of {name}: {plural(len(fitting), 'folder')} of that name;"
                 f" there are {', '.join(folders)}"
             )
         if isinstance(given, (str, Path)):
@@ -168,10 +168,10 @@ def estimate_cells(estimate: Estimate, form: str) -> tuple[str, str, str, str]:
         return "-", "-", "-", str(estimate.n)
     here = _between(estimate.low, estimate.high, form)
     anew = _between(estimate.anew_low, estimate.anew_high, form)
-    return number(estimate.value, form), here, anew, str(estimate.n)
+    return format_number(estimate.value, form), here, anew, str(estimate.n)
 
 
 def _between(low: float | None, high: float | None, form: str) -> str:
     if low is None or high is None:
         return "-"
-    return f"{number(low, form)} to {number(high, form)}"
+    return f"{format_number(low, form)} to {format_number(high, form)}"

@@ -14,7 +14,7 @@ from me2e_compress.calibration.calibrator import Calibrator
 from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.calibration.ranges import Ranges
 from me2e_compress.calibration.sample import draw
-from me2e_compress.display import counted, megabytes, significant, table
+from me2e_compress.display import format_mb, format_significant, plural, table
 from me2e_compress.errors import EnergyError, RecipeError
 from me2e_compress.fidelity.sensitivity import (
     Budget,
@@ -125,14 +125,14 @@ class SearchResult(Result):
         rows = [
             (
                 ", ".join(each.modules) or "none",
-                significant(None if each.score is None else each.score.loss),
-                significant(each.loss),
-                *map(significant, each.measured_costs or ()),
+                format_significant(None if each.score is None else each.score.loss),
+                format_significant(each.loss),
+                *map(format_significant, each.measured_costs or ()),
             )
             for each in self.tried
         ]
         limits = " and ".join(
-            f"{significant(limit, 6)} {unit}" for unit, limit in self.limits
+            f"{format_significant(limit, 6)} {unit}" for unit, limit in self.limits
         )
         columns = ("int8", "loss", "predicted", *(unit for unit, _ in self.limits))
         tried = table("Tried, best first", columns, rows, f"budget: {limits}")
@@ -248,17 +248,17 @@ class SensitivityResult(Result):
         ]
         rows.append(("together", "", *_cells(sensitivity.together)))
         columns = ("module", "nodes", f"loss {unit}", "worst output, dB")
-        size = megabytes(sensitivity.together.weight_bytes)
-        note = f"{counted(sensitivity.trials, 'variant')} run; all together {size} MB"
+        size = format_mb(sensitivity.together.weight_bytes)
+        note = f"{plural(sensitivity.trials, 'variant')} run; all together {size} MB"
         lines = [
-            f"{each.module}: {node}: {significant(alone)} {unit} alone"
+            f"{each.module}: {node}: {format_significant(alone)} {unit} alone"
             for each in sensitivity.findings
             for node, alone in each.blamed
         ]
         lines.append(self.written)
         if self.score is not None:
-            loss = f"{significant(self.score.loss)} {self.score.unit}"
-            lines.append(f"its loss: {loss}, limit {significant(self.limit)}")
+            loss = f"{format_significant(self.score.loss)} {self.score.unit}"
+            lines.append(f"its loss: {loss}, limit {format_significant(self.limit)}")
         modules = table("Int8 module by module", columns, rows, note)
         return Shown(self.written, [modules], lines)
 
@@ -299,4 +299,4 @@ def measure_sensitivity(
 
 def _cells(score: Score) -> tuple[str, str]:
     worst = score.worst
-    return significant(score.loss), f"{worst.name} {worst.sqnr_db:.1f}"
+    return format_significant(score.loss), f"{worst.name} {worst.sqnr_db:.1f}"

@@ -13,7 +13,7 @@ from me2e_compress.cli.app import build_app
 from me2e_compress.cli.commands import Output
 from me2e_compress.cli.console import listening, show
 from me2e_compress.errors import OptionError
-from me2e_compress.extras import need_extra
+from me2e_compress.extras import require_extra
 
 
 def command(
@@ -35,7 +35,7 @@ def command(
     """
     if not 0.0 <= (overlook or 0.0) <= 1.0:
         raise OptionError(f"--overlook is {overlook}: it must be from 0 to 1")
-    need_extra("highway", "training")
+    require_extra("highway", "training")
     from models.driver.workflow import train  # takes torch seconds to import
 
     with listening(stages=True) as listener:

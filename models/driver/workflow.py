@@ -3,7 +3,7 @@
 import dataclasses
 from pathlib import Path
 
-from me2e_compress.display import Table, number, table
+from me2e_compress.display import Table, format_number, table
 from me2e_compress.metrics.measure import Estimate
 from me2e_compress.workflows.checks import check_folder, writing
 from me2e_compress.workflows.options import check_count
@@ -92,5 +92,6 @@ def train(
 
 
 def _between(estimate: Estimate) -> str:
-    bounds = f"{number(estimate.low, '.1f')} to {number(estimate.high, '.1f')}"
-    return f"{number(estimate.value, '.1f')} ({bounds})"
+    ends = (estimate.value, estimate.low, estimate.high)
+    value, low, high = (format_number(each, ".1f") for each in ends)
+    return f"{value} ({low} to {high})"

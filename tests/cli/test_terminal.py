@@ -15,7 +15,7 @@ from me2e_compress.cli.console import (
     listening,
     print_table,
 )
-from me2e_compress.display import Cell, Table, duration, table
+from me2e_compress.display import Cell, Table, format_duration, table
 from me2e_compress.version import __version__
 from tests.support.command import Cli
 
@@ -122,7 +122,7 @@ def test_off_a_terminal_progress_is_lines(
     ],
 )
 def test_durations(seconds: float, text: str) -> None:
-    assert duration(seconds) == text
+    assert format_duration(seconds) == text
 
 
 NODE = "/planner/agent_layer/cross_attn/value/MatMul"

@@ -7,7 +7,7 @@ from typing import ClassVar
 import pytest
 
 from me2e_compress.calibration.observers import OBSERVERS, MaxMin
-from me2e_compress.errors import FORMER, RecipeError
+from me2e_compress.errors import FORMER_NAMES, RecipeError
 from me2e_compress.manager import recipe
 from me2e_compress.quantization.rules import RULE_SETS
 from me2e_compress.registry import Registry
@@ -121,7 +121,7 @@ def test_another_package_may_bring_a_name_that_is_gone(
 
 
 def test_a_name_is_gone_of_its_own_kind_alone() -> None:
-    assert "calibration method entropy" in FORMER
+    assert "calibration method entropy" in FORMER_NAMES
     others = Registry[MaxMin]("policy", "none.of.these", RecipeError, {})
     with pytest.raises(RecipeError, match="no policy 'entropy'; there are none"):
         others.get("entropy")

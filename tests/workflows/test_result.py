@@ -31,7 +31,7 @@ NASTY = "a\x1b[31m[red]|<b>\n\u202eb\udcff"
 
 def test_names_do_not_steer_a_terminal_and_are_no_markup_in_markdown() -> None:
     found = table("t" + NASTY, ["name"], [[NASTY]], note="one\ntwo\x07 < b")
-    shown, written = found.printable(), found.markdown()
+    shown, written = found.escape_controls(), found.markdown()
 
     assert shown.rows[0][0].text == r"a\x1b[31m[red]|<b>\n\u202eb\udcff"
     assert shown.title == r"ta\x1b[31m[red]|<b>\n\u202eb\udcff"

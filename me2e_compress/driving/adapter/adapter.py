@@ -200,7 +200,7 @@ class Adapter(BaseModel):
             first = error.errors(include_url=False)[0]
             where = ".".join(map(str, first["loc"]))
             words = first["msg"].removeprefix("Value error, ")
-            words = FORMER.get(f"adapter key {where}", words)
+            words = FORMER_NAMES.get(f"adapter key {where}", words)
             raise EvaluationError(f"{origin} {where}: {words}") from error
 
     def metadata(self, own: Mapping[str, str]) -> dict[str, str]:

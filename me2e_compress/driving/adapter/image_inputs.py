@@ -17,7 +17,7 @@ from pydantic import (
 
 from me2e_compress.driving.contract import DEFAULT_IMAGE_SIZE, Shape
 from me2e_compress.errors import EvaluationError
-from me2e_compress.extras import explained
+from me2e_compress.extras import with_install_hint
 from me2e_compress.registry import documents
 from me2e_compress.runtime.frames import Array
 
@@ -375,7 +375,7 @@ class InputImages:
         try:
             import cv2
         except ImportError as error:
-            raise explained(error) from error
+            raise with_install_hint(error) from error
         # bilinear, by pixel centres; a picture of that size stays as it is
         size, how = self.size[::-1], cv2.INTER_LINEAR
         made = [cv2.resize(part, size, interpolation=how) for part in parts]

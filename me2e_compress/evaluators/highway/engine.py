@@ -20,7 +20,7 @@ import psutil
 from me2e_compress.driving.policies import Driver
 from me2e_compress.errors import EvaluationError, Me2eError
 from me2e_compress.evaluators.contract import Drive, Driven, Engine
-from me2e_compress.extras import explained
+from me2e_compress.extras import with_install_hint
 from me2e_compress.runtime.children import end_with_parent, spawn_context
 from me2e_compress.simulator.routes import Route
 
@@ -156,7 +156,7 @@ def _serve(
     except (EOFError, BrokenPipeError, ConnectionResetError):
         return
     except (Me2eError, ImportError) as error:
-        explanation = explained(error)
+        explanation = with_install_hint(error)
         if not isinstance(explanation, Me2eError):
             raise
         line.send(explanation)
@@ -220,7 +220,7 @@ class RayEngine:
             import ray
             import ray.util
         except ImportError as error:
-            raise explained(error) from error
+            raise with_install_hint(error) from error
         self._connect(ray)
         try:
             remote: Any = ray.remote(num_cpus=1)(RouteWorker)

@@ -18,7 +18,7 @@ from me2e_compress.evaluators.contract import (
 from me2e_compress.evaluators.highway.drivers import image_size_of
 from me2e_compress.evaluators.highway.engine import LocalEngine
 from me2e_compress.evaluators.results import log_cost
-from me2e_compress.extras import need_extra
+from me2e_compress.extras import require_extra
 from me2e_compress.metrics.episode import Episode
 from me2e_compress.simulator.routes import (
     EXPERT_S,
@@ -59,7 +59,7 @@ class Highway(Evaluator):
 
     def check_policy(self, policy: Driver) -> None:
         """Open a policy once; highway-env is an extra."""
-        need_extra("highway", "driving")
+        require_extra("highway", "driving")
         opened(policy)
 
     def made_by(self, policy: Driver | None, drive: Drive) -> dict[str, Any]:

@@ -7,7 +7,7 @@ from typing import Literal
 
 import onnx_ir as ir
 
-from me2e_compress.display import some_of
+from me2e_compress.display import join_names
 from me2e_compress.errors import ModuleMapError
 from me2e_compress.graph.modules.module_map import (
     ModuleMap,
@@ -211,7 +211,7 @@ def _check_required(modules: ModuleMap, paths: Collection[str]) -> None:
 
 def _sample(paths: Iterable[str]) -> str:
     tops = list(dict.fromkeys(".".join(path.split(".")[:2]) for path in paths if path))
-    return some_of(tops, 8) or "no scopes and no named parameters"
+    return join_names(tops, 8) or "no scopes and no named parameters"
 
 
 def _parameters(model: ir.Model) -> list[str]:

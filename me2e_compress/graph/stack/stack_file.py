@@ -11,7 +11,7 @@ from typing import Any, Self
 import onnx_ir as ir
 import pydantic
 
-from me2e_compress.errors import FORMER, GraphError
+from me2e_compress.errors import FORMER_NAMES, GraphError
 from me2e_compress.graph.files import load
 from me2e_compress.graph.recurrence import SessionPort, declared_pairs, port_of
 from me2e_compress.registry import documents
@@ -37,7 +37,7 @@ class PartEntry(pydantic.BaseModel):
     @classmethod
     def _without_first_frame(cls, value: Any) -> Any:
         if isinstance(value, dict) and "first_frame" in value:
-            raise ValueError(FORMER["stack first_frame"])
+            raise ValueError(FORMER_NAMES["stack first_frame"])
         return value
 
     @pydantic.model_validator(mode="after")
@@ -71,7 +71,7 @@ class StackFile(pydantic.BaseModel):
     @classmethod
     def _without_first(cls, state: Any) -> Any:
         if isinstance(state, dict) and any(isinstance(e, dict) for e in state.values()):
-            raise ValueError(FORMER["stack first"])
+            raise ValueError(FORMER_NAMES["stack first"])
         return state
 
     @pydantic.field_validator("metadata")

@@ -12,7 +12,7 @@ import onnx_ir as ir
 
 from me2e_compress.calibration.calibrator import Calibrator
 from me2e_compress.calibration.dataset import CalibrationSet
-from me2e_compress.display import counted
+from me2e_compress.display import plural
 from me2e_compress.errors import PreconditionError
 from me2e_compress.graph import (
     array_of,
@@ -156,7 +156,7 @@ class ConvertFloat16(Pass):
             for node, reason in wide.items()
             if any(each is not None and each.dtype == FLOAT for each in node.inputs)
         )
-        nodes, stay = counted(len(narrow), "node"), reasons.total()
+        nodes, stay = plural(len(narrow), "node"), reasons.total()
         notes = [f"{nodes} in float16, {stay} stay in float32"]
         if reasons:
             listed = ", ".join(f"{why} {n}" for why, n in reasons.most_common())

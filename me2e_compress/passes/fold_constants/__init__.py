@@ -21,7 +21,7 @@ from typing import ClassVar
 import onnx_ir as ir
 
 from me2e_compress import graph as graphs
-from me2e_compress.display import counted
+from me2e_compress.display import plural
 from me2e_compress.graph import provenance
 from me2e_compress.graph.digest import digest_of_tensor
 from me2e_compress.graph.nodes import Array, graphs_of
@@ -303,14 +303,14 @@ def _notes(tally: _Tally) -> tuple[str, ...]:
     notes = []
     if tally.folded:
         notes.append(
-            f"{counted(tally.folded, 'node')} became"
-            f" {counted(tally.stored, 'initializer')}"
+            f"{plural(tally.folded, 'node')} became"
+            f" {plural(tally.stored, 'initializer')}"
             f" ({tally.growth_bytes:+,} bytes)"
         )
     if tally.inlined:
         notes.append("branches took the places of Ifs whose conditions are known")
     if tally.kept:
-        kept = counted(tally.kept, "node")
+        kept = plural(tally.kept, "node")
         notes.append(f"{kept} left to compute constants: smaller than their values")
     if tally.refused:
         what = ", ".join(f"{count} {op}" for op, count in sorted(tally.refused.items()))

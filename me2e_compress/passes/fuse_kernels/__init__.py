@@ -7,7 +7,7 @@ from typing import ClassVar
 
 import onnx_ir as ir
 
-from me2e_compress.display import counted
+from me2e_compress.display import plural
 from me2e_compress.errors import PreconditionError
 from me2e_compress.graph import graphs_of, opset_of
 from me2e_compress.graph.nodes import STANDARD
@@ -83,7 +83,7 @@ class FuseKernels(Pass):
         if done:
             model.opset_imports.setdefault(OWN_DOMAIN, 1)
             remove_dead(model.graph)
-        notes = [f"fused: {counted(n, kind)}" for kind, n in sorted(done.items())]
+        notes = [f"fused: {plural(n, kind)}" for kind, n in sorted(done.items())]
         return PassResult(model, done.total(), (*notes, *left))
 
 

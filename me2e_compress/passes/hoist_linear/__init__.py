@@ -5,7 +5,7 @@ from typing import ClassVar
 
 import onnx_ir as ir
 
-from me2e_compress.display import counted
+from me2e_compress.display import plural
 from me2e_compress.graph import macs, nodes_of, opset_of
 from me2e_compress.graph.nodes import graphs_of
 from me2e_compress.graph.rewrite import remove_dead, value_names
@@ -78,11 +78,11 @@ class HoistLinear(Pass):
                 break
         less = f"{(macs_before - _macs(model)) / 1e6:,.1f} MMACs fewer"
         notes = (
-            (products, f"moved {counted(products, 'product')}: {less}"),
-            (others, f"moved {counted(others, 'other node')} before repeated rows"),
+            (products, f"moved {plural(products, 'product')}: {less}"),
+            (others, f"moved {plural(others, 'other node')} before repeated rows"),
             (
                 left,
-                f"left {counted(left, 'node')} behind what repeats: others read it too,"
+                f"left {plural(left, 'node')} behind what repeats: others read it too,"
                 " or it is small",
             ),
             (unread, f"removed what nothing reads: {unread}"),

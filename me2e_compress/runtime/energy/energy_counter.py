@@ -15,7 +15,7 @@ from typing import Any, ClassVar
 import numpy as np
 import numpy.typing as npt
 
-from me2e_compress.display import prefixed
+from me2e_compress.display import with_prefix
 from me2e_compress.errors import EnergyError
 from me2e_compress.registry import Registry, documents
 from me2e_compress.runtime.energy.energy_result import (
@@ -212,7 +212,7 @@ def open_counter(text: str = AUTO) -> Reader | EnergyRecording | Absent:
         opened = counter.open()
         if not isinstance(opened, Absent):
             return opened
-        answers.append(prefixed(counter.name, opened.reason))
+        answers.append(with_prefix(counter.name, opened.reason))
     return Absent(f"no energy counter answers ({'; '.join(answers)})")
 
 

@@ -14,7 +14,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.style import context
 
-from me2e_compress.display import in_words
+from me2e_compress.display import cell_text
 from me2e_compress.metrics.measure import Estimate, Measure
 from me2e_compress.metrics.scores import Scores
 from me2e_compress.study.cells import estimate_cell, measure_cell, number
@@ -160,7 +160,7 @@ def differences(outcome: StudyResult) -> Markup | None:
 
 
 def _difference(place: int, gap: Estimate) -> Mark:
-    words = in_words(estimate_cell(gap, signed=True))
+    words = cell_text(estimate_cell(gap, signed=True))
     colour = ACCENT if gap.sign else MUTED
     ends = gap.low, gap.high
     return Mark(place, colour, words, gap.value, *ends, filled=bool(gap.sign))

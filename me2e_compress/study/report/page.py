@@ -7,7 +7,7 @@ from pathlib import Path
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 
-from me2e_compress.display import Table, counted, in_markdown
+from me2e_compress.display import Table, escape_markdown, plural
 from me2e_compress.errors import StudyError
 from me2e_compress.metrics.route_summary import shown_by
 from me2e_compress.registry import drafts
@@ -96,7 +96,7 @@ def study_page(
     load = "" if outcome.load is None else f"; while it was timed, {outcome.load}"
     timed = (
         f"{timing.samples} inferences a model, in turn, on"
-        f" {counted(timing.threads, 'thread')}; device scale {outcome.device_scale:.3g}"
+        f" {plural(timing.threads, 'thread')}; device scale {outcome.device_scale:.3g}"
     )
     made = [
         ("Command", " ".join(command)),
@@ -151,7 +151,7 @@ def _lede(outcome: StudyResult) -> str:
     share = "" if driven == whole else f"{driven} of "
     described = "; ".join(outcome.described(each) for each in study.conditions)
     return (
-        f"Drivers compared in closed loop on the same {share}{counted(whole, 'route')}"
+        f"Drivers compared in closed loop on the same {share}{plural(whole, 'route')}"
         f" of {study.driven_by.label}. {described}."
     )
 
@@ -166,12 +166,12 @@ def _how_to_read(outcome: StudyResult) -> str:
     if frames:
         notes.append(
             "Plan: how far the planned waypoints are from those of"
-            f" {study.baseline}, mean over {counted(frames, 'frame')} (dot) and the"
+            f" {study.baseline}, mean over {plural(frames, 'frame')} (dot) and the"
             " largest distance (end of the line)."
         )
     routes = outcome.coverage[0]
     notes.append(
-        f"Driving score: mean over {counted(routes, 'route')} (dot) and its 95 %"
+        f"Driving score: mean over {plural(routes, 'route')} (dot) and its 95 %"
         " interval (line and brackets)."
     )
     if len(outcome.drives) > MOST_DRIVES:
@@ -221,7 +221,7 @@ def limits(outcome: StudyResult) -> str:
     rest = f", all {whole} none below {shown_by(whole):.1f}" if routes < whole else ""
     note = (
         f"Differences to {outcome.study.baseline} on the same routes, in brackets the"
-        f" 95 % interval of the mean. {counted(routes, 'route')} cannot show a"
+        f" 95 % interval of the mean. {plural(routes, 'route')} cannot show a"
         f" difference below {least:.1f} points of driving score{rest}."
     )
     free = [each.name for each in outcome.study.conditions if each.latency == "none"]
@@ -265,7 +265,7 @@ def write_study(
     # paths, and all tables as Markdown
     folder = Path(folder)
     written = StudyFiles(folder / JSON, folder / MARKDOWN, folder / HTML)
-    heading = f"{drafts.IN_MARKDOWN}# {in_markdown(outcome.title)}\n\n"
+    heading = f"{drafts.IN_MARKDOWN}# {escape_markdown(outcome.title)}\n\n"
     text = heading + "\n".join(table.markdown() for table in outcome.tables())
     page = study_page(outcome, command, sections)
     # all files are written, or none
