@@ -25,7 +25,7 @@ from me2e_compress.errors import GraphError, Me2eError, RecipeError
 from me2e_compress.graph import file_bytes
 from me2e_compress.operators.deformable_attention import DeformableAttention
 from me2e_compress.registry.drafts import PRODUCER
-from me2e_compress.shipped.drivers import write
+from me2e_compress.shipped.drivers import write_model_file
 from me2e_compress.workflows.checks import writing
 from me2e_compress.workflows.inspect import WEIGHTS
 from me2e_compress.workflows.options import check_count
@@ -110,7 +110,7 @@ def save(graph: onnx.ModelProto, metadata: Mapping[str, str], path: Path) -> Pat
     for key, value in metadata.items():
         graph.metadata_props.add(key=key, value=value)
     graph.producer_name, graph.producer_version = PRODUCER, ""
-    return write(path, graph.SerializeToString())
+    return write_model_file(path, graph.SerializeToString())
 
 
 def build(

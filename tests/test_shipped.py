@@ -17,7 +17,7 @@ def test_an_altered_file_names_both_digests(weights: Path) -> None:
     path.write_bytes(altered)
 
     with pytest.raises(GraphError) as caught:
-        shipped("highway")
+        shipped_model("highway")
     message = str(caught.value)
     assert message.startswith(f"{path}: altered")
     assert hashlib.sha256(altered).hexdigest() in message
@@ -31,7 +31,7 @@ def test_a_missing_file_is_named(weights: Path, name: str) -> None:
     (weights / name).unlink()
 
     with pytest.raises(GraphError, match=rf"/{name}: .*No such file"):
-        shipped("highway")
+        shipped_model("highway")
 
 
 @pytest.mark.parametrize(
@@ -59,13 +59,13 @@ def test_a_card_that_is_none(
 
 def test_an_unknown_name_lists_what_ships() -> None:
     with pytest.raises(GraphError, match="no model 'uniad' ships; there is highway"):
-        shipped("uniad")
+        shipped_model("uniad")
 
 
 def test_a_copy_has_the_same_bytes_and_a_process_checks_once(
     weights: Path, tmp_path: Path
 ) -> None:
-    path = shipped("highway")
+    path = shipped_model("highway")
     assert path == weights / "highway.onnx"
 
     target = copy("highway", tmp_path / "new" / "mine.onnx")
@@ -73,7 +73,7 @@ def test_a_copy_has_the_same_bytes_and_a_process_checks_once(
     assert target.read_bytes() == path.read_bytes()
     assert [each.name for each in target.parent.iterdir()] == ["mine.onnx"]
     path.write_bytes(b"altered since")
-    assert shipped("highway") == path
+    assert shipped_model("highway") == path
 
 
 @pytest.mark.parametrize(
@@ -122,8 +122,8 @@ def test_a_copy_of_the_driver_has_frames_to_verify_it_on(
     other = tmp_path / "other.onnx"
     other.write_bytes(copied.read_bytes()[:-1] + b"?")
 
-    found = sample_frames(copied)
+    found = frames_of(copied)
 
     assert found is not None
     CalibrationSet(found).check(graph.load(copied))
-    assert sample_frames(other) is None
+    assert frames_of(other) is None

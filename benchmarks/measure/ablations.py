@@ -30,7 +30,7 @@ from me2e_compress.errors import Me2eError
 from me2e_compress.graph.modules.module_map import ModuleMap
 from me2e_compress.manager import PassManager, recipe
 from me2e_compress.passes import Context, Pass
-from me2e_compress.shipped.drivers import sample_frames
+from me2e_compress.shipped.drivers import frames_of
 from me2e_compress.workflows.inspect import weigh
 
 LEDGER_M = {
@@ -122,7 +122,7 @@ def rows(name: str, out: Path) -> Iterable[str]:
     stack, source = STACKS[name], out / f"{name}.onnx"
     if not source.is_file():
         write_source(name, source)
-    frames = sample_frames(source)
+    frames = frames_of(source)
     recording = None if frames is None else CalibrationSet(frames)
     context = Context(ModuleMap.load(stack.preset), recording)
     folded = run(graph.load(source), recipe.load("exact")[:COMMON], context)

@@ -86,7 +86,7 @@ def main() -> None:
 def graphs(out: Path) -> Iterator[tuple[str, PreparedGraph]]:
     """Export what is not there, and run the exact passes."""
     out.mkdir(parents=True, exist_ok=True)
-    files = {"highway": shipped("highway")}
+    files = {"highway": shipped_model("highway")}
     for name in ("vad-tiny", "resnet50"):
         files[name] = out / f"{name}.onnx"
     if not files["vad-tiny"].is_file():

@@ -22,7 +22,7 @@ from me2e_compress.driving.onnx_policy import OnnxPolicy
 from me2e_compress.evaluators import Drive
 from me2e_compress.evaluators.highway.runner import drive
 from me2e_compress.metrics.route_scores import route_score
-from me2e_compress.shipped.drivers import shipped
+from me2e_compress.shipped.drivers import shipped_model
 from me2e_compress.simulator.routes import load_routes, pick_routes
 
 Floats = npt.NDArray[np.float64]
@@ -35,7 +35,7 @@ REPEATS = 3
 def recorded(routes: str) -> list[tuple[Floats, Outputs]]:
     """Drive the routes; return the plan and the occupancy of every decision."""
     asked = list[tuple[Floats, Outputs]]()
-    plain = OnnxPolicy.open(shipped("highway"))
+    plain = OnnxPolicy.open(shipped_model("highway"))
 
     class Recorder(CollisionOptimizer):
         """The stage, which keeps what it was given."""
@@ -44,7 +44,7 @@ def recorded(routes: str) -> list[tuple[Floats, Outputs]]:
             asked.append((plan, {self.output: outputs[self.output]}))
             return super().work(plan, outputs)
 
-    policy = OnnxPolicy.open(shipped("highway"), stage=Recorder())
+    policy = OnnxPolicy.open(shipped_model("highway"), stage=Recorder())
     for route in pick_routes(load_routes(), routes):
         scores = [
             route_score(drive(route, each, Drive())).composed

@@ -73,7 +73,7 @@ def report(name: str, path: Path, reference: Reference, cpu_s: float) -> None:
     int8 = sum(w.nbytes for w in weights if w is not None and w.dtype.name == "INT8")
     session = Session(path, threads=2, int8_kernels=True, release=True)
     tally = LivenessTally(reference.session, session)
-    found = reference.compare(session, watching=[tally.add])
+    found = reference.compare(session, watchers=[tally.add])
     ego = {item.name: item.sqnr_db for item in found.outputs}[PLAN]
     (alive,) = (each for each in tally.result().outputs if each.output == PLAN)
     plan = found.plan

@@ -1,7 +1,7 @@
 """How far a graph is from another, and which modules and nodes int8 hurts."""
 
 SQNR_FLOOR_DB = 20.0
-"""Noise of a tenth of the signal's amplitude: below, an output is warned of."""
+"""Least SQNR of an output, dB: noise of a tenth of the signal's amplitude."""
 ALIVE = 0.01
 """Least standard deviation over frames, as a share of the uncompressed graph's, of an
 output that is not dead."""

@@ -53,7 +53,7 @@ class OutputFidelity:
 
     @property
     def by_frame(self) -> str:
-        """The SQNR from the noisiest frame to the quietest, dB; empty for one."""
+        """The least and most SQNR of a frame as text, dB; empty where equal."""
         least, most = self.least_db, self.most_db
         return "" if least == most else f"{least:z.1f} to {most:z.1f}"
 
@@ -91,8 +91,8 @@ class Fidelity:
     same_choice: float | None = None
     seen: int = 0
 
-    def beside(self, seen: "Fidelity") -> "Fidelity":
-        """Widen what frames reach by those calibrated on, quieter than any to come."""
+    def widen(self, seen: "Fidelity") -> "Fidelity":
+        """Let `least_db` and `most_db` include ``seen`` frames, calibrated on."""
         outputs = list[OutputFidelity]()
         for a, b in zip(self.outputs, seen.outputs, strict=True):
             least, most = min(a.least_db, b.least_db), max(a.most_db, b.most_db)
@@ -100,7 +100,7 @@ class Fidelity:
         return dataclasses.replace(self, outputs=tuple(outputs), seen=seen.frames)
 
     @property
-    def strays(self) -> tuple[str, ...]:
+    def stray_texts(self) -> tuple[str, ...]:
         """A sentence for each output that is a number in one model alone."""
         return tuple(
             f"{each.name}: {each.stray:.2g} of it is a number in one graph alone"
@@ -122,20 +122,20 @@ class Reference:
 
     @classmethod
     def of(cls, session: Session, frames: Frames) -> Self:
-        """Run the model once over the frames."""
+        """Run a model once over the frames; raises as :func:`compare` does."""
         answers = tuple(detached(each) for each in replay(session, frames))
         return cls(session, frames, answers)
 
-    def compare(self, other: Session, watching: Sequence[Watch] = ()) -> Fidelity:
+    def compare(self, other: Session, watchers: Sequence[Watch] = ()) -> Fidelity:
         """Compare another model with it, as :func:`compare` does."""
-        return compare(self.session, other, self.frames, watching, iter(self.answers))
+        return compare(self.session, other, self.frames, watchers, iter(self.answers))
 
 
 def compare(
     a: Session,
     b: Session,
     frames: Iterable[Frame],
-    watching: Sequence[Watch] = (),
+    watchers: Sequence[Watch] = (),
     answers: Iterator[dict[str, Array]] | None = None,
 ) -> Fidelity:
     """Run two models over the same frames, each with its own recurrent state.
@@ -143,13 +143,13 @@ def compare(
     Outputs that are sequences or optional are left out.
 
     All arithmetic is float64. One frame is in memory at a time. ``a`` is the reference,
-    and ``answers`` what it answered if it has run already; ``watching`` are shown the
-    outputs of both on every frame, states included.
+    ``answers`` its outputs if it has run already; ``watchers`` are called with the
+    outputs of both on every frame, states included, and the frame.
 
     Raises:
-        EvaluationError: no common output, no frame, or an output that changes its
-            shape.
+        EvaluationError: no common output, no frame, or an output of two shapes.
         FramesError: a frame does not fit one of the models.
+        GraphError: a model cannot run, or nothing picks one of its plan's modes.
     """
     shared = [name for name in a.outputs if name in b.outputs]
     shared = [name for name in shared if a.outputs[name].type.startswith("tensor(")]
@@ -160,25 +160,27 @@ def compare(
     # what can be compared: single outputs, and the plan
     tallies = {name: Tally(name) for name in shared}
     adapter, reason = common_adapter(a, b)
-    moved, chosen = list[Float64](), list[bool]()
+    displacements, same_modes = list[Float64](), list[bool]()
     count = 0
     # frame by frame, with one frame in memory
-    here, shown, along = itertools.tee(frames, 3)
+    for_a, for_b, for_plans = itertools.tee(frames, 3)
     if answers is None:
-        answers = replay(a, here)
-    del here  # what nobody reads must not be kept
+        answers = replay(a, for_a)
+    del for_a  # tee would store every frame that it has not read
     wanted = list(dict.fromkeys([*shared, *b.recurrent.values()]))
-    runs = zip(answers, replay(b, shown, wanted), along, strict=True)
+    runs = zip(answers, replay(b, for_b, wanted), for_plans, strict=True)
     for left, right, frame in runs:
         for name, tally in tallies.items():
             tally.add(left[name], right[name], count)
         if adapter is not None:
             plans = [adapter.plan(each, frame.arrays) for each in (left, right)]
             gap = np.where(np.isnan(plans).all(axis=0), 0.0, plans[0] - plans[1])
-            moved.append(np.nan_to_num(np.linalg.norm(gap, axis=1), nan=math.inf))
+            displacements.append(
+                np.nan_to_num(np.linalg.norm(gap, axis=1), nan=math.inf)
+            )
             if adapter.scores is not None:
-                chosen.append(adapter.choice(left) == adapter.choice(right))
-        for watch in watching:
+                same_modes.append(adapter.choice(left) == adapter.choice(right))
+        for watch in watchers:
             watch(left, right, frame)
         count += 1
     if not count:
@@ -186,16 +188,21 @@ def compare(
     return Fidelity(
         tuple(tally.result() for tally in tallies.values()),
         tuple(name for name in a.outputs if name not in b.outputs),
-        Displacement(float(np.mean(moved)), float(np.max(moved))) if moved else None,
+        Displacement(float(np.mean(displacements)), float(np.max(displacements)))
+        if displacements
+        else None,
         reason,
         count,
-        adapter.output if adapter is not None and moved else "",
-        float(np.mean(chosen)) if chosen else None,
+        adapter.output if adapter is not None and displacements else "",
+        float(np.mean(same_modes)) if same_modes else None,
     )
 
 
 def common_adapter(a: Session, b: Session) -> tuple[PlanAdapter | None, str]:
-    """Return how the plan of both models is read; else None and the reason."""
+    """Return how to read the plan of both models, or None and why not.
+
+    Raises GraphErrors: of malformed metadata, and of modes that nothing picks from.
+    """
     adapter = PlanAdapter.of(a.metadata, list(a.outputs))
     if adapter is None:
         return None, "the model does not say which output is its plan"
@@ -216,16 +223,13 @@ def common_adapter(a: Session, b: Session) -> tuple[PlanAdapter | None, str]:
 MODES_RANK = 4
 """Rank of a plan with modes: [1, modes, n, 2]."""
 
-
-SMALLER, GAP = 30.0, 4.0
-"""Channels so many times smaller than the largest, and than the next larger ones, are
-judged apart: where all share the 127 steps of int8's scale, four are left to them."""
-
-_CHANNELS = 128
-"""An axis of at most so many is one of channels."""
-
-_OF_PICTURES = 4
-"""Sides of a picture differ at most so many times."""
+SMALL_RATIO, GAP_RATIO = 30.0, 4.0
+"""Channels so many times smaller than the largest, and than the next larger ones, have
+an SQNR of their own: of the 127 steps of a scale that all share, four are theirs."""
+_MOST_CHANNELS = 128
+"""The longest axis that may be one of channels."""
+_MOST_ASPECT = 4
+"""Largest ratio of the sides of a picture."""
 
 
 class Tally:
@@ -236,12 +240,12 @@ class Tally:
         self.signal = self.noise = self.gap = self.reach = 0.0
         self.noises = list[float]()
         self.discrete = False
-        self.count = self.strays = 0
+        self.count = self.stray_texts = 0
         # by axis: signal, noise and largest value of each channel
         self._channels = dict[int, Float64]()
 
     def add(self, a: Array, b: Array, frame: int) -> None:
-        """Add a frame; EvaluationError if shapes differ."""
+        """Add a frame's arrays; an EvaluationError if their shapes differ."""
         if a.shape != b.shape:
             raise EvaluationError(
                 f"output {self.name} is {list(a.shape)} in the first model,"
@@ -251,13 +255,13 @@ class Tally:
         self.discrete = a.dtype.kind not in "fc"
         if not x.size:
             return
-        # what is no number in both is no difference, in one alone noise without end
+        # NaN or the same infinity in both is no difference, in one infinite noise
         numbers = np.isfinite(x) & np.isfinite(y)
         same = numbers | (np.isnan(x) & np.isnan(y)) | (x == y)
         strays = int(np.count_nonzero(~same))
         if not numbers.all():
             x, y = np.where(numbers, x, 0.0), np.where(numbers, y, 0.0)
-        self.count, self.strays = self.count + x.size, self.strays + strays
+        self.count, self.stray_texts = self.count + x.size, self.stray_texts + strays
         # sums for the SQNR, largest values for the error
         gap = np.abs(x - y)
         signal = float(np.vdot(x, x))
@@ -282,7 +286,7 @@ class Tally:
 
     @property
     def sqnr_db(self) -> float:
-        """The SQNR over the frames so far."""
+        """The SQNR over the frames so far, dB."""
         return decibels(self.signal, self.noise)
 
     def result(self) -> OutputFidelity:
@@ -292,25 +296,27 @@ class Tally:
         ends = max(noises), min(noises)
         least, most = (decibels(self.signal / len(noises), noise) for noise in ends)
         sqnr = self.sqnr_db
-        stray = self.strays / self.count if self.count else 0.0
-        small, small_db = self._small()
+        stray = self.stray_texts / self.count if self.count else 0.0
+        small, small_db = self._small_channels()
         return OutputFidelity(
             self.name, sqnr, error, self.discrete, least, most, stray, small, small_db
         )
 
-    def _small(self) -> tuple[str, float | None]:
-        """Return the channels below the first gap of sizes, and their SQNR."""
-        apart = list[tuple[float, str]]()
+    def _small_channels(self) -> tuple[str, float | None]:
+        """Return the small channels of the worst axis and their SQNR; "" and None."""
+        candidates = list[tuple[float, str]]()
         for axis, (signal, noise, largest) in self._channels.items():
             order = np.argsort(-largest)
             sizes = largest[order]
-            lower = GAP * sizes[1:] < sizes[:-1]
-            (gaps,) = np.nonzero(lower & (SMALLER * sizes[1:] < sizes[0]))
+            lower = GAP_RATIO * sizes[1:] < sizes[:-1]
+            (gaps,) = np.nonzero(lower & (SMALL_RATIO * sizes[1:] < sizes[0]))
             if gaps.size and sizes[gaps[0] + 1]:
                 small = np.sort(order[gaps[0] + 1 :])
-                name = f"[{':, ' * axis}{_ranges(small.tolist())}]"
-                apart.append((decibels(signal[small].sum(), noise[small].sum()), name))
-        value, name = min(apart, default=(None, ""))
+                name = f"[{':, ' * axis}{_index_ranges(small.tolist())}]"
+                candidates.append(
+                    (decibels(signal[small].sum(), noise[small].sum()), name)
+                )
+        value, name = min(candidates, default=(None, ""))
         return name, value
 
 
@@ -326,17 +332,17 @@ def channel_axes(shape: tuple[int, ...]) -> tuple[int, ...]:
         axes = (1 if shape[1] < shape[2] else 2,)
     elif rank == 2 or (rank > 3 and 1 in shape[1:-1]):
         axes = (rank - 1,)
-    elif rank == 4 and max(shape[2:]) <= _OF_PICTURES * min(shape[2:]):
+    elif rank == 4 and max(shape[2:]) <= _MOST_ASPECT * min(shape[2:]):
         axes = (1,)
     elif rank > 3:
         axes = 1, rank - 1
-    return tuple(axis for axis in axes if 1 < shape[axis] <= _CHANNELS)
+    return tuple(axis for axis in axes if 1 < shape[axis] <= _MOST_CHANNELS)
 
 
-def _ranges(places: list[int]) -> str:
-    """Write sorted places as ``0, 4:84``."""
-    starts = [each for each in places if each - 1 not in places]
-    ends = [each + 1 for each in places if each + 1 not in places]
+def _index_ranges(indices: list[int]) -> str:
+    """Write sorted indices as ``0, 4:84``, ends exclusive."""
+    starts = [each for each in indices if each - 1 not in indices]
+    ends = [each + 1 for each in indices if each + 1 not in indices]
     pairs = zip(starts, ends, strict=True)
     return ", ".join(f"{a}:{b}" if b > a + 1 else f"{a}" for a, b in pairs)
 
@@ -350,16 +356,13 @@ def decibels(signal: float, noise: float) -> float:
     return 10 * math.log10(signal / noise) if signal else -math.inf
 
 
-# Outputs that are sets of agents: each agent is compared with the other's nearest.
-#
-# A detector that sorts its agents by strength swaps two of nearly the same strength
-# after rounding, so a comparison slot by slot compares different cars.
+# Sets of agents: a detector that sorts them by strength swaps two of nearly the same
+# strength after rounding, so each is compared with the other model's nearest one.
 
 
-SURE = 0.5
-"""Score from which an agent counts: more likely there than not."""
-
-SAME_M = 2.0
+PRESENCE_SCORE = 0.5
+"""Least score of an agent that counts: it is there rather than not."""
+MATCH_M = 2.0
 """Centres farther apart are two agents: the largest distance at which nuScenes'
 detection benchmark matches them."""
 
@@ -442,16 +445,16 @@ class SetTally:
     def add(
         self, left: Mapping[str, Array], right: Mapping[str, Array], frame: Frame
     ) -> None:
-        """Match one frame: the assignment with the smallest sum of distances."""
+        """Match a frame's agents by the smallest sum of distances, and add them."""
         from scipy.optimize import linear_sum_assignment  # takes long to import
 
         outputs = self.outputs
         places, others = (each[outputs.boxes][0, :, :2] for each in (left, right))
-        rows = np.flatnonzero(left[outputs.scores][0] >= SURE)
+        rows = np.flatnonzero(left[outputs.scores][0] >= PRESENCE_SCORE)
         gaps = places[rows, None].astype(np.float64) - others.astype(np.float64)
         distances = np.linalg.norm(gaps, axis=2)
-        picked, columns = linear_sum_assignment(np.minimum(distances, SAME_M))
-        near = distances[picked, columns] < SAME_M
+        picked, columns = linear_sum_assignment(np.minimum(distances, MATCH_M))
+        near = distances[picked, columns] < MATCH_M
         mine, theirs = rows[picked][near], columns[near]
         self.agents += len(rows)
         self.matched += len(mine)
@@ -461,6 +464,6 @@ class SetTally:
             tally.add(left[name][0][mine], right[name][0][theirs], frame.index)
 
     def result(self) -> SetFidelity:
-        """Return the figures of all frames."""
+        """Return the figures over the frames so far."""
         sqnr_db = {name: each.sqnr_db for name, each in self.tallies.items()}
         return SetFidelity(self.agents, self.matched, sqnr_db if self.matched else {})

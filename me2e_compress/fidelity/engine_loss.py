@@ -15,9 +15,6 @@ from me2e_compress.fidelity.liveness import OutputTally
 from me2e_compress.runtime.frames import Array, Frame
 from me2e_compress.runtime.session import DTYPES, Session
 
-# An engine's answers beside its graph, which is run with the engine's state.
-
-
 Arrays: TypeAlias = Mapping[str, Array]
 Frames: TypeAlias = CalibrationSet | Sequence[Frame]
 Dump: TypeAlias = EngineDump | Sequence[Arrays]
@@ -40,13 +37,13 @@ class EngineRun:
     def __len__(self) -> int:
         return len(self.frames)
 
-    def follow(
+    def run_graph(
         self, session: Session, names: Sequence[str]
     ) -> Iterator[tuple[Arrays, Arrays]]:
-        """Run a graph over all frames; yield its inputs and the outputs that are named.
+        """Run a graph over all frames; yield its inputs and its outputs ``names``.
 
-        State comes from the dump where it has it, else from the frame before of this
-        run, and is reset where a scene begins.
+        State is that of the dump, or of this run's last frame where the dump lacks it,
+        and is reset where a scene begins.
         """
         own = [each for each in session.recurrent.values() if each not in self.dump[0]]
         asked = list(dict.fromkeys([*names, *own]))
@@ -109,7 +106,7 @@ class OutputLoss:
     dead: str
 
 
-def losses(
+def split_losses(
     run: EngineRun,
     source: Session | None,
     alive: float = ALIVE,
@@ -129,8 +126,8 @@ def losses(
     compiled, whole = ({name: Tally(name) for name in names} for _ in range(2))
     known = [] if source is None else [each for each in names if each in source.outputs]
     quantized = {name: Tally(name) for name in known}
-    floats = iter(()) if source is None else run.follow(source, known)
-    for index, (_, truth) in enumerate(run.follow(run.session, names)):
+    floats = iter(()) if source is None else run.run_graph(source, known)
+    for index, (_, truth) in enumerate(run.run_graph(run.session, names)):
         on_frame(index)
         run.check(index, truth)
         dumped, (_, exact) = run.dump[index], next(floats, (None, {}))

@@ -24,7 +24,6 @@ from me2e_compress.runtime.session import Session, detached, feed_forward
 ROUNDING_DB = 80.0
 """SQNR of two float32 values that differ by rounding alone: two runtimes are 3e-5 to
 6e-5 apart on UniAD-tiny (models/README.md)."""
-
 NARROW = (ir.DataType.FLOAT16, ir.DataType.BFLOAT16)
 
 
@@ -90,7 +89,7 @@ def find_first_difference(
     shared = [name for name in borders if name in known[0] & known[1]]
     if not shared:
         raise EvaluationError("the graphs share no value at the border of a module")
-    feeds = _feeds_of_last(source, frames, provider)
+    feeds = _last_feeds(source, frames, provider)
     expected = _compute(source, shared, feeds, provider)
     values = _compute(candidate, shared, feeds, provider)
     # A few casts to float16 in a float32 graph are what is looked for; not so where a
@@ -105,7 +104,9 @@ def find_first_difference(
             wide += sum(value.dtype == ir.DataType.FLOAT for value in node.outputs)
         if narrow > wide:
             floor_db = SQNR_FLOOR_DB
-    return _compared(candidate, expected, values, floor_db, len(borders) - len(shared))
+    return _compare_values(
+        candidate, expected, values, floor_db, len(borders) - len(shared)
+    )
 
 
 def first_difference_of_engine(
@@ -113,23 +114,24 @@ def first_difference_of_engine(
 ) -> FirstDifference:
     """Find where the tensors that an engine dumped begin to differ from its graph's.
 
-    Every dumped tensor of the first frame is compared, inner ones too.
+    Every dumped tensor of the first frame is compared, inner ones too, with the floor
+    :data:`me2e_compress.fidelity.SQNR_FLOOR_DB`.
     """
-    feeds, _ = next(run.follow(run.session, run.names))
+    feeds, _ = next(run.run_graph(run.session, run.names))
     known, dumped = _values_by_name(model), run.dump[0]
     names = [name for name in dumped if name in known]
     expected = _compute(model, names, feeds, provider)
-    return _compared(model, expected, dumped, SQNR_FLOOR_DB, unknown=0)
+    return _compare_values(model, expected, dumped, SQNR_FLOOR_DB, unknown=0)
 
 
-def _compared(
+def _compare_values(
     model: ir.Model,
     expected: Mapping[str, Array],
     values: Mapping[str, Array],
     floor_db: float,
     unknown: int,
 ) -> FirstDifference:
-    """Compare arrays of the same name, in the order in which a graph computes them."""
+    """Compare arrays by name, in a graph's order; another shape is at -infinity dB."""
 
     def sqnr(name: str) -> float:
         if expected[name].shape != values[name].shape:
@@ -163,8 +165,8 @@ def _border_values(model: ir.Model) -> Iterator[str]:
     for node in model.graph:
         for value in node.outputs:
             others = readers.get(value, set()) - {module_of(node)}
-            handed_on = others or value.is_graph_output()
-            if value.name and value not in constant and handed_on:
+            leaves_module = others or value.is_graph_output()
+            if value.name and value not in constant and leaves_module:
                 yield value.name
 
 
@@ -174,10 +176,10 @@ def _values_by_name(model: ir.Model) -> dict[str, ir.Node]:
     return {name: node for name, node in made if name}
 
 
-def _feeds_of_last(
+def _last_feeds(
     model: ir.Model, frames: Sequence[Frame], provider: Provider
 ) -> Mapping[str, Array]:
-    """Return what a graph is fed at the last frame, state included."""
+    """Return a graph's inputs at the last frame, its own state included."""
     session = Session(model, optimize=False, release=True, provider=provider)
     *before, last = frames if session.recurrent else frames[-1:]
     state = session.first_state(frames[0].arrays)
@@ -193,11 +195,11 @@ def _compute(
     feeds: Mapping[str, Array],
     provider: Provider,
 ) -> dict[str, Array]:
-    """Run a graph, its nodes as they stand, for values anywhere in it."""
-    shown, wanted = model.clone(), list(names)
-    graph.infer_shapes(shown)
-    made = {value.name: value for node in shown.graph for value in node.outputs}
+    """Run a graph without optimization, and return values anywhere in it."""
+    probed, wanted = model.clone(), list(names)
+    graph.infer_shapes(probed)
+    made = {value.name: value for node in probed.graph for value in node.outputs}
     missing = [made[name] for name in wanted if not made[name].is_graph_output()]
-    shown.graph.outputs.extend(missing)
-    session = Session(shown, optimize=False, release=True, provider=provider)
+    probed.graph.outputs.extend(missing)
+    session = Session(probed, optimize=False, release=True, provider=provider)
     return detached(session.run(feeds, wanted))

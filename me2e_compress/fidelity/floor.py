@@ -3,13 +3,13 @@
 import dataclasses
 
 from me2e_compress.fidelity import SQNR_FLOOR_DB
-from me2e_compress.fidelity.compare import Fidelity, SetFidelity
+from me2e_compress.fidelity.compare import Fidelity, OutputFidelity, SetFidelity
 
 PLAN_FLOOR_M = 0.5
-"""A car 1.9 m wide in the middle of a lane of 3.5 m still keeps 0.3 m to its lines."""
-
-MOST_EXCESS = 1e6
-"""Excess of an output that should be zero and is not."""
+"""Metres by which a car 1.9 m wide may leave the middle of a lane of 3.5 m and still
+keep 0.3 m to its lines."""
+LARGEST_EXCESS = 1e6
+"""What the excess is cut at: an output that should be zero has no finite one."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -29,7 +29,7 @@ class Shortfall:
     part: str = ""
 
     def __str__(self) -> str:
-        return f"{self.output}{self.part} {shown(self.value, self.unit)}"
+        return f"{self.output}{self.part} {format_figure(self.value, self.unit)}"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -48,32 +48,41 @@ class Floor:
     def shortfalls(
         self, fidelity: Fidelity, agents: SetFidelity | None = None
     ) -> tuple[Shortfall, ...]:
-        """List what is below the floor, the worst first; sets by matched agents."""
-        below = []
+        """List the outputs that fail, the worst first; discrete ones never do.
+
+        The plan is judged by its mean displacement, sets by the SQNR of their matched
+        ``agents``, others overall, in their small channels or their noisiest frame.
+        """
+        below = list[Shortfall]()
         matched = {} if agents is None else agents.sqnr_db
         for each in fidelity.outputs:
-            # The noise over what is allowed: above 1 is too much.
-            part = ""
             if fidelity.plan is not None and each.name == fidelity.plan_output:
-                value, unit = fidelity.plan.mean_m, "m"
+                value, unit, part = fidelity.plan.mean_m, "m", ""
                 excess = value / self.plan_m
             else:
-                value, unit = matched.get(each.name, each.sqnr_db), "dB"
-                if each.name in matched:
-                    part = " of matched agents"
-                elif each.small_db is not None and each.small_db < value:
-                    value, part = each.small_db, each.small
-                elif each.least_db < self.sqnr_db <= value:
-                    value, part = each.least_db, " in its noisiest frame"
-                excess = min(float(10 ** ((self.sqnr_db - value) / 20)), MOST_EXCESS)
+                value, part = self._worst_sqnr(each, matched.get(each.name))
+                unit, amplitude = "dB", float(10 ** ((self.sqnr_db - value) / 20))
+                excess = min(amplitude, LARGEST_EXCESS)
             if excess > 1 and not each.discrete:
                 below.append(Shortfall(each.name, value, unit, excess, part))
         return tuple(sorted(below, key=lambda each: -each.excess))
+
+    def _worst_sqnr(
+        self, output: OutputFidelity, matched_db: float | None
+    ) -> tuple[float, str]:
+        """Return the SQNR by which an output is judged, dB, and which part it is of."""
+        if matched_db is not None:
+            return matched_db, " of matched agents"
+        if output.small_db is not None and output.small_db < output.sqnr_db:
+            return output.small_db, output.small
+        if output.least_db < self.sqnr_db <= output.sqnr_db:
+            return output.least_db, " in its noisiest frame"
+        return output.sqnr_db, ""
 
     def __str__(self) -> str:
         return f"{self.sqnr_db:g} dB, {self.plan_m:g} m of plan"
 
 
-def shown(value: float, unit: str) -> str:
+def format_figure(value: float, unit: str) -> str:
     """Format a figure with its unit: dB to a tenth, metres to the centimetre."""
     return f"{value:z.1f} dB" if unit == "dB" else f"{value:.2f} {unit}"

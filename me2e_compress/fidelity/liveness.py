@@ -68,7 +68,7 @@ class Liveness:
 
     @property
     def faults(self) -> tuple[str, ...]:
-        """A sentence for each dead output, and for each state that is not fed."""
+        """A sentence for each dead output, and for each state that is not fed back."""
         dead = [str(each) for each in self.outputs if each.is_dead]
         return (*dead, *(f"{name} is not fed back any more" for name in self.not_fed))
 
@@ -115,7 +115,7 @@ class Deviation:
         self._mean = self._squares = np.zeros(())
 
     def add(self, value: Array) -> None:
-        """Take another frame."""
+        """Add a frame; NaN and infinities count as 0, another shape as ``resized``."""
         wide = np.nan_to_num(np.asarray(value, np.float64), posinf=0.0, neginf=0.0)
         self.frames += 1
         if self.frames == 1:
@@ -130,11 +130,11 @@ class Deviation:
 
     @property
     def deviation(self) -> float:
-        """Length of the deviation of all elements."""
+        """Euclidean norm of the elements' standard deviations over the frames."""
         return math.sqrt(float(self._squares.sum()) / max(self.frames, 1))
 
     @property
-    def rests(self) -> bool:
+    def is_constant(self) -> bool:
         """Whether it moves by rounding at most."""
         length = math.hypot(float(np.linalg.norm(self._mean)), self.deviation)
         return self.deviation <= ROUNDING * length
@@ -147,16 +147,16 @@ class OutputTally:
         self.name, self._first, self._second = name, Deviation(), Deviation()
 
     def add(self, first: Array, second: Array) -> None:
-        """Take what both graphs answer to a frame."""
+        """Add what both graphs give of it in a frame."""
         self._first.add(first)
         self._second.add(second)
 
     def result(self, alive: float) -> OutputLiveness:
-        """Give the verdict."""
+        """Judge the output; it is dead below ``alive`` of the first one's deviation."""
         first, second = self._first, self._second
         if first.resized or second.resized:
             return OutputLiveness(self.name, "not judged", None, "its shape changes")
-        if first.rests:
+        if first.is_constant:
             reason = "it rests in the first graph too"
             return OutputLiveness(self.name, "not judged", None, reason)
         moves = second.deviation / first.deviation
@@ -176,21 +176,21 @@ class LivenessTally:
 
     def __init__(self, a: Session, b: Session) -> None:
         self._tallies: dict[str, OutputTally] = {}
-        held = [name for name in a.recurrent if name in b.inputs]
-        self._not_fed = tuple(name for name in held if name not in b.recurrent)
+        recurrent = [name for name in a.recurrent if name in b.inputs]
+        self._not_fed = tuple(name for name in recurrent if name not in b.recurrent)
         self._frames = 0
 
     def add(
         self, left: Mapping[str, Array], right: Mapping[str, Array], frame: Frame
     ) -> None:
-        """Take what both graphs answer to a frame."""
+        """Add the outputs of both graphs in a frame; those of one alone are ignored."""
         self._frames += 1
         for name in (each for each in right if each in left):
             tally = self._tallies.setdefault(name, OutputTally(name))
             tally.add(left[name], right[name])
 
     def result(self, alive: float = ALIVE) -> Liveness:
-        """Judge every output."""
+        """Judge every output, if there are two frames or more."""
         if self._frames < 2:
             return Liveness((), alive, reason="one frame alone: nothing moves")
         outputs = (tally.result(alive) for tally in self._tallies.values())

@@ -38,20 +38,6 @@ from me2e_compress.runtime.providers import CPU, Provider
 from me2e_compress.runtime.session import Session
 from me2e_compress.targets import Target
 
-__all__ = [
-    "Budget",
-    "Candidate",
-    "Int8Choice",
-    "ModuleSensitivity",
-    "Score",
-    "Sensitivity",
-    "Trials",
-    "advise",
-    "analyse",
-    "search",
-    "write_recipe",
-]
-
 # Judge many int8 variants of one float model that is calibrated once.
 
 
@@ -140,16 +126,16 @@ class Trials:
         )
 
     def variant(self, choice: Int8Choice) -> ir.Model:
-        """Build the graph of a choice."""
+        """Return the graph of a choice; with no module, the float model itself."""
         if not choice.modules:
             return self.model
         return self._target.place(self.model, self.plan(choice), self.ranges)
 
     def score(self, choice: Int8Choice) -> Score:
-        """Build, run and judge a choice."""
+        """Build a choice, run it and judge it; each choice is run once."""
         if choice not in self._known:
-            made = self.variant(choice)
-            session, float_session = self._session(made), self.reference.session
+            variant = self.variant(choice)
+            session, float_session = self._session(variant), self.reference.session
             sets = SetTally.of(float_session, session)
             watching = () if sets is None else (sets.add,)
             fidelity = self.reference.compare(session, watching)
@@ -160,13 +146,13 @@ class Trials:
                 for e in fidelity.outputs
             )
             fidelity = dataclasses.replace(fidelity, outputs=outputs)
-            self._known[choice] = Score(fidelity, graph.size(made).weight_bytes)
+            self._known[choice] = Score(fidelity, graph.size(variant).weight_bytes)
             self.done += 1
         return self._known[choice]
 
 
-BLAME = 0.5
-"""Nodes are to blame if they alone cost this part of what their module costs."""
+BLAME_SHARE = 0.5
+"""Least share of its module's loss that a node to blame has alone."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -212,14 +198,14 @@ def analyse(
     Halving runs at most ``node_trials`` variants; ``progress`` is called as
     ``progress(steps done, steps, module)``.
     """
-    active = [name for name in modules if names_of(trials, name)]
+    active = [name for name in modules if int8_names(trials, name)]
     # every module alone
     findings = []
     for done, module in enumerate(active):
         if progress:
             progress(done, len(active) + 1, module)
         score = trials.score(Int8Choice((module,)))
-        nodes = len(names_of(trials, module))
+        nodes = len(int8_names(trials, module))
         findings.append(ModuleSensitivity(module, nodes, score))
     findings.sort(key=lambda each: -each.score.loss)
     # halves of the worst
@@ -227,15 +213,15 @@ def analyse(
     if worst is not None and worst.score.loss > 0 and worst.nodes > 1:
         if progress:
             progress(len(active), len(active) + 1, f"nodes of {worst.module}")
-        blamed = _blamed(trials, worst.module, worst.score.loss, node_trials)
+        blamed = _costly_nodes(trials, worst.module, worst.score.loss, node_trials)
         findings[0] = dataclasses.replace(worst, blamed=blamed)
     # all modules together
     together = trials.score(Int8Choice(tuple(active)))
     return Sensitivity(tuple(findings), together, trials.done)
 
 
-def names_of(trials: Trials, module: str) -> tuple[str, ...]:
-    """Name the nodes that are int8 when a module is, in graph order.
+def int8_names(trials: Trials, module: str) -> tuple[str, ...]:
+    """Name the nodes that become int8 if a module does, in graph order.
 
     Residual Adds are left out: they follow their convolution.
     """
@@ -243,7 +229,7 @@ def names_of(trials: Trials, module: str) -> tuple[str, ...]:
     return tuple(dict.fromkeys(each.node for each in chosen if each.rule != RESIDUAL))
 
 
-def _blamed(
+def _costly_nodes(
     trials: Trials, module: str, loss: float, most: int
 ) -> tuple[tuple[str, float], ...]:
     """Halve a module's nodes until those that cost much stand alone, worst first.
@@ -253,7 +239,7 @@ def _blamed(
     one half are found one by one, nodes that cost little each never. At most ``most``
     variants are run.
     """
-    names = names_of(trials, module)
+    names = int8_names(trials, module)
     parts, blamed = [(loss, names)], list[tuple[str, float]]()
     while parts:
         parts.sort(key=lambda each: each[0])
@@ -268,7 +254,7 @@ def _blamed(
         for half in (part[:middle], part[middle:]):
             rest = tuple(name for name in names if name not in half)
             cost = trials.score(Int8Choice((module,), rest)).loss
-            if cost >= BLAME * loss:
+            if cost >= BLAME_SHARE * loss:
                 parts.append((cost, half))
     return tuple(sorted(blamed, key=lambda each: -each[1]))
 
@@ -286,24 +272,24 @@ def advise(trials: Trials, sensitivity: Sensitivity, limit: float) -> Int8Choice
     The choice has no module if nothing keeps the limit.
     """
 
-    def fits(given: Sequence[_Sacrifice]) -> bool:
-        choice = _without(trials, sensitivity, given)
+    def fits(sacrifices: Sequence[_Sacrifice]) -> bool:
+        choice = _choice_without(trials, sensitivity, sacrifices)
         return not choice.modules or trials.score(choice).loss <= limit
 
     # give up nodes and modules until the limit is kept
-    order, given = list[_Sacrifice](), list[_Sacrifice]()
+    order, sacrifices = list[_Sacrifice](), list[_Sacrifice]()
     for each in sensitivity.findings:
         name, own = each.module, each.score.loss
         order += [_Sacrifice(name, (node,), loss) for node, loss in each.blamed]
         order.append(_Sacrifice(name, None, own))
-    while not fits(given):
-        given.append(order[len(given)])
+    while not fits(sacrifices):
+        sacrifices.append(order[len(sacrifices)])
     # take back what turns out not to matter
-    for last in reversed(given):
-        kept = [other for other in given if other is not last]
+    for last in reversed(sacrifices):
+        kept = [other for other in sacrifices if other is not last]
         if last.loss <= limit and fits(kept):
-            given = kept
-    return _without(trials, sensitivity, given)
+            sacrifices = kept
+    return _choice_without(trials, sensitivity, sacrifices)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -315,24 +301,24 @@ class _Sacrifice:
     loss: float
 
 
-def _without(
-    trials: Trials, sensitivity: Sensitivity, given: Sequence[_Sacrifice]
+def _choice_without(
+    trials: Trials, sensitivity: Sensitivity, sacrifices: Sequence[_Sacrifice]
 ) -> Int8Choice:
     """Return the choice of all modules but what was given up."""
-    gone = {each.module for each in given if each.nodes is None}
+    dropped = {each.module for each in sacrifices if each.nodes is None}
     names = dict[str, list[str]]()
-    for each in given:
-        if each.module not in gone:
+    for each in sacrifices:
+        if each.module not in dropped:
             names.setdefault(each.module, []).extend(each.nodes or ())
     # A module that gave up each of its nodes is given up.
-    gone |= {
+    dropped |= {
         each.module
         for each in sensitivity.findings
         if len(set(names.get(each.module, ()))) >= each.nodes
     }
-    left = {each.module for each in sensitivity.findings} - gone
-    floats = [name for module in names if module in left for name in names[module]]
-    modules = (name for name in trials.modules.names() if name in left)
+    chosen = {each.module for each in sensitivity.findings} - dropped
+    floats = [name for module in names if module in chosen for name in names[module]]
+    modules = (name for name in trials.modules.names() if name in chosen)
     return Int8Choice(tuple(modules), tuple(floats))
 
 
@@ -427,23 +413,23 @@ def search(
             found.
     """
 
-    def weighed(made: ir.Model) -> tuple[float, ...]:
-        return tuple(each.cost(made) for each in budgets)
+    def costs_of(variant: ir.Model) -> tuple[float, ...]:
+        return tuple(each.cost(variant) for each in budgets)
 
-    active = [name for name in modules if names_of(trials, name)]
+    active = [name for name in modules if int8_names(trials, name)]
     if len(active) > MOST_MODULES:
         raise EvaluationError(
             f"{len(active)} modules are more than {MOST_MODULES}: use a coarser map"
         )
     # 1. every module alone: what it loses, what it saves
-    whole = weighed(trials.model)
+    float_costs = costs_of(trials.model)
     losses, savings = dict[str, float](), dict[str, tuple[float, ...]]()
     for done, name in enumerate(active):
         if progress:
             progress(done, len(active), name)
         losses[name] = trials.score(Int8Choice((name,))).loss
-        alone = weighed(trials.variant(Int8Choice((name,))))
-        savings[name] = tuple(a - b for a, b in zip(whole, alone, strict=True))
+        alone = costs_of(trials.variant(Int8Choice((name,))))
+        savings[name] = tuple(a - b for a, b in zip(float_costs, alone, strict=True))
     # 2. every assignment, predicted from that; the least loss first, then the cheapest
     ranked = [
         Candidate(
@@ -451,7 +437,7 @@ def search(
             math.sqrt(sum(losses[name] ** 2 for name in subset)),
             tuple(
                 cost - sum(savings[name][at] for name in subset)
-                for at, cost in enumerate(whole)
+                for at, cost in enumerate(float_costs)
             ),
         )
         for size in range(len(active) + 1)
@@ -459,42 +445,42 @@ def search(
     ]
     ranked.sort(key=lambda each: (each.loss, each.costs, each.modules))
     # 3. the best that should fit, and the cheapest, measured until one does
-    fitting = [each for each in ranked if _share(budgets, each.costs) <= 1]
-    cheapest = min(ranked, key=lambda each: _share(budgets, each.costs))
+    fitting = [each for each in ranked if _largest_share(budgets, each.costs) <= 1]
+    cheapest = min(ranked, key=lambda each: _largest_share(budgets, each.costs))
     tried: list[Candidate] = []
     for candidate in dict.fromkeys((*fitting[: most_tried - 1], cheapest)):
         if not fitting:
             break
         choice = Int8Choice(candidate.modules)
-        costs = weighed(trials.variant(choice))
+        costs = costs_of(trials.variant(choice))
         score = trials.score(choice)
         tried.append(dataclasses.replace(candidate, score=score, measured_costs=costs))
-        if _share(budgets, costs) <= 1:
+        if _largest_share(budgets, costs) <= 1:
             return tuple(tried)
     least = [each.costs for each in ranked]
     least += [each.measured_costs for each in tried if each.measured_costs]
-    raise EvaluationError(nothing_fits(budgets, whole, least))
+    raise EvaluationError(budget_message(budgets, float_costs, least))
 
 
-def nothing_fits(
+def budget_message(
     budgets: Sequence[Budget], whole: Sequence[float], costs: Sequence[Sequence[float]]
 ) -> str:
     """Return the message that nothing is within the budgets, with the least costs."""
 
-    def words(numbers: Iterable[float]) -> str:
+    def amounts(numbers: Iterable[float]) -> str:
         pairs = zip(numbers, budgets, strict=True)
         return " and ".join(
             f"{format_significant(number, 6)} {budget.unit}" for number, budget in pairs
         )
 
-    apart = "; each alone" if len(budgets) > 1 else ""
+    ending = "; each alone" if len(budgets) > 1 else ""
     return (
-        f"nothing fits {words(each.limit for each in budgets)}: the float model costs"
-        f" {words(whole)}, the least found is about"
-        f" {words(map(min, zip(*costs, strict=True)))}{apart}"
+        f"nothing fits {amounts(each.limit for each in budgets)}: the float model costs"
+        f" {amounts(whole)}, the least found is about"
+        f" {amounts(map(min, zip(*costs, strict=True)))}{ending}"
     )
 
 
-def _share(budgets: Sequence[Budget], costs: Sequence[float]) -> float:
-    """Return the share spent of the tightest budget; 1 is all of it."""
+def _largest_share(budgets: Sequence[Budget], costs: Sequence[float]) -> float:
+    """Return the largest share of a budget that is spent; above 1 it does not fit."""
     return max(cost / budget.limit for cost, budget in zip(costs, budgets, strict=True))

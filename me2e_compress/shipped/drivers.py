@@ -13,8 +13,8 @@ from me2e_compress.registry.documents import reading
 from me2e_compress.runtime.atomic import write_bytes
 
 
-def write(path: Path, content: bytes) -> Path:
-    """Write a file atomically, with its folder if needed; errors are GraphErrors."""
+def write_model_file(path: Path, content: bytes) -> Path:
+    """Write a file atomically, and its folders if needed; a GraphError if it cannot."""
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -28,13 +28,12 @@ def write(path: Path, content: bytes) -> Path:
 
 WEIGHTS = Path(__file__).with_name("weights")
 """One ``NAME.onnx``, ``NAME.json`` and ``NAME-frames`` per model."""
-
 SHIPPED = ("highway",)
 """Names of the models, and of their module maps."""
 
 
-def own_map(path: Path) -> str | None:
-    """Return the module map of a model that ships; None of any other file."""
+def map_name(path: Path) -> str | None:
+    """Return the name of a shipped file's module map; None of any other file."""
     return path.stem if path.parent == WEIGHTS and path.stem in SHIPPED else None
 
 
@@ -98,31 +97,31 @@ def card(name: str) -> ModelCard:
     return ModelCard.load(WEIGHTS / f"{name}.json")
 
 
-def shipped(name: str) -> Path:
+def shipped_model(name: str) -> Path:
     """Return the file of a shipped model after checking its digest, once per process.
 
     Raises:
         GraphError: unknown model, or its file or card is missing or altered.
     """
-    return _checked(WEIGHTS / f"{name}.onnx", card(name).sha256)
+    return _check_digest(WEIGHTS / f"{name}.onnx", card(name).sha256)
 
 
-def sample_frames(model: Path) -> Path | None:
-    """Return the recorded frames of a shipped model, if a file is a copy of one.
+def frames_of(model: Path) -> Path | None:
+    """Return the folder of two recorded frames for a copy of a shipped model, or None.
 
-    Two frames of a drive suffice to verify exact passes, but not to calibrate.
+    They suffice to verify exact passes, but not to calibrate.
     """
-    name = _copied(model)
+    name = _shipped_name(model)
     frames = WEIGHTS / f"{name}-frames"
     return frames if name is not None and frames.is_dir() else None
 
 
 def is_copy(path: Path) -> bool:
-    """Return whether a file is a copy of a model that ships."""
-    return path.is_file() and _copied(path) is not None
+    """Return whether a path is a file with the content of a shipped model."""
+    return path.is_file() and _shipped_name(path) is not None
 
 
-def _copied(model: Path) -> str | None:
+def _shipped_name(model: Path) -> str | None:
     """Return the name of the shipped model that a file is a copy of."""
     for name in SHIPPED:
         known = card(name)
@@ -134,7 +133,8 @@ def _copied(model: Path) -> str | None:
 
 
 @functools.cache
-def _checked(path: Path, expected: str) -> Path:
+def _check_digest(path: Path, expected: str) -> Path:
+    """Return a path whose file has a SHA-256 in hex; else raise a GraphError."""
     try:
         digest = hashlib.sha256(path.read_bytes()).hexdigest()
     except OSError as error:
@@ -155,7 +155,7 @@ def copy(name: str, target: Path) -> Path:
         GraphError: as `shipped`, or ``target`` is the shipped file or cannot be
             written.
     """
-    source = shipped(name)
+    source = shipped_model(name)
     if target.exists() and target.samefile(source):
         raise GraphError(f"{target} is the shipped model: choose another output")
-    return write(target, source.read_bytes())
+    return write_model_file(target, source.read_bytes())

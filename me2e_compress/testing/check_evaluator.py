@@ -22,7 +22,7 @@ LATENCY_US = 250_000
 
 
 @dataclass(frozen=True)
-class _Silent:
+class _SilentListener:
     on_progress: Callable[[str, int, int, str], None] = lambda *_: None
     on_warning: Callable[[str], None] = lambda _: None
 
@@ -60,7 +60,7 @@ def check_evaluator(
     # episodes, each of its own route, that can be stored
     first = _episodes(evaluator, policy, drive)
     for each in first:
-        _check_kept(name, each)
+        _check_storable(name, each)
     # the same again
     second = _episodes(evaluator, policy, drive)
     if [each.route for each in second] != [each.route for each in first]:
@@ -83,11 +83,11 @@ def check_evaluator(
 def _episodes(
     evaluator: Evaluator, policy: Driver | None, drive: Drive
 ) -> tuple[Episode, ...]:
-    """Drive in a folder of its own; routes that were asked for in their order."""
+    """Return an episode for each route asked for, in that order; else refuse."""
     name = evaluator.name
     with tempfile.TemporaryDirectory() as folder:
         results = Path(folder) / "results"
-        episodes = tuple(evaluator.episodes(policy, drive, results, _Silent()))
+        episodes = tuple(evaluator.episodes(policy, drive, results, _SilentListener()))
     if not episodes:
         raise VerificationError(f"{name} yields no episode")
     strange = [each for each in episodes if not isinstance(each, Episode)]
@@ -104,7 +104,8 @@ def _episodes(
     return tuple(sorted(episodes, key=lambda each: wanted.index(each.route)))
 
 
-def _check_kept(name: str, episode: Episode) -> None:
+def _check_storable(name: str, episode: Episode) -> None:
+    """Check a route's id, the round trip through JSON, and the order of frames."""
     route = episode.route
     words = "a name is made of letters, digits, '_' and '-'"
     require(is_route_id(route), f"{name} yields route {route!r}: {words}")

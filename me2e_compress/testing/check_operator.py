@@ -26,9 +26,6 @@ from me2e_compress.operators.dialect import INTEGERS, NdArray, present
 from me2e_compress.runtime.session import run_once
 from me2e_compress.testing.form import check_form, require
 
-# Random calls of a fused operator, each a node in a graph of its own.
-
-
 _LARGEST_SIZE, _LARGEST_RANK = 5, 4
 
 
@@ -47,7 +44,7 @@ class DrawnCall:
 Draw: TypeAlias = Callable[[Dialect, np.random.Generator], DrawnCall]
 
 
-def drawn(dialect: Dialect, random: np.random.Generator) -> DrawnCall:
+def draw_call(dialect: Dialect, random: np.random.Generator) -> DrawnCall:
     """Draw a call from what a dialect declares of its operands and attributes.
 
     A letter among the dimensions is one size in all operands; floats are normal,
@@ -64,7 +61,7 @@ def drawn(dialect: Dialect, random: np.random.Generator) -> DrawnCall:
     return DrawnCall(inputs, attributes)
 
 
-def graph_of(call: DrawnCall, dialect: Dialect, opset: int) -> ir.Model:
+def one_node_model(call: DrawnCall, dialect: Dialect, opset: int) -> ir.Model:
     """Build the graph of one node whose inputs are those of the graph."""
     values = [
         ir.val(name, ir.DataType.from_numpy(array.dtype), array.shape)
@@ -90,6 +87,7 @@ def graph_of(call: DrawnCall, dialect: Dialect, opset: int) -> ir.Model:
 def _array(
     operand: Operand, sizes: dict[str, int], random: np.random.Generator
 ) -> NdArray:
+    """Draw an operand; letters that get a size are added to ``sizes``."""
     dims = operand.dims
     # a digit is a size, a letter one size in all operands, * any size
     letters = ["*"] * random.integers(1, _LARGEST_RANK + 1)
@@ -115,34 +113,34 @@ def dialect_reference(operator: Operator, dialect: Dialect, call: DrawnCall) -> 
         for name, array in call.inputs.items()
     }
     # a node of the dialect gives its attributes and its place to one that can run
-    graph = graph_of(DrawnCall(inputs, call.attributes), dialect, OPSETS[0]).graph
+    graph = one_node_model(DrawnCall(inputs, call.attributes), dialect, OPSETS[0]).graph
     node, place = graph[0], ir.node("Identity", graph.inputs[:1])
     attributes, given = dialect.attributes_of(node), tuple(node.inputs)
     graph.outputs.clear()
     graph.insert_before(node, place)
     graph.remove(node)
-    writer = FusedCall(place, opset=OPSETS[0], by=_BY)
+    writer = FusedCall(place, opset=OPSETS[0], by=_PASS)
     # to the own form, its reference, and back
     own = dialect.inputs_to_own(writer, given, attributes)
-    arrays = _computed(graph, present(own), inputs)
+    arrays = _evaluate(graph, present(own), inputs)
     result = operator.reference(arrays, dialect.options_to_own(attributes))
     answer = ir.val("answer", ir.DataType.DOUBLE, result.shape)
     graph.inputs.append(answer)
     converted = dialect.result_from_own(writer, answer, own)
-    (array,) = _computed(graph, [converted], {**inputs, "answer": result})
+    (array,) = _evaluate(graph, [converted], {**inputs, "answer": result})
     assert array is not None
     return array
 
 
-def _computed(
+def _evaluate(
     graph: ir.Graph, values: Sequence[ir.Value], inputs: Mapping[str, NdArray]
 ) -> list[NdArray | None]:
-    """Run a graph for values of it, some of which may be its inputs or constants."""
-    made = [each for each in values if each.producer()]
-    graph.outputs[:] = made
+    """Compute values of a graph, of which some may be its inputs or constants."""
+    computed = [each for each in values if each.producer()]
+    graph.outputs[:] = computed
     model = ir.Model(graph, ir_version=9)
     import_domains(model)
-    known = {**inputs, **run_once(model, inputs)} if made else inputs
+    known = {**inputs, **run_once(model, inputs)} if computed else inputs
     return [
         known[str(value.name)] if value.name in known else array_of(value)
         for value in values
@@ -153,7 +151,7 @@ OPSETS = (13, 17, 20)
 TOLERANCE = 1e-4
 """Allowed max|a-b| / max(1, max|b|) of float32 against float64."""
 
-_BY = "check-operator"
+_PASS = "check-operator"
 
 
 def check_operator(
@@ -193,7 +191,7 @@ def check_operator(
                 " attribute or number",
             )
     # every dialect at every opset, on random calls
-    make = drawn if draw is None else draw
+    make = draw_call if draw is None else draw
     for dialect in operator.all_dialects():
         random = np.random.default_rng(seed)
         for opset in (each for each in OPSETS if each >= operator.opset):
@@ -214,13 +212,13 @@ class _Case:
     def check_call(self, call: DrawnCall) -> None:
         """Compare the body and the declared shape of a call with its reference."""
         # what the dialect declares
-        model = graph_of(call, self.dialect, self.opset)
+        model = one_node_model(call, self.dialect, self.opset)
         node = model.graph[0]
         self.dialect.check(node)
         want = dialect_reference(self.operator, self.dialect, call)
         set_output(node, self.operator, self.dialect)
         shape, kind = node.outputs[0].shape, node.outputs[0].dtype
-        fits = shape is None or _fits(tuple(shape), want.shape)
+        fits = shape is None or _has_shape(tuple(shape), want.shape)
         declared = None if shape is None else list(shape)
         self._require(
             fits, f"the output is said to be {declared}, it is {list(want.shape)}"
@@ -228,7 +226,7 @@ class _Case:
         # what the body computes
         node.outputs[0].shape = node.outputs[0].type = None  # the body says it itself
         known = (self.operator, self.dialect)
-        expand(node, opset=self.opset, by=_BY, known=known)
+        expand(node, opset=self.opset, by=_PASS, known=known)
         import_domains(model)
         result = run_once(model, call.inputs)["result"]
         same = kind in (None, ir.DataType.from_numpy(result.dtype))
@@ -241,16 +239,16 @@ class _Case:
         if self.dialect == own:
             return
         # a call in the own form, translated and expanded
-        model = graph_of(call, own, self.opset)
+        model = one_node_model(call, own, self.opset)
         before, after = (self.operator, own), (self.operator, self.dialect)
         try:
             translate(
-                model.graph[0], self.dialect, opset=self.opset, by=_BY, known=before
+                model.graph[0], self.dialect, opset=self.opset, by=_PASS, known=before
             )
             (node,) = (
                 each for each in model.graph if each.op_type == self.dialect.op_type
             )
-            expand(node, opset=self.opset, by=_BY, known=after)
+            expand(node, opset=self.opset, by=_PASS, known=after)
         except PreconditionError:
             return  # a dialect need not be able to say everything
         import_domains(model)
@@ -261,19 +259,19 @@ class _Case:
 
     def _compare(self, what: str, result: NdArray, want: NdArray) -> None:
         shapes = list(result.shape), list(want.shape)
-        same = f"{what} gives {shapes[0]}, the reference {shapes[1]}"
-        self._require(shapes[0] == shapes[1], same)
+        mismatch = f"{what} gives {shapes[0]}, the reference {shapes[1]}"
+        self._require(shapes[0] == shapes[1], mismatch)
         scale = max(1.0, float(np.abs(want).max(initial=0.0)))
         error = float(np.abs(result - want).max(initial=0.0)) / scale
-        off = f"{what} is off the reference by {error:.2g}, of {TOLERANCE:g} allowed"
-        self._require(error <= TOLERANCE, off)  # NaN is not
+        text = f"{what} is off the reference by {error:.2g}, of {TOLERANCE:g} allowed"
+        self._require(error <= TOLERANCE, text)  # NaN is not
 
     def _require(self, holds: bool, why: str) -> None:
         where = f"{self.operator.name} in the dialect {self.dialect.name}, opset"
         require(holds, f"{where} {self.opset}: {why}")
 
 
-def _fits(declared: tuple[object, ...], shape: tuple[int, ...]) -> bool:
+def _has_shape(declared: tuple[object, ...], shape: tuple[int, ...]) -> bool:
     return len(declared) == len(shape) and all(
         dim == size or not isinstance(dim, int)
         for dim, size in zip(declared, shape, strict=True)

@@ -39,11 +39,11 @@ def check_pass(
     # its class
     check_class(current)
     cls, text = type(current), type(current).__doc__ or ""
-    shown = "Given:" in text and "Result:" in text
-    require(shown, f"{cls.__name__}'s docstring lacks Given: and Result:")
+    has_examples = "Given:" in text and "Result:" in text
+    require(has_examples, f"{cls.__name__}'s docstring lacks Given: and Result:")
     for field in dataclasses.fields(cls):
-        lacks = f"{cls.__name__}'s docstring lacks {field.name}"
-        require(field.name in text, lacks)
+        message = f"{cls.__name__}'s docstring lacks {field.name}"
+        require(field.name in text, message)
     # a graph as a pass sees it: imported, shapes inferred
     context = context if context is not None else Context(map_of(model, None))
     ready = model.clone()

@@ -43,32 +43,32 @@ def check_policy(driver: Driver) -> Answers:
     require_extra("highway", "check_policy")
     check_form(driver, POLICIES)
     name, prints = driver.name, {driver.fingerprint(), driver.fingerprint()}
-    one = len(prints) == 1 and all(prints)
-    require(one, f"{name} has no fingerprint, or more than one")
+    is_stable = len(prints) == 1 and all(prints)
+    require(is_stable, f"{name} has no fingerprint, or more than one")
     # the same answers after a reset, and from a new policy
     policy = driver.open()
     answers, again = _answers(driver, policy), _answers(driver, policy)
-    require(_same(answers, again), f"{name} plans otherwise after a reset")
+    require(_equal(answers, again), f"{name} plans otherwise after a reset")
     new = _answers(driver, driver.open())
-    require(_same(answers, new), f"{name} plans otherwise when it is opened anew")
+    require(_equal(answers, new), f"{name} plans otherwise when it is opened anew")
     return answers
 
 
-def _same(answers: Answers, others: Answers) -> bool:
+def _equal(answers: Answers, others: Answers) -> bool:
     return all(
-        np.array_equal(_numbers(one), _numbers(other))
+        np.array_equal(_answer_array(one), _answer_array(other))
         for one, other in zip(answers, others, strict=True)
     )
 
 
-def _numbers(answer: Trajectory | PedalsAndWheel) -> npt.NDArray[np.floating]:
+def _answer_array(answer: Trajectory | PedalsAndWheel) -> npt.NDArray[np.floating]:
     if isinstance(answer, PedalsAndWheel):
         return np.array(answer)
     return np.column_stack([answer.points, answer.times_s])
 
 
 def _answers(driver: Driver, policy: Policy) -> Answers:
-    """Drive the beginning of the route."""
+    """Return a policy's answers to the first decisions of the route."""
     # the evaluator needs an extra that the other checks do not need
     from me2e_compress.evaluators import Drive
     from me2e_compress.evaluators.highway.drivers import image_size_of
@@ -84,32 +84,32 @@ def _answers(driver: Driver, policy: Policy) -> Answers:
 
     # drive until the policy has answered often enough, then check the episode
     (route,) = pick_routes(load_routes(), ROUTE)
-    watched = _Watched(
+    watched = _RecordingPolicy(
         policy, policy.needs_images, policy.privileged, image_size_of(policy)
     )
     listeners = Listeners(lambda world: asked.append((world, world.time_us)), answered)
     episode = drive(route, watched, Drive(), listeners)
-    require(watched.enough, f"{driver.name}: {episode.failure}")
+    require(watched.finished, f"{driver.name}: {episode.failure}")
     return tuple(checked(answer) for answer in watched.answers)
 
 
 @dataclass
-class _Watched:
-    """A policy whose first answers are kept, and that then gives up."""
+class _RecordingPolicy:
+    """A policy whose first answers are recorded, and that then stops the drive."""
 
     policy: Policy
     needs_images: bool
     privileged: bool
     image_size: tuple[int, int]
     answers: list[Answer] = field(default_factory=list)
-    enough: bool = False
+    finished: bool = False
 
     def reset(self, route: RouteInfo) -> None:
         self.policy.reset(route)
 
     def plan(self, observation: Observation) -> Answer:
         if len(self.answers) == DECISIONS:
-            self.enough = True
+            self.finished = True
             raise StopIteration
         self.answers.append(self.policy.plan(observation))
         return self.answers[-1]

@@ -38,11 +38,12 @@ def check_form(item: T, registry: Registry[T]) -> None:
     """
     check_class(item)
     cls = type(item)
-    own = cls.__doc__ is not None and not cls.__doc__.startswith(f"{cls.__name__}(")
+    made = f"{cls.__name__}("  # how the docstring begins that dataclass makes
+    own = cls.__doc__ is not None and not cls.__doc__.startswith(made)
     require(own, f"{cls.__name__} has no docstring")
     for option in options_of(cls):
-        lacks = f"docstring lacks {option.name} under Attributes:"
-        require(option.doc, f"{cls.__name__}'s {lacks}")
+        fault = f"docstring lacks {option.name} under Attributes:"
+        require(option.doc, f"{cls.__name__}'s {fault}")
     # its text builds an equal item
     text = registry.text(item, defaults=True)
     require(registry.parse(text, cls) == item, f"{text} is read back as something else")

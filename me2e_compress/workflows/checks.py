@@ -48,7 +48,7 @@ from me2e_compress.runtime.children import run_script
 from me2e_compress.runtime.frames import Frames
 from me2e_compress.runtime.providers import CPU, Provider
 from me2e_compress.runtime.runnable import compiled_or_expanded, is_fused, unsupported
-from me2e_compress.shipped.drivers import SHIPPED, is_copy, own_map, shipped
+from me2e_compress.shipped.drivers import SHIPPED, is_copy, map_name, shipped_model
 from me2e_compress.workflows import opening_main
 from me2e_compress.workflows.options import GraphOptions
 from me2e_compress.workflows.result import Listener
@@ -63,7 +63,7 @@ def model_path(text: str | Path, beside: Path = Path()) -> Path:
     if path.is_file():
         return path
     if str(text) in SHIPPED:
-        return shipped(str(text))
+        return shipped_model(str(text))
     line = f"{text}: no such file; models that ship: {', '.join(SHIPPED)}"
     name = str(text).partition(":")[0]
     gone = FORMER_NAMES.get(f"model {name}", FORMER_NAMES.get(f"stack {name}", line))
@@ -95,7 +95,7 @@ def read_graph(
     What an adapter and a map state becomes metadata of the graph; see :func:`adapted`.
     """
     model = load_graph(path)
-    adapted(model, adapter, module_map or own_map(path))
+    adapted(model, adapter, module_map or map_name(path))
     if change := read_as(model):
         listener.on_warning(f"{path}: {change}")
     if hint := shortcomings(model):
@@ -428,7 +428,7 @@ def opened(
 ) -> OpenedGraph:
     """Read a graph, and open it apart; `others` lend what its own metadata lack."""
     model = load_graph(path)
-    module_map = options.module_map or own_map(path)
+    module_map = options.module_map or map_name(path)
     own = {each: graph.load(each).metadata_props for each in others if each != path}
     known = state_and_plan(model, path, options.adapter, module_map, own)
     recording.check(model)

@@ -102,7 +102,7 @@ class CompareResult(Comparison, Result):
                 *(() if self.runtime is None else self.runtime.lines()),
                 *(f"{name}: {why}" for name, why in self.slow_here.items()),
             ),
-            (*fidelity.strays, *self.not_finite, *faults),
+            (*fidelity.stray_texts, *self.not_finite, *faults),
             EvaluationError(f"{self.candidate}: {dead}") if dead else None,
         )
 

@@ -10,7 +10,7 @@ from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.calibration.engine_dump import EngineDump
 from me2e_compress.display import format_number, plural, table
 from me2e_compress.errors import EvaluationError
-from me2e_compress.fidelity.engine_loss import EngineRun, OutputLoss, losses
+from me2e_compress.fidelity.engine_loss import EngineRun, OutputLoss, split_losses
 from me2e_compress.fidelity.first_difference import (
     FirstDifference,
     first_difference_of_engine,
@@ -132,7 +132,7 @@ def compare_dump(
         why = "--float names no source"
     total = len(recording)
     try:
-        outputs = losses(
+        outputs = split_losses(
             run,
             original,
             options.alive,

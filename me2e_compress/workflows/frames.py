@@ -25,7 +25,7 @@ from me2e_compress.errors import FramesError
 from me2e_compress.extras import require_extra
 from me2e_compress.graph import load, sha256_of
 from me2e_compress.runtime.frames import Frame
-from me2e_compress.shipped.drivers import shipped
+from me2e_compress.shipped.drivers import shipped_model
 from me2e_compress.version import __version__
 from me2e_compress.workflows.checks import check_folder, model_path, try_first, writing
 from me2e_compress.workflows.options import FramesOptions
@@ -146,7 +146,7 @@ def _driven(
 
     loaded = None if adapter is None else Adapter.load(adapter)
     policy = OnnxPolicy.open(model, loaded, options.runs_on, metadata=metadata)
-    driver = OnnxPolicy.open(shipped("highway"))
+    driver = OnnxPolicy.open(shipped_model("highway"))
     length = options.scene_length
     return lambda begin: driven_frames(
         policy,

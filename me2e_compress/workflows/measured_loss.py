@@ -12,7 +12,7 @@ from me2e_compress.calibration.sample import hold_out, spread
 from me2e_compress.display import Table, plural
 from me2e_compress.errors import EvaluationError, FramesError, GraphError
 from me2e_compress.fidelity.compare import Fidelity, SetFidelity, SetTally, compare
-from me2e_compress.fidelity.floor import Floor, Shortfall, shown
+from me2e_compress.fidelity.floor import Floor, Shortfall, format_figure
 from me2e_compress.fidelity.liveness import Liveness
 from me2e_compress.graph.recurrence import recurrent_inputs
 from me2e_compress.manager import Report
@@ -24,7 +24,7 @@ from me2e_compress.runtime.frames import Frames
 from me2e_compress.runtime.latency_trace import cpu_seconds
 from me2e_compress.runtime.providers import Provider
 from me2e_compress.runtime.session import Session
-from me2e_compress.shipped.drivers import sample_frames
+from me2e_compress.shipped.drivers import frames_of
 from me2e_compress.targets import TARGETS
 from me2e_compress.workflows.compare import compared, outputs_table
 from me2e_compress.workflows.result import Listener
@@ -94,7 +94,7 @@ class MeasuredLoss:
             ]
             if judged:
                 worst = min(judged, key=lambda each: each.sqnr_db)
-                noise, reach = shown(worst.sqnr_db, "dB"), worst.by_frame
+                noise, reach = format_figure(worst.sqnr_db, "dB"), worst.by_frame
                 every = fidelity.seen and f" of {fidelity.frames + fidelity.seen}"
                 reach = f" ({reach} by frame{every or ''})" if reach else ""
                 parts.append(f"the noisiest output is {worst.name}, {noise}{reach}")
@@ -119,7 +119,7 @@ class MeasuredLoss:
                 f" record {3 * FEW} or more, a third of which is measured on"
             )
         if self.fidelity is not None:
-            yield from self.fidelity.strays
+            yield from self.fidelity.stray_texts
         if self.shortfalls:
             low, guilty = ", ".join(map(str, self.shortfalls)), ", ".join(self.guilty)
             nodes = f" ({', '.join(self.int8_nodes)})" if self.int8_nodes else ""
@@ -191,7 +191,7 @@ def split_frames(
     if folder is not None:
         recording = CalibrationSet(folder)
         recording.check(model)
-    elif (shipped := sample_frames(source)) is not None:
+    elif (shipped := frames_of(source)) is not None:
         samples = CalibrationSet(shipped)
     if not most or all(each.exact for each in passes):
         return SplitFrames(recording, None, NOT_ASKED, samples)
@@ -257,7 +257,7 @@ def _compared(
     sets = SetTally.of(reference, session)
     comparison = compared(reference, session, frames, after, kernels, sets)
     if seen is not None:
-        beside = comparison.fidelity.beside(compare(reference, session, seen))
+        beside = comparison.fidelity.widen(compare(reference, session, seen))
         comparison = dataclasses.replace(comparison, fidelity=beside)
     loss = dataclasses.replace(loss, **vars(comparison))
     below = loss.floor.shortfalls(comparison.fidelity, comparison.agents)

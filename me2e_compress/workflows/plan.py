@@ -27,7 +27,7 @@ from me2e_compress.quantization.decision import (
     save_plan,
 )
 from me2e_compress.quantization.rules import DEFAULT_RULES, RULE_SETS
-from me2e_compress.shipped.drivers import own_map
+from me2e_compress.shipped.drivers import map_name
 from me2e_compress.targets import DEFAULT_TARGET, TARGETS
 from me2e_compress.workflows.checks import (
     load_graph,
@@ -223,7 +223,7 @@ def _planned(file: Path, model: ir.Model, options: PlanOptions) -> PlanResult:
         target=options.target or DEFAULT_TARGET,
         overrides=None if options.overrides is None else Path(options.overrides),
     )
-    adapted(model, None, options.module_map or own_map(file))
+    adapted(model, None, options.module_map or map_name(file))
     ready = PreparedGraph.of(file, model, options.module_map)
     made = quantizer.plan(ready.model, Context(ready.modules))
     TARGETS.parse(quantizer.target).check_types(made, ready.model)

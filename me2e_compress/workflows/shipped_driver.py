@@ -7,7 +7,7 @@ from me2e_compress.driving.contract import Policy
 from me2e_compress.driving.host_stage import HostStage
 from me2e_compress.driving.policies import Driver
 from me2e_compress.evaluators.highway.drivers import OnnxDriver
-from me2e_compress.shipped.drivers import shipped
+from me2e_compress.shipped.drivers import shipped_model
 
 
 @dataclass(frozen=True)
@@ -24,7 +24,7 @@ class ShippedDriver(Driver):
 
     def resolved(self) -> Driver:
         """Return the driver of the shipped ONNX file."""
-        return OnnxDriver(shipped(self.name), host_stage=self.host_stage)
+        return OnnxDriver(shipped_model(self.name), host_stage=self.host_stage)
 
     def open(self) -> Policy:
         """Return the policy."""

@@ -21,7 +21,7 @@ from me2e_compress.driving.onnx_policy import FirstValues, OnnxPolicy, recurrent
 from me2e_compress.driving.shipped_adapters import adapter_file
 from me2e_compress.runtime.frames import Array
 from me2e_compress.runtime.session import DTYPES, Session, replay
-from me2e_compress.shipped.drivers import sample_frames, shipped
+from me2e_compress.shipped.drivers import frames_of, shipped_model
 from me2e_compress.workflows.inspect import inspect
 from tests.docs.pages import ROOT, Block, blocks
 from tests.driving.observed import motion, observation
@@ -77,7 +77,7 @@ def test_the_driver_has_the_modules_parameters_and_macs_of_its_page() -> None:
 
     assert [(n, int(p.replace(",", "")), float(macs)) for n, p, macs in rows] == [
         (item.module, item.parameters, round((item.macs or 0) / 1e6, 1))
-        for item in inspect(shipped("highway"), None).modules
+        for item in inspect(shipped_model("highway"), None).modules
     ]
 
 
@@ -106,7 +106,7 @@ def runner(path: str) -> Iterator[Runner]:
 def dumped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Run the script of docs/engine-dumps.md over three frames of two scenes."""
     drawn = np.random.default_rng(0)
-    shapes = Session(shipped("highway")).inputs
+    shapes = Session(shipped_model("highway")).inputs
     record(tmp_path / "frames", [
         {
             name: np.array([1]) if name == "command"
@@ -126,7 +126,7 @@ def dumped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         module.__dict__.update(contents)
         monkeypatch.setitem(sys.modules, name, module)
     (script,) = blocks(DOCS / "engine-dumps.md", "python")
-    paths = [str(each) for each in (shipped("highway"), tmp_path / "frames")]
+    paths = [str(each) for each in (shipped_model("highway"), tmp_path / "frames")]
     monkeypatch.setattr(sys, "argv", ["dump.py", *paths, str(tmp_path / "dump")])
     exec(script.text, {})
     return tmp_path / "dump"
@@ -136,7 +136,7 @@ def test_a_dump_is_what_a_replay_answers_and_compare_reads_it(
     dumped: Path, cli: Cli
 ) -> None:
     frames = me2e.CalibrationSet(dumped.with_name("frames"))
-    answers = replay(Session(shipped("highway")), frames)
+    answers = replay(Session(shipped_model("highway")), frames)
     for path, wanted in zip(sorted(dumped.iterdir()), answers, strict=True):
         assert path.name in {each.name for each in frames.files}
         found = dict(np.load(path))
@@ -200,8 +200,8 @@ def test_a_stack_that_is_cut_and_joined_decides_as_the_whole(
 
     made = me2e.join("stack.toml", "whole.onnx")
 
-    whole = shipped("highway")
-    frames = me2e.CalibrationSet(sample_frames(whole) or tmp_path)
+    whole = shipped_model("highway")
+    frames = me2e.CalibrationSet(frames_of(whole) or tmp_path)
     for joined, one in zip(
         *(replay(Session(path), frames, ["plan"]) for path in (made.output, whole)),
         strict=True,

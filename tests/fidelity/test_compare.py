@@ -88,7 +88,7 @@ def test_signal_to_noise_pools_all_frames_each_model_with_its_own_state() -> Non
     assert found.outputs[0].by_frame == "1.1 to 9.0"
     # frames that ranges were measured on widen that alone
     seen = compare(scaled(1.0), scaled(0.75), [ones(0, True), ones(1, True)])
-    wide, alone = found.beside(seen), compare(scaled(1.0), scaled(0.5), [ones(0, True)])
+    wide, alone = found.widen(seen), compare(scaled(1.0), scaled(0.5), [ones(0, True)])
     assert wide.outputs[0].by_frame == "1.1 to 12.0"
     assert (wide.frames, wide.seen) == (3, 2)
     assert alone.outputs[0].by_frame == ""

@@ -13,7 +13,7 @@ from me2e_compress.errors import (
 )
 from me2e_compress.manager import recipe
 from me2e_compress.runtime.providers import CPU, CpuProvider
-from me2e_compress.shipped.drivers import shipped
+from me2e_compress.shipped.drivers import shipped_model
 from me2e_compress.simulator.routes import load_routes, save_routes
 from me2e_compress.study import Condition, load_study
 from me2e_compress.study.definition import FramesToRecord, StudyBlock
@@ -125,7 +125,7 @@ def test_a_name_that_is_no_file_is_one_that_ships_whatever_is_where_you_are(
 
     study = load_study(write(models, text))
 
-    assert study.variants[0].policy == str(shipped("highway"))
+    assert study.variants[0].policy == str(shipped_model("highway"))
 
 
 def test_a_file_where_you_are_is_not_beside_the_study(
@@ -253,7 +253,7 @@ def test_variants_that_name_no_policy_take_the_study_s_and_drive_every_route(
 
     study = load_study(write(models, 'policy = "highway"\n' + text))
 
-    ours = str(shipped("highway"))
+    ours = str(shipped_model("highway"))
     named = str(models / "slow.onnx")
     assert [each.policy for each in study.variants] == [ours, ours, named]
     assert study.routes == load_routes()

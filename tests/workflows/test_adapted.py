@@ -13,7 +13,7 @@ from me2e_compress.errors import EvaluationError, FramesError
 from me2e_compress.fidelity.compare import SetOutputs
 from me2e_compress.graph.recurrence import recurrent_inputs
 from me2e_compress.runtime.plan_adapter import PlanAdapter
-from me2e_compress.shipped.drivers import own_map, shipped
+from me2e_compress.shipped.drivers import map_name, shipped_model
 from me2e_compress.workflows.calibrate import calibrate
 from me2e_compress.workflows.compare import compare
 from me2e_compress.workflows.compress import compress
@@ -116,8 +116,8 @@ def test_a_map_says_which_outputs_are_sets(mine: Path, tmp_path: Path) -> None:
     sets.write_text(PARTS + named.format('["nowhere"]'))
     with pytest.raises(EvaluationError, match="map sets: sets: no output nowhere"):
         adapted(graph.load(mine), None, sets)
-    assert own_map(shipped("highway")) == "highway"
-    assert own_map(mine) is None
+    assert map_name(shipped_model("highway")) == "highway"
+    assert map_name(mine) is None
 
 
 def test_all_that_run_a_graph_feed_the_state_back(

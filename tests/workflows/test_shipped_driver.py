@@ -4,7 +4,7 @@ from pathlib import Path
 
 from me2e_compress.driving.policies import driver_named
 from me2e_compress.evaluators.highway.drivers import image_size_of
-from me2e_compress.shipped.drivers import shipped
+from me2e_compress.shipped.drivers import shipped_model
 from me2e_compress.study import load_study
 from me2e_compress.workflows.evaluate import driver_of
 from me2e_compress.workflows.options import GraphOptions
@@ -27,7 +27,7 @@ def test_it_is_found_by_name() -> None:
     driver = driver_named("highway")
 
     assert driver.label == "highway"
-    by_file = driver_named(str(shipped("highway"))).fingerprint()
+    by_file = driver_named(str(shipped_model("highway"))).fingerprint()
     assert (
         driver.fingerprint()
         == driver_of("highway", GraphOptions()).fingerprint()
@@ -41,5 +41,5 @@ def test_a_study_may_compress_it(tmp_path: Path) -> None:
 
     (half,) = load_study(tmp_path / "study.toml").variants
 
-    assert Path(half.policy) == shipped("highway")
+    assert Path(half.policy) == shipped_model("highway")
     assert [each.name for each in half.passes] == ["convert-float16"]

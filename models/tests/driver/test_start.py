@@ -8,7 +8,7 @@ import pytest
 import torch
 from onnx import numpy_helper
 
-from me2e_compress.shipped.drivers import SHIPPED, card, shipped
+from me2e_compress.shipped.drivers import SHIPPED, card, shipped_model
 from models.driver.checkpoint import Start, TrainingCheckpoint
 from models.driver.data import Sequences
 from models.driver.errors import TrainingError
@@ -30,7 +30,7 @@ def test_the_network_with_its_weights_writes_the_bytes_that_ship(
 ) -> None:
     weights = {
         tensor.name: torch.from_numpy(numpy_helper.to_array(tensor).copy())
-        for tensor in onnx.load(shipped(NAME)).graph.initializer
+        for tensor in onnx.load(shipped_model(NAME)).graph.initializer
     }
     model = Highway()
     unknown = model.load_state_dict(weights, strict=False).unexpected_keys

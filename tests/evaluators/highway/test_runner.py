@@ -304,7 +304,7 @@ def test_moving_on_starts_the_minute_again() -> None:
 def test_the_shipped_driver_passes_a_parked_car() -> None:
     """A route that nobody passes blindly, and one of the shortest."""
     (route,) = pick_routes(load_routes(), "ParkedObstacle_R2_0")
-    policy = OnnxDriver(shipped("highway")).open()
+    policy = OnnxDriver(shipped_model("highway")).open()
 
     episode = drive(route, policy, Drive())
 

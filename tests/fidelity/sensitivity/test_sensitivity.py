@@ -17,8 +17,8 @@ from me2e_compress.fidelity.sensitivity import (
     Trials,
     advise,
     analyse,
-    names_of,
-    nothing_fits,
+    budget_message,
+    int8_names,
     search,
     write_recipe,
 )
@@ -81,7 +81,7 @@ def invented(judge: Trials, cost: dict[str, float], *, joint: bool = False) -> T
         costs = [
             cost[name]
             for module in choice.modules
-            for name in names_of(judge, module)
+            for name in int8_names(judge, module)
             if name not in choice.floats
         ]
         loss = max(costs, default=0.0) if joint else sum(costs)
@@ -269,7 +269,7 @@ def test_every_one_of_several_budgets_is_kept(tmp_path: Path) -> None:
 
 def test_what_fits_nothing_is_told_without_powers_of_ten() -> None:
     size = Budget(1e5, "bytes", weight_bytes)
-    said = nothing_fits([size], [6_142_060.0], [[4_778_000.0]])
+    said = budget_message([size], [6_142_060.0], [[4_778_000.0]])
 
     assert said == (
         "nothing fits 100,000 bytes: the float model costs 6,142,060 bytes, the least"

@@ -15,7 +15,7 @@ from me2e_compress.quantization.decision import stamp_plan
 from me2e_compress.quantization.plan import make_plan
 from me2e_compress.quantization.rules import RULE_SETS
 from me2e_compress.quantization.scheme import QuantScheme
-from me2e_compress.shipped.drivers import shipped
+from me2e_compress.shipped.drivers import shipped_model
 from me2e_compress.targets.tensorrt import TensorRT
 from me2e_compress.targets.tensorrt.rtx_check import (
     check,
@@ -179,7 +179,7 @@ SCHEMES = ("feature-ext", "prediction", "full")
 @pytest.fixture(scope="module")
 def driver() -> ir.Model:
     """After the exact passes, unverified: that is asked elsewhere."""
-    loaded = graph.load(shipped("highway"))
+    loaded = graph.load(shipped_model("highway"))
     context = Context(map_of(loaded, None))
     model = PassManager(recipe.load("exact"), verify_frames=0).run(loaded, context)
     graph.infer_shapes(model.model)
