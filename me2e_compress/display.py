@@ -26,10 +26,7 @@ def escape_controls(text: str) -> str:
 
 @dataclass(frozen=True)
 class Cell:
-    """A number or words as shown, and its interval, if any, in smaller type.
-
-    ``reason`` is why there is no number; empty where there is one.
-    """
+    """A number or words; ``detail`` is its interval, ``reason`` why it is missing."""
 
     text: str
     detail: str = ""

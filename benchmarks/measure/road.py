@@ -34,7 +34,7 @@ from me2e_compress.evaluators.highway.driven_frames import propose, seed_of
 from me2e_compress.evaluators.highway.runner import Listeners, drive
 from me2e_compress.metrics.measure import Estimate, mean_estimate
 from me2e_compress.metrics.route_summary import RouteSummary
-from me2e_compress.runtime.children import pool
+from me2e_compress.runtime.children import process_pool
 from me2e_compress.simulator.routes import (
     SCENARIO_ABILITIES,
     SHIPPED,
@@ -117,7 +117,7 @@ def show(
 ) -> None:
     """Print the tables of some routes, of which so many of each type are driven."""
     count = Counter[str]()
-    with pool(workers) as processes:
+    with process_pool(workers) as processes:
         waiting = []
         for route in routes:
             driven = speeds if count[route.scenario] < variants else ()

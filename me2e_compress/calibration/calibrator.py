@@ -41,7 +41,7 @@ from me2e_compress.runtime.probing import (
     shared_constant,
 )
 from me2e_compress.runtime.providers import CPU, Provider
-from me2e_compress.runtime.runnable import unsupported
+from me2e_compress.runtime.runnable import why_unsupported
 from me2e_compress.runtime.session import DTYPES, Session, feed_forward
 
 # The probes of a calibration: extremes, and histograms of magnitudes.
@@ -268,7 +268,7 @@ class Calibrator:
         if not tensors:
             nothing = np.empty((len(frames), 0, Extremes().width), np.float32)
             return dataclasses.replace(blank, measured=nothing, inputs=(), outputs=())
-        if reason := unsupported(model, self.provider):
+        if reason := why_unsupported(model, self.provider):
             raise GraphError(
                 f"{reason}; ranges that TensorRT measured are taken by `calibrate"
                 " --import CACHE`, and then by `compress --ranges`"

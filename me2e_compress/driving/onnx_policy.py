@@ -38,7 +38,7 @@ class FirstValues:
     """
 
     given: Mapping[str, str]
-    zeros: Mapping[str, Array]
+    zero_state: Mapping[str, Array]
 
     @classmethod
     def of(
@@ -67,7 +67,7 @@ class FirstValues:
         # all others start from zeros
         known = {*given, *session.recurrent}
         others = [name for name in recurrent if name not in known]
-        return cls(given, {name: zeros(name, ports[name]) for name in others})
+        return cls(given, {name: zero_state(name, ports[name]) for name in others})
 
     def at(self, feeds: Mapping[str, Array]) -> dict[str, Array]:
         """Return those that are not zeros, given the feeds of the first decision."""

@@ -15,16 +15,16 @@ import onnx_ir as ir
 from me2e_compress.errors import ProviderError
 from me2e_compress.runtime.frames import Frames
 from me2e_compress.runtime.latency_trace import Microseconds
-from me2e_compress.runtime.optimized import optimized, origins, with_unique_names
+from me2e_compress.runtime.optimized import optimize, origins, with_unique_names
 from me2e_compress.runtime.providers import CPU, Provider
 from me2e_compress.runtime.session import Session, replay
 
 MOST_EVENTS = 200_000
-"""Most nodes times inferences to record: onnxruntime holds half a kilobyte for each
+"""Most nodes times inferences to record: onnxruntime stores half a kilobyte for each
 until the end, and drops those beyond a million."""
-BETWEEN = "(between nodes)"
+OUTSIDE = "(between nodes)"
 """Time of an inference outside of its nodes, including the profiler's own work."""
-NOWHERE = "(no module)"
+NO_MODULE = "(no module)"
 _KERNEL = "_kernel_time"
 
 
@@ -45,13 +45,13 @@ class Breakdown:
 class NodeRun:
     """One node in one inference.
 
-    ``begin_us`` is on the profiler's clock; ``taken_us`` includes nodes of its bodies.
+    ``begin_us`` is on the profiler's clock; ``duration_us`` includes its bodies' nodes.
     """
 
     name: str
     operator: str
     begin_us: int
-    taken_us: int
+    duration_us: int
 
 
 def break_down(
@@ -84,9 +84,9 @@ def break_down(
         str(copy.name): module_of(node)
         for node, copy in zip(model.graph, source.graph, strict=True)
     }
-    compiled = optimized(source, provider)
-    made_of = origins(source, compiled)
-    places = {name: modules[str(node.name)] for name, node in made_of.items()}
+    compiled = optimize(source, provider)
+    sources = origins(source, compiled)
+    module_names = {name: modules[str(node.name)] for name, node in sources.items()}
     # Record no more events than the profiler can hold.
     wanted = max(1, min(runs, MOST_EVENTS // max(1, len(compiled.graph))))
     # Profile the source graph: the session optimizes it again.
@@ -99,8 +99,8 @@ def break_down(
         for done, _ in enumerate(islice(replayed, warm_up + wanted), 1):
             on_run(max(0, done - warm_up), wanted)
         with session.end_profile().open(encoding="utf-8") as lines:
-            counted = list(islice(node_runs(lines), warm_up, None))
-    return _divided(counted, places)
+            measured = list(islice(node_runs(lines), warm_up, None))
+    return _sum_times(measured, module_names)
 
 
 def node_runs(lines: Iterable[str]) -> Iterator[tuple[int, list[NodeRun]]]:
@@ -126,24 +126,23 @@ def node_runs(lines: Iterable[str]) -> Iterator[tuple[int, list[NodeRun]]]:
             nodes = []
 
 
-def _divided(
-    runs: Sequence[tuple[int, Sequence[NodeRun]]], places: Mapping[str, str]
+def _sum_times(
+    runs: Sequence[tuple[int, Sequence[NodeRun]]], module_names: Mapping[str, str]
 ) -> Breakdown:
-    """Add up the node times of every inference by module and by operator."""
+    """Add up times, by module and by operator; largest first, outside of nodes last."""
     modules, operators = (
         defaultdict[str, Any](lambda: np.zeros(len(runs), np.int64)) for _ in range(2)
     )
     for index, (taken_us, nodes) in enumerate(runs):
         for node in nodes:
-            modules[places.get(node.name) or NOWHERE][index] += node.taken_us
-            operators[node.operator][index] += node.taken_us
+            modules[module_names.get(node.name) or NO_MODULE][index] += node.duration_us
+            operators[node.operator][index] += node.duration_us
         # What the nodes do not account for is counted separately.
-        rest = max(0, taken_us - sum(node.taken_us for node in nodes))
-        modules[BETWEEN][index] += rest
-        operators[BETWEEN][index] += rest
-    # The largest first, and what lies between nodes last.
+        rest = max(0, taken_us - sum(node.duration_us for node in nodes))
+        modules[OUTSIDE][index] += rest
+        operators[OUTSIDE][index] += rest
     by_cost = (
-        sorted(sums.items(), key=lambda item: (item[0] == BETWEEN, -item[1].sum()))
+        sorted(sums.items(), key=lambda item: (item[0] == OUTSIDE, -item[1].sum()))
         for sums in (modules, operators)
     )
     return Breakdown(*({n: tuple(us.tolist()) for n, us in each} for each in by_cost))

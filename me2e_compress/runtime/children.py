@@ -98,8 +98,8 @@ def end_with_parent() -> None:
 
 
 @contextlib.contextmanager
-def killed_on_error() -> Iterator[None]:
-    """Kill the processes started in this block if an error leaves it."""
+def kill_on_error() -> Iterator[None]:
+    """Kill the processes that were started in this block if it raises."""
     others = set(active_children())
     try:
         yield
@@ -110,25 +110,25 @@ def killed_on_error() -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def pool(workers: int) -> Iterator[ProcessPoolExecutor]:
-    """Open a pool of processes that ends with this block in every case."""
-    made = ProcessPoolExecutor(workers, spawn_context(), end_with_parent)
+def process_pool(workers: int) -> Iterator[ProcessPoolExecutor]:
+    """Open a pool of so many processes, which end with this block in every case."""
+    executor = ProcessPoolExecutor(workers, spawn_context(), end_with_parent)
     try:
-        with killed_on_error():
-            yield made
+        with kill_on_error():
+            yield executor
     finally:
-        made.shutdown(cancel_futures=True)
+        executor.shutdown(cancel_futures=True)
 
 
 def run_script(
-    script: Path, words: Sequence[str], timeout_s: float | None = None
+    script: Path, arguments: Sequence[str], timeout_s: float | None = None
 ) -> "subprocess.CompletedProcess[str]":
-    """Run a Python file, which imports nothing of this package, to its end.
+    """Run a Python file, which imports nothing of this package, and return its output.
 
     Raises:
         subprocess.TimeoutExpired: it took longer than ``timeout_s`` and was killed.
     """
-    command = [sys.executable, "-P", __file__, str(script), *words]
+    command = [sys.executable, "-P", __file__, str(script), *arguments]
     read_end, write_end = os.pipe()  # nothing is written: it closes with this process
     try:
         return subprocess.run(

@@ -23,7 +23,7 @@ _LONGEST_MS = 1e9
 
 
 @dataclass(frozen=True)
-class Imported:
+class ImportedLatency:
     """What was read from a file of another tool.
 
     ``samples_us`` has one latency for each inference, ``layers_us`` the average of each
@@ -35,7 +35,7 @@ class Imported:
     layers_us: Mapping[str, tuple[int, ...]] = field(default_factory=dict)
 
 
-def read_import(path: Path) -> Imported:
+def read_latencies(path: Path) -> ImportedLatency:
     """Read one file.
 
     Raises:
@@ -45,21 +45,22 @@ def read_import(path: Path) -> Imported:
         document = documents.from_json(documents.content(path))
         if isinstance(document, dict):
             trace = LatencyTrace.load(path)
-            return Imported(trace.samples_us, trace.machine or "a trace")
+            return ImportedLatency(trace.samples_us, trace.machine or "a trace")
         # A list is trtexec's; a profile begins with a count.
         first = next((each for each in document if isinstance(each, dict)), {})
         if "count" not in first:
-            times = TypeAdapter(_Some[_Time]).validate_python(document)
+            times = TypeAdapter(_NonEmpty[_Time]).validate_python(document)
             samples = tuple(round(1e3 * each.latencyMs) for each in times)
-            return Imported(samples, "times of trtexec")
+            return ImportedLatency(samples, "times of trtexec")
         # Sum layers of the same name: trtexec repeats the names in loops.
         layers = dict[str, int]()
-        for each in TypeAdapter(_Some[_Layer]).validate_python(document[1:]):
-            taken = layers.get(each.name, 0) + round(1e3 * each.averageMs)
-            layers[each.name] = taken
+        for each in TypeAdapter(_NonEmpty[_Layer]).validate_python(document[1:]):
+            total_us = layers.get(each.name, 0) + round(1e3 * each.averageMs)
+            layers[each.name] = total_us
         by_cost = sorted(layers.items(), key=lambda item: -item[1])
-        layers_us = {name: (taken,) for name, taken in by_cost}
-        return Imported((sum(layers.values()),), "a profile of trtexec", layers_us)
+        layers_us = {name: (total_us,) for name, total_us in by_cost}
+        total = (sum(layers.values()),)
+        return ImportedLatency(total, "a profile of trtexec", layers_us)
 
 
 _Ms = Annotated[float, Field(ge=0.0, le=_LONGEST_MS, allow_inf_nan=False)]
@@ -75,4 +76,4 @@ class _Layer(BaseModel):
 
 
 _T = TypeVar("_T")
-_Some = Annotated[list[_T], Field(min_length=1)]
+_NonEmpty = Annotated[list[_T], Field(min_length=1)]

@@ -28,9 +28,9 @@ from me2e_compress.operators import FusedCall
 DOMAIN = "com.microsoft"
 """The domain of onnxruntime's own operators."""
 
-Stored: TypeAlias = tuple[ir.Value, ir.Value, ir.Value]
+Quantized: TypeAlias = tuple[ir.Value, ir.Value, ir.Value]
 """Integers, scale and zero point."""
-_SUFFIX = {ir.DataType.INT8: "Int8", ir.DataType.UINT8: "Uint8"}
+_KERNEL_SUFFIX = {ir.DataType.INT8: "Int8", ir.DataType.UINT8: "Uint8"}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -38,14 +38,14 @@ class _Product:
     """A quantized Gemm; ``reshape`` may lie in front of it, ``bias`` is float32 [N]."""
 
     gemm: ir.Node
-    left: Stored
+    left: Quantized
     reshape: ir.Node | None
-    weight: Stored
+    weight: Quantized
     bias: npt.NDArray[np.float32]
 
 
-def stored_bias(node: ir.Node | None) -> npt.NDArray[np.float32] | None:
-    """Compute the bias that a DequantizeLinear makes of integers; else None."""
+def bias_numbers(node: ir.Node | None) -> npt.NDArray[np.float32] | None:
+    """Return the float32 that a DequantizeLinear makes of constants; else None."""
     if node is None or node.op_type != "DequantizeLinear":
         return None
     integers, scales = array_of(node.inputs[0]), array_of(node.inputs[1])
@@ -55,7 +55,7 @@ def stored_bias(node: ir.Node | None) -> npt.NDArray[np.float32] | None:
     return numbers.astype(np.float32)
 
 
-def write_float_products(where: ir.Graph) -> int:
+def write_float_products(graph: ir.Graph) -> int:
     """Replace the quantized Gemms that no QuantizeLinear reads; return how many.
 
     Given:   y = Gemm(Reshape(DequantizeLinear(x)), DequantizeLinear(w),
@@ -63,18 +63,19 @@ def write_float_products(where: ir.Graph) -> int:
     Result:  y = MatMulIntegerToFloat(Reshape(x), w, scale of x, scales of w,
                  zero point of x, zero points of w, b)                   b float32 [N]
     """
-    products = [each for node in where if (each := _product(node)) is not None]
-    names = rewrite.value_names(where)
-    opset = where.opset_imports[""]
+    products = [each for node in graph if (each := _match_product(node)) is not None]
+    names = rewrite.value_names(graph)
+    opset = graph.opset_imports[""]
     for each in products:
-        _write(each, FusedCall(each.gemm, opset=opset, by="session", names=names))
+        _replace(each, FusedCall(each.gemm, opset=opset, by="session", names=names))
     if products:
-        where.opset_imports.setdefault(DOMAIN, 1)
-        rewrite.remove_dead(where)
+        graph.opset_imports.setdefault(DOMAIN, 1)
+        rewrite.remove_dead(graph)
     return len(products)
 
 
-def _write(product: _Product, call: FusedCall) -> None:
+def _replace(product: _Product, call: FusedCall) -> None:
+    """Write a MatMulIntegerToFloat in place of a Gemm."""
     integers, step, middle = product.left
     # The Reshape moves to the integers
     if product.reshape is not None:
@@ -85,18 +86,16 @@ def _write(product: _Product, call: FusedCall) -> None:
     call.put(call.add("MatMulIntegerToFloat", inputs, domain=DOMAIN))
 
 
-def _product(node: ir.Node) -> _Product | None:
+def _match_product(node: ir.Node) -> _Product | None:
     """Describe a quantized Gemm that is read in float; None for other nodes."""
     if node.op_type != "Gemm" or not is_standard(node) or node.attributes:
         return None
     if any(each.op_type == "QuantizeLinear" for each in node.outputs[0].consumers()):
         return None
     reshape = maker(node.inputs[0], "Reshape")
-    left = _stored(node.inputs[0] if reshape is None else reshape.inputs[0])
-    weight, bias = (
-        _stored(node.inputs[1]),
-        stored_bias(maker(input_at(node, 2), "DequantizeLinear")),
-    )
+    left = _quantized(node.inputs[0] if reshape is None else reshape.inputs[0])
+    weight = _quantized(node.inputs[1])
+    bias = bias_numbers(maker(input_at(node, 2), "DequantizeLinear"))
     if left is None or weight is None or bias is None or bias.ndim != 1:
         return None
     kinds = left[2].dtype, weight[2].dtype
@@ -104,8 +103,8 @@ def _product(node: ir.Node) -> _Product | None:
     return _Product(node, left, reshape, weight, bias) if fast else None
 
 
-def _stored(value: ir.Value | None) -> Stored | None:
-    """Return what a DequantizeLinear reads, one scale in all or one a column."""
+def _quantized(value: ir.Value | None) -> Quantized | None:
+    """Return what a DequantizeLinear along axis 1 reads; None of any other value."""
     node = maker(value, "DequantizeLinear")
     if node is None or node.attributes.get_int("axis", 1) != 1:
         return None
@@ -115,7 +114,7 @@ def _stored(value: ir.Value | None) -> Stored | None:
     return integers, scale, zero
 
 
-def read_int8(node: ir.Node, opset: int, names: set[str] | None) -> None:
+def use_int8_kernel(node: ir.Node, opset: int, names: set[str] | None) -> None:
     """Let a kernel call read int8 where its float value only dequantizes int8.
 
     Given: DequantizeLinear (one scale, or one a channel), or a Cast times a scale a
@@ -134,26 +133,26 @@ def read_int8(node: ir.Node, opset: int, names: set[str] | None) -> None:
     while (made := maker(value, "Reshape")) and made.inputs[0] is not None:
         reshapes.append(made)
         value = made.inputs[0]
-    stored = _values(value, channels)
+    stored = _int8_rows(value, channels)
     if stored is None:
         return
     rows, scale, zero = stored
     kind = rows.dtype
-    if kind is None or kind not in _SUFFIX:
+    if kind is None or kind not in _KERNEL_SUFFIX:
         return
     # Repeat the reshapes on the integers.
     call = FusedCall(node, opset=opset, by="session", names=names)
     for each in reversed(reshapes):
-        options = {name: held.as_int() for name, held in each.attributes.items()}
+        options = {key: item.as_int() for key, item in each.attributes.items()}
         rows = call.add("Reshape", [rows, each.inputs[1]], options)
     zero = zero or call.constant(np.zeros(1, kind.numpy()), "zero")
     # Switch the call to the int8 kernel.
     before, count = node.inputs[0], len(node.inputs)
-    node.op_type += _SUFFIX[kind]
+    node.op_type += _KERNEL_SUFFIX[kind]
     node.resize_inputs(count + 2)
     for index, new in ((0, rows), (count, scale), (count + 1, zero)):
         node.replace_input_with(index, new)
-    # Remove what nobody reads now, and what only that read.
+    # Remove the nodes that nobody reads any more.
     unread = None if before is None else producer_of(before)
     while unread is not None and unread.graph is not None:
         if any(value.uses() or value.is_graph_output() for value in unread.outputs):
@@ -163,12 +162,12 @@ def read_int8(node: ir.Node, opset: int, names: set[str] | None) -> None:
         unread = None if first is None else producer_of(first)
 
 
-def _values(
+def _int8_rows(
     value: ir.Value | None, channels: int | None
 ) -> tuple[ir.Value, ir.Value, ir.Value | None] | None:
-    """Return the integers behind a value, and scale and zero, if they fit the kernel.
+    """Return the integers of a value, their scale and zero, if they fit the kernel.
 
-    ``channels`` is the length of a row's last axis; None if unknown.
+    ``channels`` is the length of a row's last axis, None if unknown; zero may be None.
     """
     if node := maker(value, "DequantizeLinear"):
         source, scale, *rest = node.inputs
@@ -176,14 +175,14 @@ def _values(
         if source is None or scale is None or source.shape is None:
             return None
         # A zero point per channel must be zero everywhere.
-        if zero is not None and _size(zero) != 1:
+        if zero is not None and _count(zero) != 1:
             known = array_of(zero)
             if known is None or known.any():
                 return None
             zero = None
         # The kernel takes one scale, or one for each channel.
         last = node.attributes.get_int("axis", 1) in (-1, len(source.shape) - 1)
-        fits = _size(scale) == 1 or (last and _size(scale) == channels)
+        fits = _count(scale) == 1 or (last and _count(scale) == channels)
         return (source, scale, zero) if fits else None
     # The other form: integers cast to float, times a scale.
     if node := maker(value, "Mul"):
@@ -195,6 +194,6 @@ def _values(
     return None
 
 
-def _size(value: ir.Value) -> int | None:
+def _count(value: ir.Value) -> int | None:
     dims = open_shape(value)
     return None if dims is None else product(dims)

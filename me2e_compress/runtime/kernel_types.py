@@ -19,7 +19,7 @@ _CAST_BY_ITSELF = (ir.DataType.FLOAT16, ir.DataType.BFLOAT16)
 """Types that onnxruntime casts to float32 and back where it has no kernel."""
 
 
-def without_kernel(model: ir.Model) -> Iterator[tuple[ir.Node, str]]:
+def nodes_without_kernel(model: ir.Model) -> Iterator[tuple[ir.Node, str]]:
     """Yield the nodes that onnxruntime has no kernel for, with what is missing.
 
     Types must be known, by the file or by inference: a node of unknown types is not
@@ -29,29 +29,29 @@ def without_kernel(model: ir.Model) -> Iterator[tuple[ir.Node, str]]:
     for node in nodes_in(model.graph):
         if not is_standard(node) or not any(map(is_read, node.outputs)):
             continue
-        if missing := _missing(node, opset):
+        if missing := _missing_types(node, opset):
             yield node, f"onnxruntime has no kernel for {node.op_type} of {missing}"
 
 
-def _missing(node: ir.Node, opset: int) -> str:
-    """Name the opset, or the types that no kernel takes together; empty if one does."""
+def _missing_types(node: ir.Node, opset: int) -> str:
+    """Name the opset or the types that no kernel is for; empty if there is one."""
     schema = _schema(node.op_type, opset)
     if schema is None or node.op_type == "Constant":  # which becomes a weight
         return ""
-    given = _given(node, schema)
-    if given is None:
+    tensor_types = _tensor_types(node, schema)
+    if tensor_types is None:
         return ""
     listed = kernels().get(node.op_type, ())
-    able = [kernel for kernel in listed if serves(kernel, schema.since_version)]
-    if not able:
+    usable = [each for each in listed if serves(each, schema.since_version)]
+    if not usable:
         return f"opset {opset}"
-    for _, _, types in able:
-        if all(word in types.get(n, (word,)) for n, word, _ in given):
+    for _, _, types in usable:
+        if all(word in types.get(n, (word,)) for n, word, _ in tensor_types):
             return ""
-    return " and ".join(dict.fromkeys(kind for _, _, kind in given))
+    return " and ".join(dict.fromkeys(kind for _, _, kind in tensor_types))
 
 
-def _given(
+def _tensor_types(
     node: ir.Node, schema: onnx.defs.OpSchema
 ) -> list[tuple[str, str, str]] | None:
     """Return (constraint, type as onnxruntime writes it, its name) of all tensors.
@@ -88,8 +88,8 @@ def _schema(op_type: str, opset: int) -> onnx.defs.OpSchema | None:
     return None if is_made else schema
 
 
-def remedy(model: ir.Model, missing: str) -> str:
-    """Say what writes float32, unless the graph's inputs or outputs are float64."""
+def float32_hint(model: ir.Model, missing: str) -> str:
+    """Return advice where a pass can write float32; empty for ports of float64."""
     ports = (*model.graph.inputs, *model.graph.outputs)
     if "float64" not in missing or any(e.dtype == ir.DataType.DOUBLE for e in ports):
         return ""

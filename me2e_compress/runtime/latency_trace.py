@@ -16,10 +16,9 @@ from me2e_compress.metrics.measure import percentile, too_few
 from me2e_compress.registry import documents, drafts
 from me2e_compress.runtime.atomic import write_document
 
-BUSY = 0.1
+BUSY_SHARE = 0.1
 """Share of the cores that other processes may take before a latency is in doubt: they
 move our threads between cores and evict caches long before all cores are taken."""
-
 SHORTEST_S = 0.5
 """Shortest block to be judged, seconds: systems count CPU time in ticks of 10 ms."""
 
@@ -35,7 +34,7 @@ class Load:
     @property
     def busy(self) -> bool:
         """Whether they took more than `BUSY` of the cores."""
-        return self.others > BUSY * self.cores
+        return self.others > BUSY_SHARE * self.cores
 
     def to_json(self) -> dict[str, float]:
         """Return ``others_cores`` and ``cores``."""
@@ -46,8 +45,8 @@ class Load:
         if not self.busy:
             return load
         return (
-            f"the machine was busy: {load}, and more than {BUSY:.0%} moves latencies;"
-            " measure again when it is idle"
+            f"the machine was busy: {load}, and more than {BUSY_SHARE:.0%}"
+            " moves latencies; measure again when it is idle"
         )
 
 
@@ -65,7 +64,7 @@ class OthersLoad:
         ours: Callable[[], float] | None = None,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        self._machine, self._ours = machine or _machine_seconds, ours or cpu_seconds
+        self._machine, self._ours = machine or _all_cpu_seconds, ours or cpu_seconds
         self._clock = clock
         self.load: Load | None = None
 
@@ -86,7 +85,8 @@ class OthersLoad:
             self.load = Load(others, os.cpu_count() or 1)
 
 
-def _machine_seconds() -> float:
+def _all_cpu_seconds() -> float:
+    """Return the CPU time of all processes since boot, without idle and waiting."""
     times = psutil.cpu_times()
     idle = times.idle + getattr(times, "iowait", 0.0)
     guests = getattr(times, "guest", 0.0) + getattr(times, "guest_nice", 0.0)
@@ -117,8 +117,8 @@ class TimeShare:
     max_us: int
 
 
-def shares(parts: Microseconds) -> tuple[TimeShare, ...]:
-    """Return the share of each part over all inferences."""
+def time_shares(parts: Microseconds) -> tuple[TimeShare, ...]:
+    """Return the share of each part in the time of all inferences, in their order."""
     whole = max(1, sum(map(sum, parts.values())))
     return tuple(
         TimeShare(name, sum(samples) / whole, *_percentiles(samples))
@@ -137,24 +137,24 @@ def _percentiles(
     return p50, p90, p99, max(samples)
 
 
-def _shown(samples: Sequence[int]) -> list[str]:
-    """Write the percentiles in milliseconds."""
+def _percentile_texts(samples: Sequence[int]) -> list[str]:
+    """Write p50, p90, p99 and the largest in milliseconds, a dash for too few."""
     return ["-" if us is None else f"{us / 1e3:.2f}" for us in _percentiles(samples)]
 
 
-def shares_table(title: str, what: str, parts: Microseconds) -> Table:
-    """Return a table of the parts: share, then percentiles in milliseconds."""
+def shares_table(title: str, kind: str, parts: Microseconds) -> Table:
+    """Return a row for each part of a kind: share, then percentiles, milliseconds."""
     rows = [
-        (each.name, f"{each.share:.1%}", *_shown(parts[each.name]))
-        for each in shares(parts)
+        (each.name, f"{each.share:.1%}", *_percentile_texts(parts[each.name]))
+        for each in time_shares(parts)
     ]
-    columns = (what, "share", "p50 ms", "p90 ms", "p99 ms", "max ms")
+    columns = (kind, "share", "p50 ms", "p90 ms", "p99 ms", "max ms")
     count = min(map(len, parts.values()), default=0)
-    return table(title, columns, rows, _missing_percentiles(count))
+    return table(title, columns, rows, _percentiles_note(count))
 
 
-def _missing_percentiles(count: int) -> str:
-    """Say which percentiles need more samples."""
+def _percentiles_note(count: int) -> str:
+    """Return the note of a table on percentiles that need more samples, or ""."""
     why = {f"p{percent}": too_few(percent, count) for percent in PERCENTILES}
     return missing_note({name: each for name, each in why.items() if each})
 
@@ -195,8 +195,8 @@ class LatencyTrace:
     def tables(self) -> tuple[Table, ...]:
         """Return the percentiles in milliseconds, and the times of modules."""
         names = (*(f"p{percent}" for percent in PERCENTILES), "max")
-        rows = list(zip(names, _shown(self.samples_us), strict=True))
-        note = _missing_percentiles(len(self.samples_us))
+        rows = list(zip(names, _percentile_texts(self.samples_us), strict=True))
+        note = _percentiles_note(len(self.samples_us))
         whole = table(self.headline, ("latency", "ms"), rows, note)
         # Times of modules are optional.
         if not self.modules_us:
@@ -211,7 +211,7 @@ class LatencyTrace:
 
     def to_json(self) -> dict[str, Any]:
         """Return p50, p90, p99 and max with the samples; None with too few samples."""
-        taken = {name: list(each) for name, each in self.modules_us.items()}
+        modules = {name: list(each) for name, each in self.modules_us.items()}
         names = (*(f"p{percent}_us" for percent in PERCENTILES), "max_us")
         # What was not measured is left out.
         return {
@@ -221,24 +221,24 @@ class LatencyTrace:
             **({} if self.others is None else self.others.to_json()),
             **dict(zip(names, _percentiles(self.samples_us), strict=True)),
             "samples_us": list(self.samples_us),
-            **({"modules_us": taken} if taken else {}),
+            **({"modules_us": modules} if modules else {}),
         }
 
     def save(self, path: Path) -> None:
-        """Write the trace atomically."""
+        """Write the trace atomically; an EvaluationError if it cannot be written."""
         with drafts.written(path, EvaluationError):
             write_document(path, self.to_json())
 
     @classmethod
     def load(cls, path: Path) -> Self:
-        """Read a trace; its percentiles are recomputed from the samples."""
+        """Read a trace, without its percentiles; an EvaluationError if it is none."""
         with documents.reading(path, EvaluationError, "not a latency trace"):
             return TypeAdapter(cls).validate_json(documents.content(path))
 
     @model_validator(mode="before")
     @classmethod
     def _with_load(cls, record: Any) -> Any:
-        """Make a load of its two numbers, which a file has beside the rest."""
+        """Read the load from its two numbers, which a file has among the others."""
         if not isinstance(record, dict):
             return record
         known = None not in (record.get("others_cores"), record.get("cores"))

@@ -17,7 +17,7 @@ _SEPARATORS = "/_"
 ``/MatMulAddFusion``, ``_nchwc``, ``_token_1``."""
 
 
-def optimized(model: ir.Model, provider: Provider = CPU) -> ir.Model:
+def optimize(model: ir.Model, provider: Provider = CPU) -> ir.Model:
     """Return a graph as onnxruntime's optimizations leave it on this machine.
 
     Its operators are those that run: ``QLinearConv``, ``FusedConv``, ``ReorderInput``.
@@ -64,15 +64,15 @@ def origins(source: ir.Model, compiled: ir.Model) -> dict[str, ir.Node]:
         stems = (name, *(name[:end] for end in ends))
         named = (names.get(stem) for stem in stems)
         made = (makers.get(str(value.name)) for value in node.outputs)
-        known[node] = _first(chain(named, made))
+        known[node] = _first_known(chain(named, made))
     # Take the origin of readers, then of inputs, for the rest.
     for node in reversed(compiled.graph):
-        known[node] = known[node] or _first(
+        known[node] = known[node] or _first_known(
             known.get(reader) for value in node.outputs for reader in value.consumers()
         )
     # Readers may be unknown too: fall back to the inputs.
     for node in compiled.graph:
-        known[node] = known[node] or _first(
+        known[node] = known[node] or _first_known(
             known.get(maker)
             for value in node.inputs
             if (maker := producer_of(value)) is not None
@@ -80,5 +80,5 @@ def origins(source: ir.Model, compiled: ir.Model) -> dict[str, ir.Node]:
     return {str(node.name): each for node, each in known.items() if each is not None}
 
 
-def _first(nodes: Iterable[ir.Node | None]) -> ir.Node | None:
+def _first_known(nodes: Iterable[ir.Node | None]) -> ir.Node | None:
     return next((each for each in nodes if each is not None), None)

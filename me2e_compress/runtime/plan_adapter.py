@@ -46,7 +46,7 @@ class Trajectory:
     def ahead(
         cls, points: npt.NDArray[np.floating], times_s: npt.NDArray[np.floating]
     ) -> Self:
-        """Build a trajectory of the waypoints after the observation."""
+        """Build one of the waypoints after 0 s; an EvaluationError if there is none."""
         if not (times_s > 0).any():
             raise EvaluationError("no waypoint lies after the observation")
         return cls(points[times_s > 0], times_s[times_s > 0])
@@ -60,11 +60,11 @@ class Trajectory:
         times = np.concatenate([[0.0], self.times_s])
         points = np.vstack([np.zeros((1, 2)), self.points])
         velocity = (points[-1] - points[-2]) / (times[-1] - times[-2])
-        asked = np.asarray(times_s, np.float64)
-        x, y = (np.interp(asked, times, column) for column in points.T)
-        beyond = np.maximum(asked - times[-1], 0.0)
-        places: Floats = np.stack([x, y], axis=1) + beyond[:, None] * velocity
-        return places
+        times_asked = np.asarray(times_s, np.float64)
+        x, y = (np.interp(times_asked, times, column) for column in points.T)
+        overshoot_s = np.maximum(times_asked - times[-1], 0.0)
+        positions: Floats = np.stack([x, y], axis=1) + overshoot_s[:, None] * velocity
+        return positions
 
 
 PLAN = "me2e.plan"
@@ -116,7 +116,7 @@ class PlanAdapter(pydantic.BaseModel):
     columns: tuple[int, int] | None = None
 
     @pydantic.model_validator(mode="after")
-    def _one_choice(self) -> Self:
+    def _check_fields(self) -> Self:
         if self.scores is not None and self.command_input is not None:
             raise ValueError("scores and command_input both pick the mode")
         if self.command_modes is not None and self.command_input is None:
@@ -131,7 +131,8 @@ class PlanAdapter(pydantic.BaseModel):
     def of(cls, metadata: Mapping[str, str], outputs: Sequence[str]) -> Self | None:
         """Read the adapter from a model's metadata, or use an output named ``plan``.
 
-        Returns None if the model names no plan; malformed metadata is a GraphError.
+        Returns None if the model names no plan; metadata that are malformed or name
+        what is not an output are a GraphError.
         """
         text = metadata.get(PLAN)
         if text is None:
@@ -170,7 +171,7 @@ class PlanAdapter(pydantic.BaseModel):
         # Choose the mode, then read the coordinates.
         if value.ndim == 4:
             modes = value.shape[1]
-            mode = self._picked(outputs, inputs, modes)
+            mode = self._selected_mode(outputs, inputs, modes)
             if not 0 <= mode < modes:
                 raise GraphError(f"mode {mode} of {self.output}: it has {modes} modes")
             value = value[:, mode]
@@ -192,7 +193,7 @@ class PlanAdapter(pydantic.BaseModel):
         return np.cumsum(points, axis=0) if self.deltas else points
 
     def trajectory(self, points: npt.NDArray[np.float64]) -> Trajectory:
-        """Return waypoints, in any frame, with their times, if the step is known."""
+        """Return waypoints [n, 2] with their times; a GraphError without a step."""
         if self.step_s is None and len(points) != CONTRACT_WAYPOINTS:
             raise GraphError(
                 f"output {self.output}: the plan has shape {list(points.shape)}, it"
@@ -216,12 +217,13 @@ class PlanAdapter(pydantic.BaseModel):
             )
 
     def choice(self, outputs: Arrays) -> int:
-        """Return the mode with the largest score, the first of equals."""
+        """Return the first mode of the largest score; a GraphError without scores."""
         if self.scores is None:
             raise GraphError(f"nothing names the scores of {self.output}")
         return int(np.argmax(np.asarray(outputs[self.scores], np.float64).reshape(-1)))
 
-    def _picked(self, outputs: Arrays, inputs: Arrays, modes: int) -> int:
+    def _selected_mode(self, outputs: Arrays, inputs: Arrays, modes: int) -> int:
+        """Return the mode that scores, a command or the default selects."""
         if self.scores is not None:
             if (count := np.size(outputs[self.scores])) != modes:
                 raise GraphError(
@@ -230,8 +232,12 @@ class PlanAdapter(pydantic.BaseModel):
             return self.choice(outputs)
         # A command is a number, or a one-hot vector.
         if self.command_input is not None and self.command_input in inputs:
-            given: Any = np.asarray(inputs[self.command_input]).reshape(-1)
-            command = int(given[0] if len(given) == 1 else np.argmax(given))
+            command_values: Any = np.asarray(inputs[self.command_input]).reshape(-1)
+            command = int(
+                command_values[0]
+                if len(command_values) == 1
+                else np.argmax(command_values)
+            )
             if self.command_modes is None:
                 return command
             if not 0 <= command < len(self.command_modes):

@@ -1,7 +1,7 @@
 """Probes: nodes added to a graph that measure its tensors as they are computed.
 
-A probe stands right behind the node that makes its tensor, so that the tensor is freed
-as early as without it; all readings come out as one more output.
+A probe follows right after the node that makes its tensor, so that the tensor is freed
+as early as without it; all readings are one more output.
 """
 
 from collections.abc import Sequence
@@ -37,7 +37,7 @@ class Probe(Protocol):
 def insert_probes(model: ir.Model, tensors: Sequence[str], probe: Probe) -> ir.Model:
     """Return a copy of a graph with a probe right after each tensor's producer.
 
-    The last output of the copy is :data:`READINGS`.
+    Its last output is :data:`READINGS`. A tensor that the graph lacks is a GraphError.
     """
     copy = model.clone()
     made = (value for node in copy.graph for value in node.outputs)
@@ -48,7 +48,7 @@ def insert_probes(model: ir.Model, tensors: Sequence[str], probe: Probe) -> ir.M
     readings = [
         reading
         for at, name in enumerate(tensors)
-        for reading in _watch(copy.graph, known[name], probe, at)
+        for reading in _probe_tensor(copy.graph, known[name], probe, at)
     ]
     # Join all readings into one output.
     joined = ir.node("Concat", readings, {"axis": 0}, name=READINGS)
@@ -60,9 +60,10 @@ def insert_probes(model: ir.Model, tensors: Sequence[str], probe: Probe) -> ir.M
     return copy
 
 
-def _watch(
+def _probe_tensor(
     where: ir.Graph, value: ir.Value, probe: Probe, at: int
 ) -> Sequence[ir.Value]:
+    """Insert the nodes that measure one tensor; return its 1-D readings."""
     nodes: list[ir.Node] = []
     seen = value
     if value.dtype not in (None, ir.DataType.FLOAT):

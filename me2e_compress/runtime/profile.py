@@ -37,26 +37,26 @@ def profile(
     the model's own; ``on_sample`` is called with samples done and all samples.
     """
     wanted = len(frames) if samples is None else samples
-    check_work(wanted, warm_up, frames)
+    check_counts(wanted, warm_up, frames)
     session = TimedSession(model, threads=threads, provider=provider, metadata=metadata)
     # Warm up and measure in one replay of the repeated recording.
     endless = chain.from_iterable(repeat(frames))
     for done, _ in enumerate(islice(replay(session, endless), warm_up + wanted), 1):
         on_sample(max(0, done - warm_up), wanted)
-    machine = machine_words(threads, provider)
-    taken = tuple(session.taken_us[warm_up:])
-    return LatencyTrace(sha256_of(model), machine, taken)
+    machine = machine_text(threads, provider)
+    durations_us = tuple(session.taken_us[warm_up:])
+    return LatencyTrace(sha256_of(model), machine, durations_us)
 
 
-def machine_words(threads: int, provider: Provider = CPU) -> str:
-    """Describe the machine: processor, threads, provider."""
+def machine_text(threads: int, provider: Provider = CPU) -> str:
+    """Describe what measures: processor, threads, a provider other than the CPU."""
     runs = "" if provider == CPU else f", {PROVIDERS.text(provider)}"
     on = plural(threads, "thread") if threads else "all threads"
     return f"{processor()}, onnxruntime on {on}{runs}"
 
 
-def check_work(samples: int, warm_up: int, frames: Frames) -> None:
-    """Check that there is at least one sample and one frame to measure."""
+def check_counts(samples: int, warm_up: int, frames: Frames) -> None:
+    """Raise an EvaluationError unless there are a sample and a frame to measure."""
     if samples < 1 or warm_up < 0 or not len(frames):
         raise EvaluationError(
             f"{samples} samples after {warm_up} of warm-up on {len(frames)} frames: "
@@ -67,7 +67,7 @@ def check_work(samples: int, warm_up: int, frames: Frames) -> None:
 class TimedSession(Session):
     """A session that records how long each run took.
 
-    ``taken_us`` has the microseconds of each run.
+    ``taken_us`` lists the microseconds of each run.
     """
 
     def __init__(
@@ -111,10 +111,10 @@ def processor() -> str:
 # Interleaved timing: models measured in turn, so that noise affects all of them.
 
 
-BLOCK = 10
+BLOCK_RUNS = 10
 """Inferences of one model in a row: caches stay warm, and noise that lasts a second
 affects all models."""
-RE_WARM = 2
+BLOCK_WARM_UP = 2
 """Uncounted inferences at the start of a block: the caches hold another model's
 data."""
 
@@ -137,7 +137,7 @@ def record_traces(
     ``samples`` and ``warm_up`` count for each model; ``on_sample`` is called with
     samples done, all samples and the model's name.
     """
-    check_work(samples, warm_up, frames)
+    check_counts(samples, warm_up, frames)
     sessions = {
         name: TimedSession(
             path,
@@ -152,27 +152,27 @@ def record_traces(
         name: replay(session, chain.from_iterable(repeat(frames)))
         for name, session in sessions.items()
     }
-    kept = {name: list[int]() for name in models}
+    durations_us = {name: list[int]() for name in models}
     for run in runs.values():
         deque(islice(run, warm_up), maxlen=0)
     # Measure block by block, and discard the start of each.
     total = samples * len(models)
     with OthersLoad() as others:
-        for done in range(0, samples, BLOCK):
-            block = min(BLOCK, samples - done)
-            for place, (name, session) in enumerate(sessions.items()):
-                deque(islice(runs[name], RE_WARM + block), maxlen=0)
-                kept[name] += session.taken_us[-block:]
-                on_sample(done * len(models) + place * block, total, name)
-    machine = describe_machine(threads, provider)
+        for done in range(0, samples, BLOCK_RUNS):
+            block = min(BLOCK_RUNS, samples - done)
+            for position, (name, session) in enumerate(sessions.items()):
+                deque(islice(runs[name], BLOCK_WARM_UP + block), maxlen=0)
+                durations_us[name] += session.taken_us[-block:]
+                on_sample(done * len(models) + position * block, total, name)
+    machine = in_turn_text(threads, provider)
     return {
         name: LatencyTrace(
-            sha256_of(path), machine, tuple(kept[name]), others=others.load
+            sha256_of(path), machine, tuple(durations_us[name]), others=others.load
         )
         for name, path in models.items()
     }
 
 
-def describe_machine(threads: int, provider: Provider = CPU) -> str:
-    """Describe the machine of `record_traces`: processor, threads, provider."""
-    return f"{machine_words(threads, provider)}, in turn"
+def in_turn_text(threads: int, provider: Provider = CPU) -> str:
+    """Describe what measures in `record_traces`; see :func:`machine_text`."""
+    return f"{machine_text(threads, provider)}, in turn"

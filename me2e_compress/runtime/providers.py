@@ -31,8 +31,8 @@ thread and two), 2.7 times on 20 rows, and as long on one
 _CPU = "CPUExecutionProvider"
 _CUDA = "CUDAExecutionProvider"
 _GPU_PACKAGE = "pip uninstall onnxruntime; pip install onnxruntime-gpu"
-_NO_LIBRARY = (_native.Fail, _native.RuntimeException, RuntimeError)
-_ENTRY = b"RegisterCustomOps"  # of every library of onnxruntime operators
+_LIBRARY_ERRORS = (_native.Fail, _native.RuntimeException, RuntimeError)
+_ENTRY_POINT = b"RegisterCustomOps"  # of every library of onnxruntime operators
 
 
 @dataclasses.dataclass(frozen=True)
@@ -66,16 +66,16 @@ class Provider(abc.ABC):
         for library in self.plugins:
             if not library.is_file():
                 raise ProviderError(f"plugins library {library}: no such file")
-        there = ort.get_available_providers()
+        available = ort.get_available_providers()
         if not self.is_installed():
             raise ProviderError(
                 f"provider {self.name}: onnxruntime {ort.__version__} has only"
-                f" {', '.join(there)}; {self.advice}"
+                f" {', '.join(available)}; {self.advice}"
             )
 
     def claims(self, op_type: str) -> bool:
-        """Return whether a user's library names an operator, and so runs it."""
-        return any(holds(each, op_type.encode()) for each in self.plugins)
+        """Return whether a user's library holds an operator's name, and so runs it."""
+        return any(file_contains(each, op_type.encode()) for each in self.plugins)
 
     def is_installed(self) -> bool:
         """Return whether this onnxruntime has it; its device may still be missing."""
@@ -91,7 +91,7 @@ class Provider(abc.ABC):
         for library in self.plugins:
             try:
                 options.register_custom_ops_library(str(library))
-            except _NO_LIBRARY as error:
+            except _LIBRARY_ERRORS as error:
                 line = " ".join(str(error).split())
                 raise ProviderError(f"plugins library {library}: {line}") from error
 
@@ -155,7 +155,7 @@ class CudaProvider(Provider):
     tf32: bool = False
 
     def attach(self, options: ort.SessionOptions) -> None:
-        """Attach as usual, and load CUDA and cuDNN from installed packages."""
+        """Attach as the base does, and load CUDA and cuDNN from installed packages."""
         super().attach(options)
         ort.preload_dlls()
 
@@ -187,7 +187,7 @@ class TensorRtProvider(Provider):
 
     def attach(self, options: ort.SessionOptions) -> None:
         """Register the libraries of onnxruntime operators, and load CUDA."""
-        ours = tuple(each for each in self.plugins if not self._is_tensorrts(each))
+        ours = tuple(each for each in self.plugins if not self._is_plugin(each))
         self.check()
         CudaProvider(self.device, plugins=ours).attach(options)
 
@@ -202,15 +202,15 @@ class TensorRtProvider(Provider):
             for kind in ("engine", "timing"):
                 options[f"trt_{kind}_cache_enable"] = "True"
                 options[f"trt_{kind}_cache_path"] = str(self.cache)
-        theirs = [str(each) for each in self.plugins if self._is_tensorrts(each)]
+        theirs = [str(each) for each in self.plugins if self._is_plugin(each)]
         if theirs:
             options["trt_extra_plugin_lib_paths"] = ";".join(theirs)
         return [(self.native, options), *CudaProvider(self.device).chain()]
 
     @staticmethod
-    def _is_tensorrts(library: Path) -> bool:
+    def _is_plugin(library: Path) -> bool:
         """Return whether a library lacks onnxruntime operators, without running it."""
-        return library.is_file() and not holds(library, _ENTRY)
+        return library.is_file() and not file_contains(library, _ENTRY_POINT)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -251,7 +251,7 @@ class TensorRtRtxProvider(Provider):
         """Return None: the options of the session name its device."""
 
 
-def holds(path: Path, *words: bytes) -> bool:
+def file_contains(path: Path, *words: bytes) -> bool:
     """Return whether a file holds some of these bytes, without running it."""
     if not path.is_file() or not path.stat().st_size:
         return False

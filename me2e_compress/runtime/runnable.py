@@ -27,7 +27,7 @@ from me2e_compress.graph.nodes import (
 )
 from me2e_compress.graph.rewrite import add_constant, value_names
 from me2e_compress.operators import OWN_DOMAIN, kernels
-from me2e_compress.runtime.int8_values import read_int8, write_float_products
+from me2e_compress.runtime.int8_values import use_int8_kernel, write_float_products
 from me2e_compress.runtime.providers import CPU, Provider
 
 QDQ_OFF = "session.disable_quant_qdq"
@@ -44,17 +44,17 @@ NO_OVERFLOW = "session.x64quantprecision"
 1.2 times as slow, and 35 dB instead of 13 on a small transformer. Others do not ignore
 it: a Xeon with AMX takes 3 to 5 times as long for a convolution."""
 
-_SUMS = f"""<ir_version: 9, opset_import: ["" : 17]>
+_SUM_MODEL = f"""<ir_version: 9, opset_import: ["" : 17]>
 m (uint8[1,64] x) => (int32[1,16] y)
 <int8[64,16] w = {{{",".join(["127"] * 1024)}}}> {{ y = MatMulInteger(x, w) }}"""
 
 
 @functools.cache
 def int8_entry() -> tuple[str, str]:
-    """Return :data:`NO_OVERFLOW` and its value for this processor: is a sum wrong?"""
+    """Return :data:`NO_OVERFLOW` and its value, "1" where a sum overflows here."""
     options = ort.SessionOptions()
     options.intra_op_num_threads = 1
-    model = ir.to_proto(ir.from_onnx_text(_SUMS)).SerializeToString()
+    model = ir.to_proto(ir.from_onnx_text(_SUM_MODEL)).SerializeToString()
     session = ort.InferenceSession(model, options, providers=["CPUExecutionProvider"])
     sums = np.asarray(session.run(None, {"x": np.full((1, 64), 255, np.uint8)})[0])
     return NO_OVERFLOW, "0" if (sums == 64 * 255 * 127).all() else "1"
@@ -90,7 +90,7 @@ def unknown_nodes(model: ir.Model) -> Iterator[ir.Node]:
                 yield node
 
 
-def runnable(
+def make_runnable(
     model: ir.Model, options: ort.SessionOptions, provider: Provider
 ) -> ir.Model:
     """Return a graph whose fused nodes onnxruntime can run with these options.
@@ -100,31 +100,31 @@ def runnable(
     without fused nodes is returned itself, others are copied.
     """
     compiled = provider.native == CPU.native and kernels.why_not() is None
-    theirs = provider.claims
-    made, needed = compiled_or_expanded(model, compiled=compiled, theirs=theirs)
+    in_library = provider.claims
+    prepared, needed = replace_fused(model, compiled=compiled, in_library=in_library)
     if needed:
         from me2e_compress.operators.kernels import custom_ops  # needs the extra `fast`
 
         try:
             custom_ops.register(options, needed)
         except (ImportError, OSError):
-            made, _ = compiled_or_expanded(model, compiled=False, theirs=theirs)
+            prepared, _ = replace_fused(model, compiled=False, in_library=in_library)
     if provider.native != CPU.native:
-        return made
+        return prepared
     # May onnxruntime make int8 kernels of pairs?
     try:
         as_written = str(options.get_session_config_entry(QDQ_OFF)) == "1"
     except RuntimeError:  # it is not set
         as_written = False
     if as_written or options.graph_optimization_level == _AS_WRITTEN:
-        return made
+        return prepared
     # Files without fused nodes are opened unread, so their products stay, too.
-    if made is not model:
-        write_float_products(made.graph)
-    return _with_own_weights(made)
+    if prepared is not model:
+        write_float_products(prepared.graph)
+    return _unshare_weights(prepared)
 
 
-def _with_own_weights(model: ir.Model) -> ir.Model:
+def _unshare_weights(model: ir.Model) -> ir.Model:
     """Return a graph in which no two nodes read one int8 weight or zero point.
 
     With :data:`NO_OVERFLOW` onnxruntime (1.31) writes each as uint8 under one new name,
@@ -144,6 +144,7 @@ def _with_own_weights(model: ir.Model) -> ir.Model:
 
 
 def _shared_weights(model: ir.Model) -> Iterator[tuple[ir.Node, int]]:
+    """Yield nodes and input indices of int8 weights and zero points read twice."""
     for node in model.graph:
         indices = _WEIGHT_INPUTS.get(node.op_type, ())
         weight = input_at(node, indices[0]) if indices else None
@@ -158,23 +159,23 @@ def _shared_weights(model: ir.Model) -> Iterator[tuple[ir.Node, int]]:
 
 
 _WEIGHT_INPUTS = {"DequantizeLinear": (0, 2), "MatMulIntegerToFloat": (1, 5)}
-"""Where nodes read an int8 weight and its zero point."""
+"""Input indices of an int8 weight and its zero point."""
 
 
-def compiled_or_expanded(
+def replace_fused(
     model: ir.Model,
     *,
     compiled: bool,
-    theirs: Callable[[str], bool] = lambda op_type: False,
+    in_library: Callable[[str], bool] = lambda op_type: False,
 ) -> tuple[ir.Model, tuple[kernels.CompiledKernel, ...]]:
     """Replace the fused nodes by kernels, if ``compiled``, or by bodies.
 
-    Operators for which ``theirs`` is true are left as they are. Returns a copy, or the
-    graph itself if it has no fused nodes, and the kernels in it.
+    Operators for which ``in_library`` is true are left. Returns a copy, or the graph
+    itself if it has no fused nodes, and the kernels in it.
     """
     names = {node.op_type for node in unknown_nodes(model) if is_fused(node)}
-    ours = {name for name in sorted(names) if not theirs(name)}
-    if not ours:
+    fused_types = {name for name in sorted(names) if not in_library(name)}
+    if not fused_types:
         return model, ()
     copy = model.clone()
     known = [node for node in unknown_nodes(copy) if node.op_type in ours]
@@ -194,9 +195,9 @@ def compiled_or_expanded(
     ]
     try:
         operators.raise_for_bodies(copy, fused, _BY)
-        taken = value_names(copy.graph)
+        names_in_use = value_names(copy.graph)
         for node in fused:
-            opset, used = _surroundings(node, copy, taken)
+            opset, used = _opset_and_names(node, copy, names_in_use)
             operators.expand(node, opset=opset, by=_BY, names=used, compiled=compiled)
     except PreconditionError as error:
         raise GraphError(str(error)) from error
@@ -214,14 +215,14 @@ def compiled_or_expanded(
     return copy, tuple(needed.values())
 
 
-def _surroundings(
-    node: ir.Node, model: ir.Model, taken: set[str]
+def _opset_and_names(
+    node: ir.Node, model: ir.Model, names_in_use: set[str]
 ) -> tuple[int, set[str] | None]:
     """Return the opset of a node, and the names that its graph must not use again."""
     where = node.graph
     assert where is not None
     opset = where.opset_imports.get("", model.opset_imports.get("", 1))
-    return opset, taken if isinstance(where, ir.Graph) else None
+    return opset, names_in_use if isinstance(where, ir.Graph) else None
 
 
 def is_fused(node: ir.Node) -> bool:
@@ -234,32 +235,33 @@ MOST_ROUNDS = 1 << 24
 """Most iterations of a loop times those around it: one takes at least 5 us."""
 
 
-def endless(model: ir.Model) -> str | None:
+def why_endless(model: ir.Model) -> str | None:
     """Describe a loop that would run for minutes or forever; None if none is known.
 
     Loops whose condition is computed at run time are not reported.
     """
     for nodes in (model.graph, *model.functions.values()):
-        if (node := _endless(nodes, 1)) is not None:
+        if (node := _endless_loop(nodes, 1)) is not None:
             name = node.name or node.outputs[0].name
             return f"Loop node {name!r} goes on for more than {MOST_ROUNDS:,} rounds"
     return None
 
 
-def _endless(nodes: Iterable[ir.Node], rounds: float) -> ir.Node | None:
+def _endless_loop(nodes: Iterable[ir.Node], rounds: float) -> ir.Node | None:
+    """Return a loop of more iterations than allowed, within loops of ``rounds``."""
     for node in nodes:
         if not (bodies := bodies_of(node)):
             continue
-        inside = rounds * _rounds(node)
+        inside = rounds * _iterations(node)
         if inside > MOST_ROUNDS:
             return node
         for body in bodies:
-            if (inner := _endless(body, inside)) is not None:
+            if (inner := _endless_loop(body, inside)) is not None:
                 return inner
     return None
 
 
-def _rounds(node: ir.Node) -> float:
+def _iterations(node: ir.Node) -> float:
     """Return the iterations of a loop if constants alone decide them; else 1."""
     if node.op_type != "Loop" or not is_standard(node):
         return 1
@@ -281,7 +283,7 @@ def _rounds(node: ir.Node) -> float:
     return 1 if count is None or count.size != 1 else max(0, int(count.item()))
 
 
-def unsupported(model: ir.Model, provider: Provider = CPU) -> str | None:
+def why_unsupported(model: ir.Model, provider: Provider = CPU) -> str | None:
     """Return why a graph cannot be run; None if every operator is known.
 
     Endless loops are refused, because no signal can stop them. Fused operators are
@@ -290,7 +292,7 @@ def unsupported(model: ir.Model, provider: Provider = CPU) -> str | None:
     element type; only building a :class:`~me2e_compress.runtime.session.Session` shows
     it.
     """
-    if reason := endless(model):
+    if reason := why_endless(model):
         return reason
     unknown = {
         f"{node.domain or 'ai.onnx'}::{node.op_type}": node

@@ -21,13 +21,16 @@ from me2e_compress.graph.files import INLINE_LIMIT_BYTES
 from me2e_compress.graph.nodes import NATIVE, is_read
 from me2e_compress.graph.recurrence import SessionPort, not_fed_back, recurrence
 from me2e_compress.runtime.frames import Array, Frame
-from me2e_compress.runtime.kernel_types import remedy, without_kernel
-from me2e_compress.runtime.providers import CPU, Provider, holds
-from me2e_compress.runtime.runnable import QDQ_OFF, int8_entry, runnable, unsupported
+from me2e_compress.runtime.kernel_types import float32_hint, nodes_without_kernel
+from me2e_compress.runtime.providers import CPU, Provider, file_contains
+from me2e_compress.runtime.runnable import (
+    QDQ_OFF,
+    int8_entry,
+    make_runnable,
+    why_unsupported,
+)
 
 # The compiled module has no stubs.
-
-
 InvalidArgument: type[Exception] = _native.InvalidArgument
 """Raised where inputs do not fit."""
 
@@ -40,14 +43,13 @@ REFUSALS: tuple[type[Exception], ...] = (
     _native.NoSuchFile,
     _native.NotImplemented,
     _native.RuntimeException,
-    UnicodeDecodeError,  # a message about names that are not UTF-8
+    UnicodeDecodeError,  # from a message about names that are not UTF-8
     MemoryError,  # what it computes of constants as it opens is too large
     RuntimeError,  # an output of a type that numpy lacks, such as bfloat16
 )
 """Everything raised where a graph cannot be read, built or run."""
 
-
-_INT8_STAYS = "session.qdqisint8allowed"
+_KEEP_INT8 = "session.qdqisint8allowed"
 LENT_BYTES = 1024
 """Smaller tensors stay in the graph: shape inference reads them."""
 
@@ -76,17 +78,17 @@ def open_file(
     if not path.is_file():
         raise GraphError(f"{path}: no such file")
     # Most files open directly: to load one takes ten times as long as to search it.
-    if not holds(path, _OWN_NODE, _LOOP):
+    if not file_contains(path, _OWN_NODE_BYTES, _LOOP_BYTES):
         try:
-            return _build(str(path), options, provider, without), {}
+            return _open_with_retry(str(path), options, provider, without), {}
         except GraphError:
             pass
     return open_graph(graph.load(path), options, provider, without)
 
 
-_OWN_NODE = b":\x04me2e"
+_OWN_NODE_BYTES = b":\x04me2e"
 """Bytes of a node in the toolkit's own domain; onnxruntime would run its body."""
-_LOOP = b'"\x04Loop'
+_LOOP_BYTES = b'"\x04Loop'
 """Bytes of a node that may never end."""
 
 
@@ -102,32 +104,33 @@ def open_graph(
     attached to ``options``; ``without`` lists optimizations to disable, by default
     those of the provider. The GraphError of a refused graph names the operator.
     """
-    if reason := unsupported(model, provider):
+    if reason := why_unsupported(model, provider):
         raise GraphError(reason)
-    model = runnable(model, options, provider)
+    model = make_runnable(model, options, provider)
     try:
-        return _lending(model, options, provider, without)
+        return _open_lent(model, options, provider, without)
     except GraphError as refusal:
-        # Name the first operator that has no kernel; if all have one, what was said.
+        # Name the first operator that has no kernel, else give onnxruntime's reason.
         reason = str(refusal)
         if provider.native == CPU.native:
             typed = model.clone()
             graph.infer_shapes(typed)
-            for node, missing in without_kernel(typed):
-                reason = f"{missing} (node {node.name!r}){remedy(typed, missing)}"
+            for node, missing in nodes_without_kernel(typed):
+                reason = f"{missing} (node {node.name!r}){float32_hint(typed, missing)}"
                 break
         raise GraphError(reason) from refusal
 
 
-def _lending(
+def _open_lent(
     model: ir.Model,
     options: ort.SessionOptions,
     provider: Provider,
     without: Sequence[str] | None,
 ) -> tuple[ort.InferenceSession, Weights]:
-    # Lend the large weights that are read, and keep the rest in the graph.
+    """Open a graph whose large weights onnxruntime reads from this process's arrays."""
+    # Lend the large weights that are read, and write the rest into the graph.
     lent: dict[str, ir.TensorProtocol] = {}
-    kept: list[ir.TensorProtocol] = []
+    inline: list[ir.TensorProtocol] = []
     for each in model.graphs():
         for name, value in each.initializers.items():
             tensor = value.const_value
@@ -142,16 +145,16 @@ def _lending(
             ):
                 lent[name] = tensor
             else:
-                kept.append(tensor)
+                inline.append(tensor)
     # What remains may be external, or too large for one message.
     if (
-        any(map(_is_external, kept))
-        or sum(tensor.nbytes for tensor in kept) > INLINE_LIMIT_BYTES
+        any(map(_is_external, inline))
+        or sum(tensor.nbytes for tensor in inline) > INLINE_LIMIT_BYTES
     ):
         with tempfile.TemporaryDirectory(prefix="me2e-session-") as folder:
             path = Path(folder) / "model.onnx"
             graph.save(model, path)
-            return _build(str(path), options, provider, without), {}
+            return _open_with_retry(str(path), options, provider, without), {}
     weights = {
         name: ort.OrtValue.ortvalue_from_numpy(np.ascontiguousarray(tensor.numpy()))
         for name, tensor in lent.items()
@@ -176,7 +179,7 @@ def _is_external(tensor: ir.TensorProtocol) -> bool:
     return isinstance(tensor, ir.ExternalTensor)
 
 
-def _build(
+def _open_with_retry(
     source: str | bytes,
     options: ort.SessionOptions,
     provider: Provider,
@@ -191,20 +194,20 @@ def _build(
     """
     left_out = provider.left_out if without is None else without
     try:
-        return _opened(source, options, provider, left_out)
+        return _open_once(source, options, provider, left_out)
     except REFUSALS as error:
         refusal = error
     # Disable that step; setting the option twice would make onnxruntime warn.
     try:
-        options.get_session_config_entry(_INT8_STAYS)
+        options.get_session_config_entry(_KEEP_INT8)
     except RuntimeError:  # it is not set yet
-        options.add_session_config_entry(_INT8_STAYS, "1")
+        options.add_session_config_entry(_KEEP_INT8, "1")
     level = options.graph_optimization_level
     # Who asks for the rewritten graph gets that
-    for tried in (level, level if options.optimized_model_filepath else _PLAIN):
+    for tried in (level, level if options.optimized_model_filepath else _UNOPTIMIZED):
         options.graph_optimization_level = tried
         try:
-            return _opened(source, options, provider, left_out)
+            return _open_once(source, options, provider, left_out)
         except REFUSALS:
             pass
     options.graph_optimization_level = level
@@ -212,12 +215,13 @@ def _build(
     raise GraphError(f"onnxruntime cannot run this graph: {line}") from refusal
 
 
-def _opened(
+def _open_once(
     source: str | bytes,
     options: ort.SessionOptions,
     provider: Provider,
     left_out: Sequence[str],
 ) -> ort.InferenceSession:
+    """Open a graph once, and check that it runs on the provider."""
     session = ort.InferenceSession(
         source,
         options,
@@ -229,9 +233,6 @@ def _opened(
     return session
 
 
-# Sessions that run one graph, and the replay of recordings.
-
-
 __all__ = ["Session", "SessionPort", "detached", "replay", "run_once"]
 
 DTYPES: Mapping[str, np.dtype[np.generic]] = {
@@ -239,13 +240,10 @@ DTYPES: Mapping[str, np.dtype[np.generic]] = {
 }
 """Element types by onnxruntime's word for them."""
 
-
 _SHRINK = "memory.enable_memory_arena_shrinkage"
 _WEIGHTS_FILE = "session.optimized_model_external_initializers_file_name"
-
-
-_PLAIN = ort.GraphOptimizationLevel.ORT_DISABLE_ALL
-_FULL = ort.GraphOptimizationLevel.ORT_ENABLE_ALL
+_UNOPTIMIZED = ort.GraphOptimizationLevel.ORT_DISABLE_ALL
+_OPTIMIZED = ort.GraphOptimizationLevel.ORT_ENABLE_ALL
 
 
 class Session:
@@ -298,7 +296,7 @@ class Session:
         # Idle threads that spin slow down whatever else runs on the machine.
         options.add_session_config_entry("session.intra_op.allow_spinning", "0")
         # The optimizations: level, memory and order of nodes.
-        options.graph_optimization_level = _FULL if optimize else _PLAIN
+        options.graph_optimization_level = _OPTIMIZED if optimize else _UNOPTIMIZED
         # One block for all tensors of a run: twice the memory on VAD-tiny, no gain.
         options.enable_mem_pattern = False
         if not stock and provider.target == CPU.target:
@@ -333,10 +331,10 @@ class Session:
         self.metadata = {**stored, **(metadata or {})}
         self.recurrent = recurrence(self.metadata, self.inputs, self.outputs)
 
-    def first_state(self, held: Mapping[str, Array]) -> dict[str, Array]:
-        """Return the first values of recurrent inputs: from ``held``, else zeros.
+    def first_state(self, arrays: Mapping[str, Array]) -> dict[str, Array]:
+        """Return the first values of recurrent inputs: from ``arrays``, else zeros.
 
-        An open dimension has the size that it has in ``held``.
+        An open dimension has the size that an array has for its name.
 
         Raises:
             GraphError: an input of unknown shape has no first value.
@@ -344,12 +342,14 @@ class Session:
         sizes = {
             dim: size
             for name, port in self.inputs.items()
-            if name in held
-            for dim, size in zip(port.shape, held[name].shape, strict=False)
+            if name in arrays
+            for dim, size in zip(port.shape, arrays[name].shape, strict=False)
             if dim_name(dim)
         }
         return {
-            name: held[name] if name in held else zeros(name, self.inputs[name], sizes)
+            name: arrays[name]
+            if name in arrays
+            else zero_state(name, self.inputs[name], sizes)
             for name in self.recurrent
         }
 
@@ -373,12 +373,14 @@ class Session:
         names = list(self.outputs) if outputs is None else list(outputs)
         # Inputs that do not fit are the caller's fault, others the graph's.
         try:
-            fed = {name: feeds[name] for name in self.inputs}
-            values = cast("list[Array]", self._ort.run(names, fed, self._each_run))
+            inputs = {name: feeds[name] for name in self.inputs}
+            values = cast("list[Array]", self._ort.run(names, inputs, self._each_run))
         except InvalidArgument as error:
-            raise FramesError(f"these inputs do not fit: {_line(error)}") from error
+            raise FramesError(
+                f"these inputs do not fit: {_on_one_line(error)}"
+            ) from error
         except REFUSALS as error:
-            raise GraphError(f"onnxruntime failed: {_line(error)}") from error
+            raise GraphError(f"onnxruntime failed: {_on_one_line(error)}") from error
         return dict(zip(names, values, strict=True))
 
     def end_profile(self) -> Path:
@@ -463,7 +465,7 @@ def dim_name(dim: int | str | None) -> str:
     return dim if isinstance(dim, str) and any(map(str.isalnum, dim)) else ""
 
 
-def zeros(
+def zero_state(
     name: str, port: SessionPort, sizes: Mapping[int | str | None, int] | None = None
 ) -> Array:
     """Return zeros for a recurrent input, its open dimensions of the named sizes.
@@ -473,8 +475,8 @@ def zeros(
     """
     known = sizes or {}
     shape = [each if isinstance(each, int) else known.get(each) for each in port.shape]
-    there = [size for size in shape if size is not None]
-    if len(there) < len(shape):
+    sizes_known = [size for size in shape if size is not None]
+    if len(sizes_known) < len(shape):
         axis = shape.index(None)
         dim = dim_name(port.shape[axis]) or f"{name}:{axis}"
         raise GraphError(
@@ -484,8 +486,8 @@ def zeros(
         )
     if port.type not in DTYPES:
         raise GraphError(f"recurrent input {name} is {port.type}: it has no zeros")
-    return np.zeros(there, DTYPES[port.type])
+    return np.zeros(sizes_known, DTYPES[port.type])
 
 
-def _line(error: Exception) -> str:
+def _on_one_line(error: Exception) -> str:
     return " ".join(str(error).split())

@@ -18,7 +18,7 @@ from me2e_compress.fidelity.compare import compare
 from me2e_compress.metrics.measure import Measure, too_few
 from me2e_compress.runtime.frames import Frame
 from me2e_compress.runtime.latency_trace import LatencyTrace, Load
-from me2e_compress.runtime.profile import describe_machine, processor, record_traces
+from me2e_compress.runtime.profile import in_turn_text, processor, record_traces
 from me2e_compress.runtime.session import Session
 from me2e_compress.study.cells import EXACT
 from me2e_compress.study.condition import Condition
@@ -120,7 +120,7 @@ def _measured(
     day: traces are kept as a set, of the same models, machine, samples and frames.
     """
     timing = study.timing
-    machine = describe_machine(timing.threads, study.provider)
+    machine = in_turn_text(timing.threads, study.provider)
     parts = machine, str(timing.samples), frames.fingerprint
     digests = (f"{each.variant.name} {each.sha256}" for each in timed)
     key = hashlib.sha256("\n".join((*parts, *digests)).encode()).hexdigest()

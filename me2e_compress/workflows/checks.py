@@ -47,7 +47,7 @@ from me2e_compress.runtime.atomic import write_bytes
 from me2e_compress.runtime.children import run_script
 from me2e_compress.runtime.frames import Frames
 from me2e_compress.runtime.providers import CPU, Provider
-from me2e_compress.runtime.runnable import compiled_or_expanded, is_fused, unsupported
+from me2e_compress.runtime.runnable import is_fused, replace_fused, why_unsupported
 from me2e_compress.shipped.drivers import SHIPPED, is_copy, map_name, shipped_model
 from me2e_compress.workflows import opening_main
 from me2e_compress.workflows.options import GraphOptions
@@ -360,9 +360,9 @@ def try_first(
     try:
         file = source if isinstance(source, Path) else file
         model = graph.load(source) if isinstance(source, Path) else source
-        if unsupported(model):
+        if why_unsupported(model):
             return
-        ready, needed = compiled_or_expanded(model, compiled=why_not() is None)
+        ready, needed = replace_fused(model, compiled=why_not() is None)
     except GraphError:
         return
     # A verdict holds for this graph, onnxruntime and these kernels.

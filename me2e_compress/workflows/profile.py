@@ -14,13 +14,13 @@ from me2e_compress.runtime.breakdown import break_down
 from me2e_compress.runtime.energy import EnergyResult
 from me2e_compress.runtime.energy.energy_counter import check_counter
 from me2e_compress.runtime.energy.meter import measure_energy
-from me2e_compress.runtime.imported_latency import read_import
+from me2e_compress.runtime.imported_latency import read_latencies
 from me2e_compress.runtime.latency_trace import (
     LatencyTrace,
     Microseconds,
     OthersLoad,
-    shares,
     shares_table,
+    time_shares,
 )
 from me2e_compress.runtime.profile import WARM_UP
 from me2e_compress.runtime.profile import profile as measure
@@ -108,8 +108,8 @@ class ProfileResult(Result):
         return {
             **self.trace.to_json(),
             "deadlines": self.deadlines,
-            "modules": shares(self.trace.modules_us),
-            "operators": shares(self.operators_us),
+            "modules": time_shares(self.trace.modules_us),
+            "operators": time_shares(self.operators_us),
             "energy": self.energy,
             "slow_here": self.slow_here,
             "known": self.known,
@@ -216,7 +216,7 @@ def import_profile(
     check_number("--budget-ms", budget_ms)
     source, written = model_path(model), None if output is None else Path(output)
     with writing([written], (source, file), force=force):
-        imported = read_import(Path(file))
+        imported = read_latencies(Path(file))
         # the trace belongs to the very file that was measured
         trace = LatencyTrace(
             graph.sha256_of(source), imported.machine, imported.samples_us

@@ -26,7 +26,7 @@ from me2e_compress.evaluators.highway.runner import EndingRules
 from me2e_compress.metrics.episode import Ending, InfractionKind
 from me2e_compress.registry import documents
 from me2e_compress.runtime.atomic import write_document
-from me2e_compress.runtime.children import pool
+from me2e_compress.runtime.children import process_pool
 from me2e_compress.simulator.camera_rig import CameraRig
 from me2e_compress.simulator.routes import (
     ROAD_VERSION,
@@ -241,7 +241,7 @@ def generate(
     if workers == 1:
         yield from map(of_type, scenarios)
         return
-    with pool(workers) as processes:
+    with process_pool(workers) as processes:
         yield from processes.map(of_type, scenarios)
 
 

@@ -9,11 +9,7 @@ from pathlib import Path
 import torch
 from torch.multiprocessing.spawn import ProcessException, spawn
 
-from me2e_compress.runtime.children import (
-    end_with_parent,
-    killed_on_error,
-    sheltered,
-)
+from me2e_compress.runtime.children import end_with_parent, kill_on_error, sheltered
 from models.driver.checkpoint import TrainingCheckpoint
 from models.driver.errors import TrainingError
 from models.driver.network.config import HighwayConfig
@@ -90,7 +86,7 @@ def _run(task: StageTask, on_step: Callable[[int, int], None]) -> None:
     what, folder = task.what, task.folder
     group = ProcessGroup.of(what.workers, task.config)
     try:
-        with killed_on_error():
+        with kill_on_error():
             with sheltered():
                 running = spawn(_process, (task, group), what.workers, join=False)
             while running is not None and not running.join(POLL_S):

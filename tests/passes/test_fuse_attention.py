@@ -74,7 +74,7 @@ def written(layout: str, scaled_by: str = "query", scale: float = C**-0.5) -> ir
 
 def widened(model: ir.Model) -> ir.Model:
     """Return a graph of standard operators, in float64."""
-    copy, _ = runnable.compiled_or_expanded(model.clone(), compiled=False)
+    copy, _ = runnable.replace_fused(model.clone(), compiled=False)
     kind = ir.TensorType(ir.DataType.DOUBLE)
     for value in copy.graph.initializers.values():
         assert value.const_value is not None

@@ -8,15 +8,15 @@ import pytest
 
 from me2e_compress.errors import ProviderError
 from me2e_compress.runtime.breakdown import (
-    BETWEEN,
-    NOWHERE,
+    NO_MODULE,
+    OUTSIDE,
     Breakdown,
     break_down,
     node_runs,
 )
 from me2e_compress.runtime.frames import Frame
-from me2e_compress.runtime.latency_trace import LatencyTrace, shares
-from me2e_compress.runtime.optimized import optimized, origins, with_unique_names
+from me2e_compress.runtime.latency_trace import LatencyTrace, time_shares
+from me2e_compress.runtime.optimized import optimize, origins, with_unique_names
 from me2e_compress.runtime.providers import CPU, CudaProvider, Provider
 from tests.support.nets import net
 
@@ -58,8 +58,8 @@ def test_every_node_that_runs_is_of_a_module_and_both_ways_add_up(
 ) -> None:
     found = measured(model)
 
-    assert set(found.modules_us) == {"backbone", "head", NOWHERE, BETWEEN}
-    assert list(found.modules_us)[-1] == BETWEEN
+    assert set(found.modules_us) == {"backbone", "head", NO_MODULE, OUTSIDE}
+    assert list(found.modules_us)[-1] == OUTSIDE
     assert any(name.endswith("Conv") for name in found.operators_us)
     by_module, by_operator = (
         [sum(taken) for taken in zip(*parts.values(), strict=True)]
@@ -67,11 +67,11 @@ def test_every_node_that_runs_is_of_a_module_and_both_ways_add_up(
     )
     assert by_module == by_operator
     assert len(by_module) == 5
-    assert sum(each.share for each in shares(found.modules_us)) == pytest.approx(1)
+    assert sum(each.share for each in time_shares(found.modules_us)) == pytest.approx(1)
 
 
 def test_fused_and_inserted_nodes_stand_for_those_of_the_file(model: ir.Model) -> None:
-    found = optimized(model)
+    found = optimize(model)
     stands_for = origins(model, found)
 
     told = [
@@ -116,7 +116,7 @@ def test_what_runs_inside_a_body_is_counted_once() -> None:
     ]
 
     found = [
-        (taken, [(node.name, node.operator, node.taken_us) for node in nodes])
+        (taken, [(node.name, node.operator, node.duration_us) for node in nodes])
         for taken, nodes in node_runs(lines)
     ]
 

@@ -20,10 +20,10 @@ from me2e_compress.passes.base import Context
 from me2e_compress.passes.import_normalize import ImportNormalize
 from me2e_compress.passes.quantize_int8 import QuantizeInt8
 from me2e_compress.runtime.int8_values import write_float_products
-from me2e_compress.runtime.optimized import optimized
+from me2e_compress.runtime.optimized import optimize
 from me2e_compress.runtime.profile import TimedSession
 from me2e_compress.runtime.providers import CPU
-from me2e_compress.runtime.runnable import int8_entry, runnable
+from me2e_compress.runtime.runnable import int8_entry, make_runnable
 from me2e_compress.runtime.session import Session
 from tests.manager.transformer import transformer
 from tests.passes.small import EVERYTHING, read
@@ -116,7 +116,7 @@ def test_a_session_runs_them_in_a_graph_that_it_reads() -> None:
     model.graph.outputs.append(model.graph[-1].outputs[0])
     model.graph.outputs[-1].type = ir.TensorType(ir.DataType.FLOAT)
 
-    found = [node.op_type for node in optimized(model).graph]
+    found = [node.op_type for node in optimize(model).graph]
 
     assert "MatMulIntegerToFloat" in found
     assert "QGemm" not in found
@@ -124,7 +124,7 @@ def test_a_session_runs_them_in_a_graph_that_it_reads() -> None:
     # unoptimized, a session is the reference, and runs the file as it is
     options = ort.SessionOptions()
     options.graph_optimization_level = ort.GraphOptimizationLevel.ORT_DISABLE_ALL
-    exact = runnable(model, options, CPU)
+    exact = make_runnable(model, options, CPU)
     assert "Gemm" in [node.op_type for node in exact.graph]
     np.testing.assert_allclose(
         ran(model, drawn()), ran(model, drawn(), optimize=False), rtol=1e-5, atol=1e-5

@@ -5,7 +5,7 @@ from typing import Any
 import pytest
 
 from me2e_compress.errors import EvaluationError
-from me2e_compress.runtime.imported_latency import read_import
+from me2e_compress.runtime.imported_latency import read_latencies
 from me2e_compress.runtime.latency_trace import LatencyTrace
 from me2e_compress.workflows.profile import import_profile
 from tests.evaluators.highway.drivers import straight_on
@@ -37,7 +37,7 @@ def files(tmp_path: Path) -> dict[str, Path]:
 def test_a_profile_of_trtexec_is_one_sample_and_its_layers(
     files: dict[str, Path],
 ) -> None:
-    found = read_import(files["layers"])
+    found = read_latencies(files["layers"])
 
     assert found.samples_us == (400,)
     assert found.layers_us == {"attn": (300,), "conv1": (100,)}
@@ -81,7 +81,7 @@ def test_a_broken_file_is_one_line(tmp_path: Path, content: Any, words: str) -> 
     path = write(tmp_path / "broken.json", content)
 
     with pytest.raises(EvaluationError, match=rf"broken\.json: .*({words})") as caught:
-        read_import(path)
+        read_latencies(path)
     assert "\n" not in str(caught.value)
 
 

@@ -9,7 +9,7 @@ from me2e_compress import graph
 from me2e_compress.errors import GraphError
 from me2e_compress.graph.files import external_tensors
 from me2e_compress.graph.rewrite import add_constant
-from me2e_compress.runtime.kernel_types import without_kernel
+from me2e_compress.runtime.kernel_types import nodes_without_kernel
 from me2e_compress.runtime.session import Session, open_graph
 from tests.passes import onnx_cases
 from tests.support.nets import net, parsed, stored
@@ -201,7 +201,7 @@ def test_nothing_that_opens_is_said_to_have_no_kernel() -> None:
     for case in onnx_cases.load():
         model = ir.from_proto(case.model)
         graph.infer_shapes(model)
-        said = [what for _, what in without_kernel(model)]
+        said = [what for _, what in nodes_without_kernel(model)]
         try:
             Session(model)
         except (GraphError, TypeError):

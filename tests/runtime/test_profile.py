@@ -8,11 +8,11 @@ from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.errors import EvaluationError, FramesError
 from me2e_compress.graph import sha256_of
 from me2e_compress.runtime.frames import Array, Frame
-from me2e_compress.runtime.latency_trace import LatencyTrace, shares
+from me2e_compress.runtime.latency_trace import LatencyTrace, time_shares
 from me2e_compress.runtime.profile import (
-    BLOCK,
+    BLOCK_RUNS,
     TimedSession,
-    machine_words,
+    machine_text,
     processor,
     profile,
     record_traces,
@@ -67,8 +67,8 @@ def test_nothing_to_measure_is_an_error(
 
 
 def test_one_thread_is_singular() -> None:
-    assert machine_words(1) == f"{processor()}, onnxruntime on 1 thread"
-    assert machine_words(0).endswith("on all threads")
+    assert machine_text(1) == f"{processor()}, onnxruntime on 1 thread"
+    assert machine_text(0).endswith("on all threads")
 
 
 @pytest.fixture
@@ -80,7 +80,7 @@ def models(tmp_path: Path) -> dict[str, Path]:
     return found
 
 
-@pytest.mark.parametrize("samples", [1, BLOCK, 2 * BLOCK + 3])
+@pytest.mark.parametrize("samples", [1, BLOCK_RUNS, 2 * BLOCK_RUNS + 3])
 def test_every_model_has_its_samples(
     models: dict[str, Path], tmp_path: Path, samples: int
 ) -> None:
@@ -136,7 +136,7 @@ def test_p99_needs_100_samples(count: int, p99: int | None) -> None:
     found = trace_of(count)
 
     assert found.to_json()["p99_us"] == p99
-    (module,) = shares(found.modules_us)
+    (module,) = time_shares(found.modules_us)
     assert module.p99_us == p99
 
 

@@ -9,7 +9,7 @@ from me2e_compress import graph
 from me2e_compress.errors import FramesError, GraphError
 from me2e_compress.graph.nodes import constant_values
 from me2e_compress.runtime.frames import Array, Frame
-from me2e_compress.runtime.runnable import endless, unsupported
+from me2e_compress.runtime.runnable import why_endless, why_unsupported
 from me2e_compress.runtime.session import Session, feed_forward, replay
 from me2e_compress.targets.weights import evaluate_constants
 from tests.support.nets import parsed
@@ -96,9 +96,9 @@ def test_state_of_open_shape_needs_a_first_value() -> None:
 def test_an_unknown_operator_is_named(counter: ir.Model) -> None:
     plugin = parsed(PLUGIN)
 
-    assert unsupported(counter) is None
+    assert why_unsupported(counter) is None
     assert (
-        unsupported(plugin)
+        why_unsupported(plugin)
         == "onnxruntime has no operator vendor::Rotate (node 'turn')"
     )
     with pytest.raises(GraphError, match="vendor::Rotate"):
@@ -192,7 +192,7 @@ def test_a_loop_without_end_is_not_run(model: ir.Model, tmp_path: Path) -> None:
     ids=["it may end", "few rounds", "it never begins"],
 )
 def test_a_loop_that_may_end_is_run(model: ir.Model) -> None:
-    assert endless(model) is None
+    assert why_endless(model) is None
 
 
 INNER = """b = Loop (most, first, a) <body = inner (
@@ -205,5 +205,5 @@ INNER = """b = Loop (most, first, a) <body = inner (
 
 def test_loops_in_loops_count_together() -> None:
     text = LOOP.format(most=1 << 13, on=SAME, rounds="most", first=1)
-    assert endless(parsed(text)) is None
-    assert endless(parsed(text.replace("b = Relu(a)", INNER)))
+    assert why_endless(parsed(text)) is None
+    assert why_endless(parsed(text.replace("b = Relu(a)", INNER)))

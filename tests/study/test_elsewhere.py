@@ -7,7 +7,7 @@ import pytest
 
 from me2e_compress.errors import EvaluationError, StudyError
 from me2e_compress.evaluators.highway.engine import LocalEngine
-from me2e_compress.runtime.profile import describe_machine
+from me2e_compress.runtime.profile import in_turn_text
 from me2e_compress.runtime.providers import CpuProvider
 from me2e_compress.study import Study, StudyResult, Timing, load_study, run_study
 from me2e_compress.study.report.page import write_study
@@ -137,7 +137,7 @@ def test_every_session_of_a_study_is_on_its_provider(
 
     assert set(opened) == {provided.provider.plugins}
     (trace,) = (folder / "traces").glob("slow*")
-    machine = describe_machine(1, provided.provider)
+    machine = in_turn_text(1, provided.provider)
     assert json.loads(trace.read_text())["machine"] == machine
     assert "operators.so" in machine
     assert "operators.so" in result.to_json()["provider"]

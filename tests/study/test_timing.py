@@ -11,7 +11,7 @@ from me2e_compress.errors import EvaluationError
 from me2e_compress.graph import sha256_of
 from me2e_compress.metrics.measure import Measure
 from me2e_compress.runtime.latency_trace import LatencyTrace
-from me2e_compress.runtime.profile import describe_machine
+from me2e_compress.runtime.profile import in_turn_text
 from me2e_compress.study import Condition, Listener, Study, Timing, Variant, outcome
 from me2e_compress.study.outcome import Clock, time_all
 from me2e_compress.study.prepared import prepare_variant
@@ -22,7 +22,7 @@ from tests.support.command import write_frames
 
 DEVICE = Condition("device", "trace")
 SAMPLES = (100, 110, 120, 130, 140)
-HERE = describe_machine(1)
+HERE = in_turn_text(1)
 
 
 def clock_of(study: Study, folder: Path, listener: Listener = SILENT) -> Clock:

@@ -26,7 +26,7 @@ from me2e_compress.graph.recurrence import (
     sides,
 )
 from me2e_compress.runtime.plan_adapter import PLAN, PlanAdapter
-from me2e_compress.runtime.session import DTYPES, Session, zeros
+from me2e_compress.runtime.session import DTYPES, Session, zero_state
 
 COMMAND = "command"
 """Name of the navigator's command among the inputs."""
@@ -264,7 +264,7 @@ def input_uses(
             entry = (adapter.recurrent or {}).get(name)
             if entry is None or entry.first == ZEROS:
                 try:
-                    zeros(name, port)
+                    zero_state(name, port)
                 except GraphError as error:
                     problems[name] = str(error)
     return tuple(

@@ -27,8 +27,6 @@ from me2e_compress.runtime.energy.energy_result import (
     summarise,
 )
 
-# The schedule of an energy measurement: warm-up, idle, and alternating windows.
-
 
 @dataclass(frozen=True)
 class EnergySchedule:
@@ -72,15 +70,12 @@ class EnergySchedule:
 
     def turns(self, models: Sequence[str]) -> list[str]:
         """Return the models in order of their windows: A B B A spreads drift evenly."""
-        there, back = list(models), list(reversed(models))
+        forth, back = list(models), list(reversed(models))
         return [
             name
             for turn in range(self.windows)
-            for name in (back if turn % 2 else there)
+            for name in (back if turn % 2 else forth)
         ]
-
-
-# A recording of energy over time with the frames done, and windows cut from it.
 
 
 Floats = npt.NDArray[np.float64]
@@ -102,13 +97,16 @@ class EnergyRecording:
     counter: str
 
     def measured(self, schedule: EnergySchedule) -> EnergyResult:
-        """Return the energy of the model; EnergyError if the recording is too short."""
+        """Return the energy of the model; raises as :meth:`cut_windows` does."""
         step_s = float(np.median(np.diff(self.times_s)))
         by = (self.counter, self.device, self.scope, step_s)
-        return summarise(self.windows(schedule), by, self.idle_w(schedule))
+        return summarise(self.cut_windows(schedule), by, self.idle_w(schedule))
 
-    def windows(self, schedule: EnergySchedule) -> list[Window]:
-        """Cut consecutive windows from the work after the warm-up."""
+    def cut_windows(self, schedule: EnergySchedule) -> list[Window]:
+        """Cut windows in a row after the warm-up, and drop the rest of the work.
+
+        An EnergyError says that there are too few, or that the counter is stuck.
+        """
         # Find the stretch in which frames are done, and skip the warm-up.
         working = np.flatnonzero(np.diff(self.frames) > 0)
         if not len(working):
@@ -119,9 +117,9 @@ class EnergyRecording:
         # Cut windows, long enough and of enough frames, until the rest is too short.
         windows = list[Window]()
         while at < last:
-            long = int(np.searchsorted(times, times[at] + schedule.window_s))
-            many = self.frames[at] + schedule.window_frames
-            end = max(long, int(np.searchsorted(self.frames, many)))
+            end_by_time = int(np.searchsorted(times, times[at] + schedule.window_s))
+            frames_at_end = self.frames[at] + schedule.window_frames
+            end = max(end_by_time, int(np.searchsorted(self.frames, frames_at_end)))
             if end > last:
                 break
             windows.append(self._window(at, end))
@@ -229,8 +227,8 @@ def check_counter(text: str) -> None:
         counter.close()
 
 
-def integrated(times_s: Floats, watts: Floats) -> Floats:
-    """Return the joules since the first time, at each time, by the trapezoidal rule."""
+def integrate_power(times_s: Floats, watts: Floats) -> Floats:
+    """Return the joules [n] since the first of the times [n], by trapezoids."""
     steps = np.diff(times_s) * (watts[1:] + watts[:-1]) / 2
     return np.concatenate([[0.0], np.cumsum(steps)])
 
@@ -266,7 +264,7 @@ class Recorded(EnergyCounter):
 
 
 def _read(path: Path) -> Mapping[str, Sequence[str]]:
-    """Return the columns; every row must have as many values as the header."""
+    """Return a CSV file's columns by name; a ValueError of rows of other lengths."""
     content = documents.content(path)
     rows = csv.reader(io.StringIO(content.decode("utf-8-sig")))
     header = [name.strip() for name in next(rows, [])]
@@ -281,14 +279,15 @@ def _read(path: Path) -> Mapping[str, Sequence[str]]:
 
 
 def _recording(columns: Mapping[str, Sequence[str]], name: str) -> EnergyRecording:
-    times, frames = _numbers(columns, "time_s"), _numbers(columns, "frames")
+    """Build a recording; a ValueError names the first row that does not fit."""
+    times, frames = _column(columns, "time_s"), _column(columns, "frames")
     if np.any(np.diff(times) <= 0):
         raise ValueError(f"time_s does not ascend at row {_row(np.diff(times) <= 0)}")
     if np.any(np.diff(frames) < 0):
         raise ValueError(f"frames go back at row {_row(np.diff(frames) < 0)}")
     # Check the columns against each other.
     counts = "joules" in columns
-    values = _numbers(columns, "joules" if counts else "watts")
+    values = _column(columns, "joules" if counts else "watts")
     if len({len(times), len(frames), len(values)}) > 1 or len(times) < 2:
         raise ValueError("the columns are not of one length of 2 rows or more")
     if counts and np.any(np.diff(values) < 0):
@@ -296,12 +295,12 @@ def _recording(columns: Mapping[str, Sequence[str]], name: str) -> EnergyRecordi
     if not counts and np.any(values < 0):
         raise ValueError(f"watts are negative at row {_row(values < 0)}")
     # Power is integrated to joules.
-    joules = values if counts else integrated(times, values)
+    joules = values if counts else integrate_power(times, values)
     counter = "recorded" if counts else "recorded-power-integrated"
     return EnergyRecording(times, joules, frames, name, "as recorded", counter)
 
 
-def _numbers(columns: Mapping[str, Sequence[str]], name: str) -> Floats:
+def _column(columns: Mapping[str, Sequence[str]], name: str) -> Floats:
     if name not in columns:
         there = ", ".join(columns) or "none"
         raise ValueError(f"no column {name}; there are {there}, wanted: {_COLUMNS}")

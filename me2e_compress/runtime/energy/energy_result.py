@@ -15,8 +15,6 @@ from me2e_compress.errors import EnergyError
 from me2e_compress.registry import documents, drafts
 from me2e_compress.runtime.atomic import write_document
 
-# The interface of an open energy counter, or the reason why there is none.
-
 
 class Reader(abc.ABC):
     """An open counter that counts energy, or else reads power.
@@ -67,14 +65,11 @@ class Absent:
     reason: str
 
 
-# Estimate joules per frame, with a confidence interval, from windows of a counter.
-
-
 FEWEST_WINDOWS = 5
-ENOUGH_FOR_A_BEND = 8
-"""Windows from which the drift is fitted by a parabola: warming up slows down."""
-UNSURE = 2e-4
-"""Share by which the time between two updates of a counter may be off."""
+PARABOLA_WINDOWS = 8
+"""Fewest windows to fit the drift by a parabola: warming up slows down."""
+STEP_TOLERANCE = 2e-4
+"""Relative error that the time between two updates of a counter may have."""
 
 
 @dataclass(frozen=True)
@@ -117,20 +112,21 @@ def estimate(windows: Sequence[Window], step_s: float) -> tuple[float, float, fl
     frames = np.array([each.frames for each in windows], float)
     taken = np.array([each.taken_s for each in windows])
     watts = np.array([each.watts for each in windows])
-    spent = watts * taken / frames
+    per_frame = watts * taken / frames
     # Take the drift over time out of the spread.
     middle = np.array([(each.begin_s + each.end_s) / 2 for each in windows])
-    bends = 2 if len(windows) >= ENOUGH_FOR_A_BEND else 1
-    free = len(windows) - 1 - bends
-    left = spent - np.polynomial.Polynomial.fit(middle, spent, bends)(middle)
+    degree = 2 if len(windows) >= PARABOLA_WINDOWS else 1
+    freedom = len(windows) - 1 - degree
+    drift = np.polynomial.Polynomial.fit(middle, per_frame, degree)
+    residuals = per_frame - drift(middle)
     # The spread is at least what the counter's step allows.
     from_whole = np.abs(taken - step_s * np.round(taken / step_s))
-    beyond = np.minimum(from_whole + UNSURE * taken, step_s / 2)
-    ends = watts / frames * np.sqrt(beyond * (step_s - beyond))
-    variance = max(float(left @ left) / free, float(np.mean(ends**2)))
-    quantile = float(stdtrit(free, 0.975))  # both sides 95 %
+    past_step = np.minimum(from_whole + STEP_TOLERANCE * taken, step_s / 2)
+    ends = watts / frames * np.sqrt(past_step * (step_s - past_step))
+    variance = max(float(residuals @ residuals) / freedom, float(np.mean(ends**2)))
+    quantile = float(stdtrit(freedom, 0.975))  # both sides 95 %
     half = quantile * math.sqrt(variance / len(windows))
-    mean = float(spent.mean())
+    mean = float(per_frame.mean())
     return mean, max(0.0, mean - half), mean + half
 
 
@@ -235,13 +231,13 @@ class EnergyResult:
         return (table(title, columns, rows, "\n".join(notes)),)
 
     def save(self, path: Path) -> None:
-        """Write the result atomically."""
+        """Write the result atomically; an EnergyError if it cannot be written."""
         with drafts.written(path, EnergyError):
             write_document(path, asdict(self), indent=2)
 
     @classmethod
     def load(cls, path: Path) -> Self:
-        """Read what :meth:`save` wrote; unknown keys are ignored."""
+        """Read what :meth:`save` wrote, without unknown keys; else an EnergyError."""
         with documents.reading(path, EnergyError, "not an energy file"):
             record = documents.from_json(documents.content(path))
             return TypeAdapter(cls).validate_python(record)

@@ -18,7 +18,7 @@ from me2e_compress.graph import sha256_of
 from me2e_compress.runtime.energy.energy_counter import (
     EnergyRecording,
     EnergySchedule,
-    integrated,
+    integrate_power,
     open_counter,
 )
 from me2e_compress.runtime.energy.energy_result import (
@@ -31,9 +31,6 @@ from me2e_compress.runtime.energy.energy_result import (
 from me2e_compress.runtime.frames import Frame, Frames
 from me2e_compress.runtime.providers import CPU, Provider
 from me2e_compress.runtime.session import Session, replay
-
-# Sample the power in the background and integrate it.
-
 
 SAMPLED_S = 0.02
 """Seconds between samples of the power: five within a usual step of 0.1 s."""
@@ -53,7 +50,7 @@ class PowerSamples:
         self._taken.append((self._clock(), self._reader.watts()))
 
     def joules(self, begin_s: float, end_s: float) -> float:
-        """Return the energy between two times; too few samples are an error."""
+        """Return the energy between two times; an EnergyError of too few samples."""
         times, watts = np.array(self._taken or [(0.0, 0.0)]).T
         count = sum(begin_s <= each <= end_s for each, _ in self._taken)
         if count < FEWEST_SAMPLES:
@@ -62,26 +59,26 @@ class PowerSamples:
                 f" {count} times in {end_s - begin_s:.1f} s, at least {FEWEST_SAMPLES}"
                 " are needed"
             )
-        so_far = integrated(times, watts)
+        so_far = integrate_power(times, watts)
         return float(
             np.interp(end_s, times, so_far) - np.interp(begin_s, times, so_far)
         )
 
 
 @contextlib.contextmanager
-def in_background(period_s: float, call: Callable[[], None]) -> Iterator[None]:
+def call_repeatedly(period_s: float, call: Callable[[], None]) -> Iterator[None]:
     """Call a function periodically in a thread while the context is open.
 
     An EnergyError of the call is raised when the context is left.
     """
-    done, failed = Event(), list[EnergyError]()
+    stop, errors = Event(), list[EnergyError]()
 
     def repeat() -> None:
-        while not done.wait(period_s) and not failed:
+        while not stop.wait(period_s) and not errors:
             try:
                 call()
             except EnergyError as error:
-                failed.append(error)
+                errors.append(error)
 
     # A daemon thread does not keep a failed process alive.
     thread = Thread(target=repeat, daemon=True)
@@ -89,16 +86,16 @@ def in_background(period_s: float, call: Callable[[], None]) -> Iterator[None]:
     try:
         yield
     finally:
-        done.set()
+        stop.set()
         thread.join()
     # An error in the thread is raised here.
-    if failed:
-        raise failed[0]
+    if errors:
+        raise errors[0]
 
 
 Work = Callable[[], object]
 """Runs one frame of a model and returns when it is done, on the device too."""
-Every = Callable[[float, Callable[[], None]], AbstractContextManager[None]]
+Repeater = Callable[[float, Callable[[], None]], AbstractContextManager[None]]
 """Calls a function every so many seconds while the context is open."""
 
 
@@ -119,7 +116,7 @@ class EnergyMeter:
         *,
         clock: Callable[[], float] = time.perf_counter,
         sleep: Callable[[float], None] = time.sleep,
-        every: Every = in_background,
+        every: Repeater = call_repeatedly,
         on_window: Callable[[int, int, str], None] = lambda done, total, name: None,
     ) -> None:
         self._reader, self._schedule = reader, schedule or EnergySchedule()
@@ -147,7 +144,8 @@ class EnergyMeter:
             for done, name in enumerate(turns):
                 self._on_window(done, len(turns), name)
                 frames = schedule.frames(frame_s[name])
-                windows[name].append(self._work(work[name], frames, slowed[name]))
+                window = self._run_window(work[name], frames, slowed[name])
+                windows[name].append(window)
             self._on_window(len(turns), len(turns), turns[-1])
             self._sleep(schedule.lead_in_s)
             idle.append(self._window(0, rest))
@@ -202,14 +200,15 @@ class EnergyMeter:
         return {name: median(each) for name, each in taken.items()}
 
     def _lead_in(self, run: Work) -> list[float]:
+        """Run frames for `lead_in_s`; return the seconds of each."""
         times = [self._clock()]
         while times[-1] - times[0] < self._schedule.lead_in_s:
             run()
             times.append(self._clock())
         return [after - before for before, after in pairwise(times)]
 
-    def _work(self, run: Work, frames: int, slowed: list[str]) -> Window:
-        """Run one window at a random phase of the counter; add what slowed it."""
+    def _run_window(self, run: Work, frames: int, slowed: list[str]) -> Window:
+        """Run a window at a random phase of the counter; add to ``slowed`` why."""
         # The lead-in follows the wait: caches must hold this model.
         self._sleep(float(self._random.uniform(0, self._reader.step_s)))
         slowed += self._reader.throttled()
@@ -222,9 +221,6 @@ class EnergyMeter:
         window = self._window(frames, work)
         slowed += self._reader.throttled()
         return window
-
-
-# Measure the energy of ONNX files on this machine, in turn.
 
 
 MOST_BYTES = 500_000_000
@@ -268,7 +264,7 @@ def measure_energy(
         results = dict.fromkeys(models, opened.measured(schedule or EnergySchedule()))
     else:
         with contextlib.closing(opened):
-            work = _work_of(models, frames, threads, provider, metadata)
+            work = _open_models(models, frames, threads, provider, metadata)
             meter = EnergyMeter(opened, schedule, on_window=on_window)
             results = meter.measure(work)
     # Each result carries the digest of its model's files.
@@ -278,7 +274,7 @@ def measure_energy(
     }
 
 
-def _work_of(
+def _open_models(
     models: Mapping[str, Path],
     frames: Frames,
     threads: int,
@@ -286,13 +282,13 @@ def _work_of(
     metadata: Mapping[str, str] | None,
 ) -> dict[str, Work]:
     """Open each model, to replay endlessly the first frames that fit into memory."""
-    kept, size = list[Frame](), 0
+    in_memory, size = list[Frame](), 0
     for frame in frames:
         size += sum(array.nbytes for array in frame.arrays.values())
-        if kept and size > MOST_BYTES:
+        if in_memory and size > MOST_BYTES:
             break
-        kept.append(frame)
-    if not kept:
+        in_memory.append(frame)
+    if not in_memory:
         raise EnergyError("energy: there is no frame to run")
     sessions = {
         name: Session(
@@ -305,6 +301,6 @@ def _work_of(
         for name, path in models.items()
     }
     return {
-        name: replay(session, chain.from_iterable(repeat(kept))).__next__
+        name: replay(session, chain.from_iterable(repeat(in_memory))).__next__
         for name, session in sessions.items()
     }

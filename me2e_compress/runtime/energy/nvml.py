@@ -12,7 +12,7 @@ from me2e_compress.runtime.energy.energy_result import Absent, Reader
 
 T = TypeVar("T")
 
-_SLOWED = {
+_REASONS = {
     "nvmlClocksEventReasonSwPowerCap": "power cap",
     "nvmlClocksEventReasonHwSlowdown": "hardware slowdown",
     "nvmlClocksEventReasonHwThermalSlowdown": "hardware thermal slowdown",
@@ -56,11 +56,11 @@ class Nvml(EnergyCounter):
             handle = pynvml.nvmlDeviceGetHandleByIndex(self.index)
         except pynvml.NVMLError as error:
             return Absent(f"GPU {self.index}: {error}")
-        energy = _answer(pynvml.nvmlDeviceGetTotalEnergyConsumption, handle)
-        power = _answer(_instant_power, handle)
+        energy = _query(pynvml.nvmlDeviceGetTotalEnergyConsumption, handle)
+        power = _query(_instant_power, handle)
         if isinstance(energy, str) and isinstance(power, str):
             return Absent(
-                f"{_name(handle)} tells no energy: total energy: {energy};"
+                f"{_device_name(handle)} tells no energy: total energy: {energy};"
                 f" instant power: {power}"
             )
         return NvmlReader(handle, not isinstance(energy, str))
@@ -74,7 +74,7 @@ class NvmlReader(Reader):
     def __init__(self, handle: Any, counts: bool) -> None:
         self._handle, self.counts = handle, counts
         self.counter = "nvml-total" if counts else "nvml-power-integrated"
-        self.device = _name(handle)
+        self.device = _device_name(handle)
 
     def joules(self) -> float:
         """Return the joules since the driver was loaded."""
@@ -86,11 +86,11 @@ class NvmlReader(Reader):
 
     def throttled(self) -> tuple[str, ...]:
         """Return why the GPU runs slower, of a bit mask; empty if it does not say."""
-        mask = _answer(pynvml.nvmlDeviceGetCurrentClocksEventReasons, self._handle)
+        mask = _query(pynvml.nvmlDeviceGetCurrentClocksEventReasons, self._handle)
         if isinstance(mask, str):
             return ()
         return tuple(
-            words for bit, words in _SLOWED.items() if mask & getattr(pynvml, bit)
+            words for bit, words in _REASONS.items() if mask & getattr(pynvml, bit)
         )
 
     def close(self) -> None:
@@ -98,13 +98,13 @@ class NvmlReader(Reader):
         pynvml.nvmlShutdown()
 
     def _ask(self, question: Callable[[Any], int]) -> int:
-        answer = _answer(question, self._handle)
+        answer = _query(question, self._handle)
         if isinstance(answer, str):
             raise EnergyError(f"{self.counter} of {self.device}: {answer}")
         return answer
 
 
-def _answer(question: Callable[..., T], *arguments: Any) -> T | str:
+def _query(question: Callable[..., T], *arguments: Any) -> T | str:
     """Return NVML's answer, or its error as text."""
     try:
         return question(*arguments)
@@ -122,6 +122,6 @@ def _instant_power(handle: Any) -> int:
     return int(field.value.uiVal)
 
 
-def _name(handle: Any) -> str:
-    name = _answer(pynvml.nvmlDeviceGetName, handle)
+def _device_name(handle: Any) -> str:
+    name = _query(pynvml.nvmlDeviceGetName, handle)
     return name.decode() if isinstance(name, bytes) else str(name)

@@ -12,7 +12,7 @@ from me2e_compress.errors import GraphError
 from me2e_compress.operators import int8_inputs, int8_op_types
 from me2e_compress.quantization.costs import Costs
 from me2e_compress.quantization.decision import Decision, KeptFloat, QuantPlan
-from me2e_compress.runtime.optimized import optimized, origins, with_unique_names
+from me2e_compress.runtime.optimized import optimize, origins, with_unique_names
 from me2e_compress.runtime.providers import CPU, Provider
 from me2e_compress.targets import LintFinding, LintRule, Target, error, warning
 from me2e_compress.targets.onnxruntime.convert import (
@@ -104,7 +104,7 @@ class OnnxRuntime(Target):
         """
         source = with_unique_names(model)
         try:
-            running = optimized(source, provider)
+            running = optimize(source, provider)
         except GraphError as refusal:
             return (error("refused", None, str(refusal)),)
         known = origins(source, running)

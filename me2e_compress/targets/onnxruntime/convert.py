@@ -23,7 +23,7 @@ from me2e_compress.graph import (
     rewrite,
 )
 from me2e_compress.graph.nodes import LAYOUT_OPERATORS, maker
-from me2e_compress.runtime.int8_values import stored_bias
+from me2e_compress.runtime.int8_values import bias_numbers
 from me2e_compress.runtime.providers import CPU, Provider
 from me2e_compress.targets.onnxruntime.lint_rules import PASSED
 from me2e_compress.targets.onnxruntime.lower import Draft, lower, symmetric
@@ -126,7 +126,7 @@ def _draft_of_qdq(model: ir.Model) -> Draft:
         if node.op_type in LAYERS and producer_of(node.inputs[0]) in pairs
     ]
     for node in layers:
-        bias = stored_bias(producer_of(graph.bias_of(node)))
+        bias = bias_numbers(producer_of(graph.bias_of(node)))
         if bias is not None:
             name = f"{node.inputs[2].name}_stored" if node.inputs[2] else ""
             node.replace_input_with(2, rewrite.add_constant(copy.graph, bias, name))

@@ -33,7 +33,7 @@ from me2e_compress.graph.runtime_operators import has_operator, newest_ir, reads
 from me2e_compress.graph.shapes import open_shape
 from me2e_compress.graph.validity import ORIGINAL_DOMAIN
 from me2e_compress.operators import find
-from me2e_compress.runtime.kernel_types import remedy, without_kernel
+from me2e_compress.runtime.kernel_types import float32_hint, nodes_without_kernel
 from me2e_compress.runtime.runnable import known_operators
 from me2e_compress.targets import (
     LintFinding,
@@ -373,8 +373,8 @@ def operators(model: ir.Model) -> Iterator[LintFinding]:
 
 def kernels(model: ir.Model) -> Iterator[LintFinding]:
     """Find operators that have a kernel, but none for these element types."""
-    for node, missing in without_kernel(model):
-        yield error("kernel", node, f"{missing}{remedy(model, missing)}")
+    for node, missing in nodes_without_kernel(model):
+        yield error("kernel", node, f"{missing}{float32_hint(model, missing)}")
 
 
 def fuses_pads_wrongly() -> bool:

@@ -16,7 +16,7 @@ from me2e_compress.evaluators.highway.runner import drive
 from me2e_compress.graph import sha256_of
 from me2e_compress.metrics.episode import Ending
 from me2e_compress.runtime.atomic import write_bytes
-from me2e_compress.runtime.children import pool
+from me2e_compress.runtime.children import process_pool
 from me2e_compress.simulator.camera_rig import CameraRig
 from models.driver.episodes.collection import (
     FORMAT,
@@ -110,7 +110,7 @@ def _driven(
             yield
         return
     try:
-        with pool(workers) as processes:
+        with process_pool(workers) as processes:
             jobs = [
                 processes.submit(_collect_one, folder, what, student, task)
                 for task in tasks

@@ -56,7 +56,7 @@ def test_every_dialect_answers_its_reference(
     model = graph_of(
         dialect, arrays, opset=17, constants=known, open_dims=open_dims and not known
     )
-    _, needed = runnable.compiled_or_expanded(model, compiled=True)
+    _, needed = runnable.replace_fused(model, compiled=True)
     assert needed
 
     found = Session(model, threads=1).run(arrays)["result"]
@@ -80,7 +80,7 @@ def test_aggregation_over_cameras_takes_the_same_kernel() -> None:
     arrays = in_float32(inputs)
     operator = DeformableAggregation()
     model = graph_of(operator.dialects[0], arrays, opset=17)
-    _, needed = runnable.compiled_or_expanded(model, compiled=True)
+    _, needed = runnable.replace_fused(model, compiled=True)
     assert [each.op_type for each in needed] == ["MultiScaleDeformableAttention"]
 
     found = Session(model, threads=1).run(arrays)["result"]
@@ -137,7 +137,7 @@ def test_levels_share_offsets_and_a_camera_without_weight_is_not_read(
     expected = dialect_reference(OPERATOR, RAW, DrawnCall(arrays))
     arrays["value"][:, 12:24] = np.nan
     model = graph_of(RAW, arrays, opset=17)
-    _, needed = runnable.compiled_or_expanded(model, compiled=True)
+    _, needed = runnable.replace_fused(model, compiled=True)
     assert [each.op_type for each in needed] == ["RawDeformableAttention"]
 
     one, two = (Session(model, threads=n).run(arrays)["result"] for n in (1, 2))
@@ -162,7 +162,7 @@ def test_int8_values_with_raw_offsets_and_scores() -> None:
     arrays = raw_call()
     stored = np.random.default_rng(2).integers(0, 256, (1, 36, 23, 8)).astype(np.uint8)
     model = ir.from_onnx_text(STORED_RAW)
-    _, needed = runnable.compiled_or_expanded(model, compiled=True)
+    _, needed = runnable.replace_fused(model, compiled=True)
     assert [each.op_type for each in needed] == ["RawDeformableAttentionUint8"]
 
     names = [str(port.name) for port in model.graph.inputs]
@@ -211,7 +211,7 @@ def test_int8_values_are_read_as_they_are(kind: str, made: str) -> None:
         "by_channel": random.uniform(0.01, 0.03, 24),
     }
     feeds = in_float32(feeds)
-    ready, needed = runnable.compiled_or_expanded(model, compiled=True)
+    ready, needed = runnable.replace_fused(model, compiled=True)
     assert [each.op_type for each in needed] == [
         f"MultiScaleDeformableAttention{kind.capitalize()}"
     ]
@@ -231,6 +231,6 @@ def test_scales_that_the_kernel_does_not_know_stay_in_float() -> None:
     text = STORED.replace("TYPE", "int8").replace("ZERO", "0").replace("MADE", made)
     text = text.replace("float[24] by_channel", "float[8] by_head")
 
-    _, needed = runnable.compiled_or_expanded(ir.from_onnx_text(text), compiled=True)
+    _, needed = runnable.replace_fused(ir.from_onnx_text(text), compiled=True)
 
     assert [each.op_type for each in needed] == ["MultiScaleDeformableAttention"]

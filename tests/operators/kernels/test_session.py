@@ -22,7 +22,7 @@ from me2e_compress.operators.kernels.kernel import CompiledKernel
 from me2e_compress.operators.kernels.machine_code import load_or_compile
 from me2e_compress.runtime.frames import Frame
 from me2e_compress.runtime.providers import CpuProvider
-from me2e_compress.runtime.runnable import compiled_or_expanded
+from me2e_compress.runtime.runnable import replace_fused
 from me2e_compress.runtime.session import Session, open_graph
 from me2e_compress.workflows.checks import try_first
 from me2e_compress.workflows.listing import doctor
@@ -185,7 +185,7 @@ def test_what_a_library_of_the_user_names_is_left_to_it(tmp_path: Path) -> None:
     library.write_bytes(b"\x7fELF..." + model.graph[0].op_type.encode() + b"\0")
     theirs = CpuProvider(plugins=(library,)).claims
 
-    left, needed = compiled_or_expanded(model, compiled=True, theirs=theirs)
+    left, needed = replace_fused(model, compiled=True, in_library=theirs)
 
     assert left is model
     assert not needed

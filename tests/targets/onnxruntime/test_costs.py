@@ -12,7 +12,7 @@ from me2e_compress.quantization.decision import QuantPlan
 from me2e_compress.quantization.plan import make_plan
 from me2e_compress.quantization.rules import RULE_SETS
 from me2e_compress.quantization.scheme import QuantScheme
-from me2e_compress.runtime.optimized import optimized
+from me2e_compress.runtime.optimized import optimize
 from me2e_compress.targets.onnxruntime import OnnxRuntime
 from me2e_compress.targets.onnxruntime.costs import work_of
 from tests.support.nets import FULL, MODULES, drawn, net
@@ -225,7 +225,7 @@ def quantized(model: ir.Model) -> ir.Model:
 @pytest.mark.parametrize("make", [attention, aggregation])
 def test_the_kernel_for_uint8_samples_it(make: Callable[[], ir.Model]) -> None:
     model = make()
-    found = Counter(node.op_type for node in optimized(quantized(model)).graph)
+    found = Counter(node.op_type for node in optimize(quantized(model)).graph)
 
     assert found["MultiScaleDeformableAttentionUint8"] == 1
     assert found["QGemm"] == 0  # it is slower at writing uint8
@@ -234,7 +234,7 @@ def test_the_kernel_for_uint8_samples_it(make: Callable[[], ir.Model]) -> None:
 
 @compiled
 def test_maps_of_convolutions_are_joined_and_sampled_without_becoming_float() -> None:
-    found = Counter(node.op_type for node in optimized(quantized(aggregation())).graph)
+    found = Counter(node.op_type for node in optimize(quantized(aggregation())).graph)
 
     assert found["QLinearConcat"] == 1
     assert found["QuantizeLinear"] == 1  # of the image

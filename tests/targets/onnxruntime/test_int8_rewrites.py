@@ -7,7 +7,7 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from me2e_compress.graph import array_of
-from me2e_compress.runtime.optimized import optimized
+from me2e_compress.runtime.optimized import optimize
 from me2e_compress.runtime.session import Session
 from me2e_compress.targets.onnxruntime import OnnxRuntime, int8_layers, int8_rewrites
 from tests.support.nets import net, placed
@@ -164,7 +164,7 @@ def test_a_layer_that_stays_float_keeps_its_weight(bias: str) -> None:
     assert [each.op_type for each in int8_layers(small)] == ["Conv", "Conv"]
     assert not list(int8_rewrites(small))
     assert "Sum" in [node.op_type for node in small.graph]
-    (up,) = (n for n in optimized(small).graph if n.op_type == "ConvTranspose")
+    (up,) = (n for n in optimize(small).graph if n.op_type == "ConvTranspose")
     assert up.inputs[1] is not None
     assert array_of(up.inputs[1]) is not None  # not behind a DequantizeLinear
 

@@ -8,7 +8,7 @@ from me2e_compress.calibration.ranges import Ranges
 from me2e_compress.errors import FramesError
 from me2e_compress.graph import provenance
 from me2e_compress.quantization.plan import make_plan
-from me2e_compress.runtime.optimized import optimized
+from me2e_compress.runtime.optimized import optimize
 from me2e_compress.targets.onnxruntime import OnnxRuntime, int8_layers
 from tests.support.nets import FULL, PAPER, conv_attention, drawn, placed
 from tests.targets.onnxruntime.lowered import (
@@ -300,6 +300,6 @@ def test_a_pool_of_floats_stays_in_front_of_its_quantization(read: str) -> None:
     """
     small = calibrated(drawn(text, {"w": (8, 4, 1, 1)}), feeds(2, x=(1, 4, 8, 8)))
 
-    (pool,) = (n for n in optimized(small).graph if n.op_type.endswith("MaxPool"))
+    (pool,) = (n for n in optimize(small).graph if n.op_type.endswith("MaxPool"))
     assert pool.inputs[0] is not None
     assert pool.inputs[0].name == "x"
