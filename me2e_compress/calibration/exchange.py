@@ -50,7 +50,7 @@ def read_cache(path: Path) -> Ranges:
     return Ranges(bounds, IMPORTED, 0, "", "")
 
 
-def taken_from(
+def pick_ranges(
     cache: Ranges, path: Path, model: ir.Model, tensors: Sequence[str]
 ) -> Ranges:
     """Take those of ``tensors`` that a cache has, by their names in ``model``.

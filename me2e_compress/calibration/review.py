@@ -76,7 +76,7 @@ def review(ranges: Ranges) -> tuple[RangeFinding, ...]:
     return tuple(sorted(findings, key=lambda each: each.severity, reverse=True))
 
 
-def not_in(cache: Path, missing: Sequence[str]) -> tuple[RangeFinding, ...]:
+def missing_ranges(cache: Path, missing: Sequence[str]) -> tuple[RangeFinding, ...]:
     """Name the tensors that an imported cache lacks."""
     if not missing:
         return ()

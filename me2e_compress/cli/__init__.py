@@ -5,14 +5,14 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
-from me2e_compress.cli.signals import INTERRUPTED, TERMINATED, signals_in_order
+from me2e_compress.cli.signals import INTERRUPTED, TERMINATED, handle_signals
 from me2e_compress.display import escape_controls
 from me2e_compress.errors import Me2eError, OptionError, cites_old_name
 
-AGAIN = "run again to go on"
+RUN_AGAIN = "run again to go on"
 RESUMES = {
-    **dict.fromkeys(("calibrate", "evaluate", "sensitivity", "study"), AGAIN),
-    "frames": f"{AGAIN} after the last whole scene, if there is one",
+    **dict.fromkeys(("calibrate", "evaluate", "sensitivity", "study"), RUN_AGAIN),
+    "frames": f"{RUN_AGAIN} after the last whole scene, if there is one",
 }
 """What to do to resume a command that was interrupted."""
 
@@ -20,25 +20,25 @@ RESUMES = {
 def main() -> int:
     """Run the command and return its exit code."""
     words = [word for word in sys.argv[1:] if not word.startswith("-")]
-    again = [RESUMES[word] for word in words[:1] if word in RESUMES]
-    return run_in_order(_commands, *again)
+    hints = [RESUMES[word] for word in words[:1] if word in RESUMES]
+    return run_command(_commands, *hints)
 
 
-def run_in_order(run: Callable[[], None], again: str = "") -> int:
+def run_command(run: Callable[[], None], resume_hint: str = "") -> int:
     """Run a command line; our own errors are one line and code 1, signals other codes.
 
-    `run` reads ``sys.argv``, and returns or raises ``SystemExit``; `again` says how to
-    go on after an interruption.
+    `run` reads ``sys.argv``, and returns or raises ``SystemExit``; the `resume_hint` is
+    printed after an interruption.
     """
     try:
-        with signals_in_order():
+        with handle_signals():
             code = _run(run)
     except SystemExit as done:
         code = done.code if isinstance(done.code, int) else int(bool(done.code))
     except KeyboardInterrupt:
         code = INTERRUPTED
     if code in (INTERRUPTED, TERMINATED):
-        message = "; ".join(filter(None, ["interrupted", again]))
+        message = "; ".join(filter(None, ["interrupted", resume_hint]))
         sys.stderr.write(f"me2e-compress: {message}\n")
     return code
 
@@ -51,6 +51,7 @@ def _commands() -> None:
 
 
 def _run(run: Callable[[], None]) -> int:
+    """Run a command; print an error of the user's on one line; return the exit code."""
     from cyclopts import CycloptsError
 
     from me2e_compress.cli.console import errors
@@ -67,14 +68,14 @@ def _run(run: Callable[[], None]) -> int:
                 raise Me2eError(f"{word!a} is not UTF-8: rename the file")
         run()
     except (CycloptsError, Me2eError, OSError, ImportError) as error:
-        shown = with_install_hint(error)
-        if isinstance(shown, ImportError):
+        hint = with_install_hint(error)
+        if isinstance(hint, ImportError):
             raise  # of no optional package: a defect of ours, which needs its traceback
         # an error of the user's is one line, without a traceback; that of the system
         # is preceded by its file, if any
-        text = str(shown)
-        if isinstance(shown, OSError) and shown.filename is not None and shown.strerror:
-            text = f"{os.fsdecode(shown.filename)}: {shown.strerror}"
+        text = str(hint)
+        if isinstance(hint, OSError) and hint.filename is not None and hint.strerror:
+            text = f"{os.fsdecode(hint.filename)}: {hint.strerror}"
         line = escape_controls(" ".join(text.split()))
         errors.print(f"me2e-compress: {line}", soft_wrap=True, markup=False)
         usage = isinstance(error, CycloptsError | OptionError) or cites_old_name(error)

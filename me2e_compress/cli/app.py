@@ -22,7 +22,7 @@ def build_app(name: str, about: str = "") -> App:
         version_flags="--version",
         help_format="plaintext",
         default_parameter=Parameter(
-            negative=(), show_default=_shown, allow_repeating=True
+            negative=(), show_default=_default_text, allow_repeating=True
         ),
         result_action="return_value",
         exit_on_error=False,
@@ -46,14 +46,14 @@ def build_app(name: str, about: str = "") -> App:
         """
         printing.quiet, printing.verbose = quiet, verbose and not quiet
         printing.json = json
-        _refuse_former(tokens)
+        _check_former(tokens)
         app(tokens)
 
     return app
 
 
-def _shown(default: object) -> str | None:
-    """Write a default that says something: a number or a word."""
+def _default_text(default: object) -> str | None:
+    """Return the text of a default that ``--help`` shows: a number or a word."""
     return str(default) if isinstance(default, int | float | str) and default else None
 
 
@@ -65,15 +65,15 @@ _PANELS = {
     "Drive": "evaluate score study",
 }
 """Commands in the order in which ``--help`` lists them."""
-_DRIVING = ("evaluate", "study")
+_NEED_HIGHWAY = ("evaluate", "study")
 COMMANDS = {name: panel for panel, names in _PANELS.items() for name in names.split()}
 """The panel of every command."""
 
 
-def _with_commands() -> App:
+def _main_app() -> App:
     about = "Make modular end-to-end driving models small, and prove that they drive."
-    made = build_app("me2e-compress", about)
-    made.register_install_completion_command()
+    root = build_app("me2e-compress", about)
+    root.register_install_completion_command()
     groups = {panel: Group(panel, sort_key=at) for at, panel in enumerate(_PANELS, 1)}
     for at, (name, panel) in enumerate(COMMANDS.items()):
         # ``list`` is Python's own
@@ -81,11 +81,11 @@ def _with_commands() -> App:
         function = getattr(home, "list_entries" if name == "list" else name)
         text, _, _ = (inspect.getdoc(function) or "").partition("\n\nArgs:")
         first, *rest = (" ".join(each.split()) for each in text.split("\n\n"))
-        if name in _DRIVING and missing_module("highway"):
+        if name in _NEED_HIGHWAY and missing_module("highway"):
             first += " Needs the extra highway."
         text = "\n\n".join([first, *rest])
-        made.command(function, name=name, group=groups[panel], sort_key=at, help=text)
-    return made
+        root.command(function, name=name, group=groups[panel], sort_key=at, help=text)
+    return root
 
 
 def options_of(name: str) -> list[str]:
@@ -94,18 +94,18 @@ def options_of(name: str) -> list[str]:
     return [each.name for each in arguments if each.parse and each.name[:1] == "-"]
 
 
-def _refuse_former(words: Sequence[str]) -> None:
-    """Refuse a command or an option that is gone, with what replaces it."""
-    name, taken = next(iter(words), ""), set[str]()
-    if gone := FORMER_NAMES.get(f"command {name}"):
-        raise CycloptsError(gone)
+def _check_former(words: Sequence[str]) -> None:
+    """Raise a CycloptsError that says what replaces a command or option of 0.2."""
+    name, flags = next(iter(words), ""), set[str]()
+    if message := FORMER_NAMES.get(f"command {name}"):
+        raise CycloptsError(message)
     if name in COMMANDS:
         arguments = app[name].assemble_argument_collection()
-        taken = {flag for each in arguments if each.parse for flag in each.names}
+        flags = {flag for each in arguments if each.parse for flag in each.names}
     for flag in (word.partition("=")[0] for word in words[1:]):
-        gone = FORMER_NAMES.get(f"{name} {flag}") or FORMER_NAMES.get(flag)
-        if gone and flag not in taken:
-            raise CycloptsError(gone)
+        message = FORMER_NAMES.get(f"{name} {flag}") or FORMER_NAMES.get(flag)
+        if message and flag not in flags:
+            raise CycloptsError(message)
 
 
-app = _with_commands()
+app = _main_app()

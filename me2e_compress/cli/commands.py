@@ -9,14 +9,7 @@ from typing import Annotated, TypeAlias
 
 from cyclopts import Parameter
 
-from me2e_compress.cli.console import (
-    listening,
-    printing,
-    say,
-    show,
-    show_of,
-    tell,
-)
+from me2e_compress.cli.console import listening, printing, say, show, show_call, tell
 from me2e_compress.errors import EvaluationError, OptionError, RecipeError
 from me2e_compress.extras import require_extra
 from me2e_compress.workflows.options import (
@@ -177,7 +170,7 @@ def plan(
     from me2e_compress.workflows.plan import plan as workflow
 
     result = workflow(model, output, options)
-    show(result, result.shown(every=printing.verbose).tables)
+    show(result, result.view(every=printing.verbose).tables)
 
 
 def calibrate(
@@ -201,7 +194,7 @@ def calibrate(
     """
     from me2e_compress.workflows.calibrate import calibrate as workflow
 
-    show_of(workflow, model, frames, output, options)
+    show_call(workflow, model, frames, output, options)
 
 
 def compress(
@@ -231,7 +224,7 @@ def compress(
     if recipe is not None and passes is not None:
         raise RecipeError("give a recipe (-r) or a pipeline (--passes), not both")
     wanted = recipe if passes is None else parse(passes)
-    show_of(workflow, model, output, wanted, frames, options)
+    show_call(workflow, model, output, wanted, frames, options)
 
 
 def lint(model: str, /, *, options: LintOptions | None = None) -> None:
@@ -244,7 +237,7 @@ def lint(model: str, /, *, options: LintOptions | None = None) -> None:
 
     with listening() as listener:
         result = workflow(model, options, listener)
-    show(result, result.shown(every=printing.verbose).tables)
+    show(result, result.view(every=printing.verbose).tables)
     result.check()
 
 
@@ -269,7 +262,7 @@ def sensitivity(
     """
     from me2e_compress.workflows.search import measure_sensitivity
 
-    show_of(measure_sensitivity, model, frames, output, options)
+    show_call(measure_sensitivity, model, frames, output, options)
 
 
 def search(
@@ -284,7 +277,7 @@ def search(
     """
     from me2e_compress.workflows.search import search as workflow
 
-    show_of(workflow, model, frames, output, options or SearchOptions())
+    show_call(workflow, model, frames, output, options or SearchOptions())
 
 
 def compare(
@@ -323,14 +316,14 @@ def compare(
         raise RecipeError("--float is for --outputs, which is not given")
     if outputs is not None and frames is None:
         workflow = against_engine.compare_dump
-        show_of(workflow, reference, outputs, candidate, float_graph, options)
+        show_call(workflow, reference, outputs, candidate, float_graph, options)
     elif outputs is not None or frames is None:
         words = "M.onnx FRAMES --outputs DUMP" if frames else "A.onnx B.onnx FRAMES"
         raise OptionError(f"expected {words}")
     elif first_difference:
-        show_of(between.first_difference, reference, candidate, frames, options)
+        show_call(between.first_difference, reference, candidate, frames, options)
     else:
-        show_of(between.compare, reference, candidate, frames, options)
+        show_call(between.compare, reference, candidate, frames, options)
 
 
 def profile(
@@ -353,12 +346,12 @@ def profile(
         imported: what another tool measured
     """
     from me2e_compress.workflows import profile as workflow
-    from me2e_compress.workflows.profile import import_profile, refuse_both
+    from me2e_compress.workflows.profile import check_import, import_profile
 
     options = options or ProfileOptions()
     with listening() as listener:
         if imported is not None:
-            refuse_both(frames, options)
+            check_import(frames, options)
             budget_ms, force = options.budget_ms, options.force
             result = import_profile(
                 model, imported, output, budget_ms=budget_ms, force=force

@@ -16,7 +16,7 @@ from rich.progress import (
     TimeElapsedColumn,
     TimeRemainingColumn,
 )
-from rich.table import Table as Shown
+from rich.table import Table as RichTable
 from rich.text import Text
 
 from me2e_compress.display import Cell, Table, escape_controls, format_duration, plural
@@ -43,7 +43,7 @@ WIDE = 120
 
 @contextmanager
 def listening(*, stages: bool = False) -> Iterator[Listener]:
-    """Show progress and warnings on stderr; nothing if quiet.
+    """Yield a listener that shows progress and warnings on stderr; nothing if quiet.
 
     On a terminal progress is a bar with the time left, elsewhere a line now and then,
     and one for every new stage if `stages` is set.
@@ -74,13 +74,13 @@ def listening(*, stages: bool = False) -> Iterator[Listener]:
             if stage != shown:
                 bar.reset(task)
             shown = stage
-            text = _done(done, total, what)
+            text = _progress_text(done, total, what)
             bar.update(task, description=stage, completed=done, total=total, what=text)
 
         yield Listener(on_progress, _warn)
 
 
-def _done(done: int, total: int, what: str) -> str:
+def _progress_text(done: int, total: int, what: str) -> str:
     """Write how much is done; a total of 0 is not known."""
     return f"{done}/{total} {what}".rstrip() if total else f"{done} {what}".rstrip()
 
@@ -112,8 +112,8 @@ def show(result: Result, tables: Iterable[Table] | None = None) -> None:
         console.print(Text(escape_controls(line), "bold"), soft_wrap=True)
 
 
-def show_of(workflow: Callable[..., Result], *words: object) -> None:
-    """Call a workflow with a listener, and show what it gives, refused or not."""
+def show_call(workflow: Callable[..., Result], *words: object) -> None:
+    """Call a workflow with a listener, show its result, and raise if it is refused."""
     with listening() as listener:
         result = workflow(*words, listener)
     show(result)
@@ -133,12 +133,12 @@ def print_table(content: Table) -> None:
     """
     content = content.escape_controls()
     # intervals are shown if the terminal is wide, or the table narrow
-    room = console.width - _frame(content) - sum(_longest(content, True, False))
-    intervals = _is_wide() or room >= 0
-    widths = _widths(content, intervals)
+    spare = console.width - _border(content) - sum(_lengths(content, True, False))
+    intervals = _is_wide() or spare >= 0
+    widths = _column_widths(content, intervals)
     console.print(Text(content.title, "bold"), soft_wrap=True)
     if widths is not None:
-        console.print(_grid(content, widths, intervals))
+        console.print(_rich_table(content, widths, intervals))
     # each row as its name and, indented, its other cells
     for first, *others in content.rows if widths is None else ():
         console.print(Text(first.text), soft_wrap=True)
@@ -157,15 +157,16 @@ def print_table(content: Table) -> None:
         console.print(Text(shown, "dim"), soft_wrap=True)
 
 
-def _frame(content: Table) -> int:
+def _border(content: Table) -> int:
+    """Return the characters of a line that rules and padding take."""
     count = len(content.columns)
     return 3 * count + 1 if _is_wide() else 3 * (count - 1)
 
 
-def _longest(content: Table, intervals: bool, words: bool) -> list[int]:
+def _lengths(content: Table, intervals: bool, words: bool) -> list[int]:
     """Return the length of the longest line, or word, of every column."""
     columns = [
-        [name, *(_text(row[at], intervals).plain for row in content.rows)]
+        [name, *(_rich_text(row[at], intervals).plain for row in content.rows)]
         for at, name in enumerate(content.columns)
     ]
     return [
@@ -177,38 +178,37 @@ def _longest(content: Table, intervals: bool, words: bool) -> list[int]:
     ]
 
 
-def _widths(content: Table, intervals: bool) -> list[int] | None:
-    """Share the terminal among columns so that no word breaks; None if too narrow."""
-    least = _longest(content, intervals, True)
-    most = _longest(content, intervals, False)
-    spare = console.width - _frame(content) - sum(least)
+def _column_widths(content: Table, intervals: bool) -> list[int] | None:
+    """Return column widths that break no word; None if the terminal is too narrow."""
+    least = _lengths(content, intervals, True)
+    most = _lengths(content, intervals, False)
+    spare = console.width - _border(content) - sum(least)
     if spare < 0:
         return None
-    # the columns share what the longest words leave over
+    # spare characters go to narrow columns first, so that only long sentences wrap
     wanted = [high - low for low, high in zip(least, most, strict=True)]
-    # who wants little gets all of it, so that only long sentences wrap
     for done, at in enumerate(sorted(range(len(wanted)), key=wanted.__getitem__)):
-        given = min(wanted[at], spare // (len(wanted) - done))
-        least[at], spare = least[at] + given, spare - given
+        extra = min(wanted[at], spare // (len(wanted) - done))
+        least[at], spare = least[at] + extra, spare - extra
     return least
 
 
-def _grid(content: Table, widths: Sequence[int], intervals: bool) -> Shown:
-    made = Shown()
-    made.show_edge = made.pad_edge = _is_wide()  # four characters that numbers can use
+def _rich_table(content: Table, widths: Sequence[int], intervals: bool) -> RichTable:
+    grid = RichTable()
+    grid.show_edge = grid.pad_edge = _is_wide()  # four characters that numbers can use
     for at, (name, width) in enumerate(zip(content.columns, widths, strict=True)):
         side: Literal["left", "right"] = "left" if at < content.words else "right"
-        made.add_column(Text(name), justify=side, overflow="fold", width=width)
+        grid.add_column(Text(name), justify=side, overflow="fold", width=width)
     for row in content.rows:
-        made.add_row(*(_text(cell, intervals) for cell in row))
-    return made
+        grid.add_row(*(_rich_text(cell, intervals) for cell in row))
+    return grid
 
 
 def _is_wide() -> bool:
     return console.width >= WIDE
 
 
-def _text(cell: Cell, wide: bool) -> Text:
+def _rich_text(cell: Cell, wide: bool) -> Text:
     if cell.detail and wide:
         return Text.assemble(cell.text, "\n", (cell.detail, "dim"))
     return Text(cell.text)
@@ -226,8 +226,8 @@ EVERY_S = 10.0
 class ProgressLines:
     """Writes the progress of a long run, seldom enough for a log.
 
-    A run of less than `EVERY_S` writes nothing, unless every new stage is written too;
-    a stage that was written of is written of as it ends.
+    A run of less than `EVERY_S` writes nothing, unless every new stage is written;
+    a stage of which a line was written gets one at its end.
     """
 
     def __init__(
@@ -239,22 +239,22 @@ class ProgressLines:
     ) -> None:
         self._write, self._stages, self._clock = write, stages, clock
         self._stage, self._unfinished = "", False
-        self._begun = self._said = clock()
+        self._begun_s = self._last_s = clock()
 
     def on_progress(self, stage: str, done: int, total: int, what: str) -> None:
         """Write a line if it is time for one; to be called by a listener."""
         now = self._clock()
         if stage != self._stage:
-            self._stage, self._begun, self._unfinished = stage, now, False
+            self._stage, self._begun_s, self._unfinished = stage, now, False
             if self._stages:
                 self._write(stage)
-                self._said = now
-        if now - self._said < EVERY_S and not (self._unfinished and done == total):
+                self._last_s = now
+        if now - self._last_s < EVERY_S and not (self._unfinished and done == total):
             return
-        self._said, self._unfinished = now, done < total
-        line = f"{stage}: {_done(done, total, what)}"
+        self._last_s, self._unfinished = now, done < total
+        line = f"{stage}: {_progress_text(done, total, what)}"
         # how long the rest takes at the pace so far
         if 0 < done < total:
-            left = (now - self._begun) / done * (total - done)
+            left = (now - self._begun_s) / done * (total - done)
             line += f", {format_duration(left)} left"
         self._write(line)

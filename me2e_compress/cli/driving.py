@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from me2e_compress.cli.commands import WRITING, Output
-from me2e_compress.cli.console import listening, printing, say, show, show_of, tell
+from me2e_compress.cli.console import listening, printing, say, show, show_call, tell
 from me2e_compress.errors import OptionError
 from me2e_compress.extras import require_extra
 from me2e_compress.metrics import BUDGET_MS
@@ -42,7 +42,7 @@ def evaluate(
     if check:
         if policy is None:
             raise OptionError("--check needs a policy: POLICY")
-        show_of(workflow.check_model, policy, options)
+        show_call(workflow.check_model, policy, options)
         return
     if output is None:
         raise OptionError("driving needs -o RESULTS/")

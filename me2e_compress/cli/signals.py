@@ -10,18 +10,18 @@ from types import FrameType
 
 INTERRUPTED, TERMINATED = 128 + signal.SIGINT, 128 + signal.SIGTERM
 """Exit codes after Ctrl-C and after SIGTERM, as shells count them."""
-DEAF_S = 5.0
+TIMEOUT_S = 5.0
 """Seconds that native code may delay a signal; after that the process ends."""
-_LOST: dict[type[BaseException], signal.Signals] = {
+_SIGNALS: dict[type[BaseException], signal.Signals] = {
     KeyboardInterrupt: signal.SIGINT,
     SystemExit: signal.SIGTERM,
 }
-"""The signal behind each exception that a handler raises."""
+"""The signal for which a handler raises each exception."""
 _MOMENT_S = 0.02
 
 
 @contextlib.contextmanager
-def signals_in_order() -> Iterator[None]:
+def handle_signals() -> Iterator[None]:
     """Make SIGTERM an exit like Ctrl-C, so that processes and drafts are cleaned up.
 
     An exception raised in a finalizer, or in a callback of native code, is lost; Python
@@ -29,29 +29,29 @@ def signals_in_order() -> Iterator[None]:
     Native code that never returns, such as an endless loop in a graph, blocks the
     handler: the process then exits all the same, and leaves what a kill leaves.
     """
-    heard = threading.Event()
+    handled = threading.Event()
 
-    def leave(number: int, frame: FrameType | None) -> None:
-        heard.set()
+    def on_signal(number: int, frame: FrameType | None) -> None:
+        handled.set()
         if number == signal.SIGINT:
             raise KeyboardInterrupt
         raise SystemExit(TERMINATED)
 
-    def again(lost: "sys.UnraisableHookArgs") -> None:
-        number = _LOST.get(lost.exc_type)
+    def on_lost(lost: "sys.UnraisableHookArgs") -> None:
+        number = _SIGNALS.get(lost.exc_type)
         if number is None:
             hook(lost)
         else:
             threading.Timer(_MOMENT_S, os.kill, (os.getpid(), number)).start()
 
     # install the handlers and the hook for lost exceptions
-    hook, sys.unraisablehook = sys.unraisablehook, again
-    before = {signal.SIGTERM: signal.signal(signal.SIGTERM, leave)}
+    hook, sys.unraisablehook = sys.unraisablehook, on_lost
+    before = {signal.SIGTERM: signal.signal(signal.SIGTERM, on_signal)}
     # what is started in the background ignores Ctrl-C, and goes on doing so
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
-        before[signal.SIGINT] = signal.signal(signal.SIGINT, leave)
+        before[signal.SIGINT] = signal.signal(signal.SIGINT, on_signal)
     try:
-        with _ended_where_unheard(heard):
+        with _exit_if_unhandled(handled):
             yield
     finally:
         # restore what was there before
@@ -61,8 +61,8 @@ def signals_in_order() -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def _ended_where_unheard(heard: threading.Event) -> Iterator[None]:
-    """Exit if a signal is not handled within `DEAF_S`."""
+def _exit_if_unhandled(handled: threading.Event) -> Iterator[None]:
+    """Exit if a signal is not handled within `TIMEOUT_S`."""
     # Python writes signal numbers into a pipe even while native code runs
     reader, writer = os.pipe()
     os.set_blocking(writer, False)
@@ -70,7 +70,7 @@ def _ended_where_unheard(heard: threading.Event) -> Iterator[None]:
     def watch() -> None:
         while number := os.read(reader, 1):
             wanted = number[0] in (signal.SIGINT, signal.SIGTERM)
-            if wanted and not heard.wait(DEAF_S):
+            if wanted and not handled.wait(TIMEOUT_S):
                 os.write(2, b"me2e-compress: interrupted\n")
                 os._exit(128 + number[0])
 

@@ -38,7 +38,7 @@ class FirstValues:
     """
 
     given: Mapping[str, str]
-    zero_state: Mapping[str, Array]
+    zeros: Mapping[str, Array]
 
     @classmethod
     def of(

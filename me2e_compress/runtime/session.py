@@ -346,10 +346,11 @@ class Session:
             for dim, size in zip(port.shape, arrays[name].shape, strict=False)
             if dim_name(dim)
         }
+        ports = self.inputs
         return {
             name: arrays[name]
             if name in arrays
-            else zero_state(name, self.inputs[name], sizes)
+            else zero_state(name, ports[name], sizes)
             for name in self.recurrent
         }
 

@@ -21,14 +21,14 @@ from me2e_compress.study.run import run_study
 from me2e_compress.study.study_result import StudyResult
 from me2e_compress.study.workspace import HTML, JSON, MARKDOWN
 from me2e_compress.targets import DEFAULT_TARGET
-from me2e_compress.workflows.checks import check_folder, check_ours
+from me2e_compress.workflows.checks import check_folder, check_replaceable
 from me2e_compress.workflows.compare import CompareResult, compare
-from me2e_compress.workflows.compress import CompressResult, beside, compress
+from me2e_compress.workflows.compress import CompressResult, compress, sidecar
 from me2e_compress.workflows.files import export_stack
 from me2e_compress.workflows.frames import record_frames
 from me2e_compress.workflows.inspect import InspectResult, inspect
 from me2e_compress.workflows.options import CompressOptions, FramesOptions
-from me2e_compress.workflows.result import Listener, Result, Shown
+from me2e_compress.workflows.result import Listener, Result, View
 
 CALIBRATION_FRAMES, HELD_OUT_FRAMES = 64, 24
 LATENCY_SAMPLES, WORKERS = 100, 2
@@ -67,10 +67,10 @@ class DriveResult(Result):
     study: StudyResult
     ending: tuple[str, ...]
 
-    def shown(self) -> Shown:
+    def view(self) -> View:
         """Return size, time, plan and driving, before and after, and the verdict."""
         driven, whole = self.study.coverage
-        return Shown(
+        return View(
             f"{driven} of {whole} routes, before and after",
             [before_and_after(self.study)],
             (*map(": ".join, findings(self.study)), limits(self.study), *self.ending),
@@ -85,11 +85,11 @@ class DemoResult(Result):
     keys = ("*steps",)
     steps: Mapping[str, Result]
 
-    def shown(self) -> Shown:
+    def view(self) -> View:
         """Return the verdict of the last step, and the warnings of all."""
         *_, last = self.steps.values()
         alerts = [line for each in self.steps.values() for line in each.alerts()]
-        return Shown(last.headline, last.tables(), last.lines(), alerts)
+        return View(last.headline, last.tables(), last.lines(), alerts)
 
 
 def figure(result: Result) -> str:
@@ -116,9 +116,9 @@ class DriverDemo:
         self._frames, self._held_out = out / "frames", out / "frames-held-out"
         self._sections = list[Section]()
         check_folder(out, ())
-        records = (beside(self._small, what) for what in ("report", "plan"))
+        records = (sidecar(self._small, what) for what in ("report", "plan"))
         pages = (out / name for name in (JSON, MARKDOWN, HTML))
-        check_ours(
+        check_replaceable(
             [self._source, self._small, *records, *pages],
             trees=[self._frames, self._held_out],
             force=force,
@@ -187,8 +187,8 @@ class DriverDemo:
         files = (
             ("the driver", self._source),
             ("the small one", self._small),
-            ("pass by pass", beside(self._small, "report")),
-            ("node by node", beside(self._small, "plan")),
+            ("pass by pass", sidecar(self._small, "report")),
+            ("node by node", sidecar(self._small, "plan")),
             ("calibration", self._frames),
             ("held out", self._held_out),
             ("drives", self.out / "results"),

@@ -25,7 +25,7 @@ from me2e_compress.study.workspace import Workspace
 from me2e_compress.targets.onnxruntime import slow_here
 from me2e_compress.version import __version__
 from me2e_compress.workflows.checks import try_first
-from me2e_compress.workflows.compress import beside, compress
+from me2e_compress.workflows.compress import compress, sidecar
 from me2e_compress.workflows.inspect import WEIGHTS
 from me2e_compress.workflows.options import CompressOptions
 from me2e_compress.workflows.result import Listener
@@ -167,7 +167,7 @@ def prepare_variant(
 def _reported_beside(model: Path) -> tuple[str, str] | None:
     """Read source and passes from the report next to a file, if it is of that file."""
     try:
-        report = documents.from_json(beside(model, "report").read_bytes())
+        report = documents.from_json(sidecar(model, "report").read_bytes())
         if report["output"]["sha256"] != graph.sha256_of(model):
             return None
         return str(report["source"]["file"]), str(report["pipeline"])
@@ -185,7 +185,7 @@ def _compressed(
     """Apply the passes, unless a file exists that still matches its report."""
     frames = None if study.frames is None else CalibrationSet(study.frames)
     path = workspace.model(variant, _key(study, variant, source, frames))
-    if path.is_file() and beside(path, "report").is_file():
+    if path.is_file() and sidecar(path, "report").is_file():
         if _reported_beside(path) is not None:
             return path
         listener.on_warning(f"{path}: not what its report is of: made again")

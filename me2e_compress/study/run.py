@@ -25,7 +25,7 @@ from me2e_compress.study.outcome import (
 from me2e_compress.study.prepared import PreparedVariant, prepare_all
 from me2e_compress.study.study_result import StudyResult
 from me2e_compress.study.workspace import HTML, JSON, MARKDOWN, Workspace
-from me2e_compress.workflows.checks import check_folder, check_ours, writing
+from me2e_compress.workflows.checks import check_folder, check_replaceable, writing
 from me2e_compress.workflows.frames import record_frames
 from me2e_compress.workflows.options import FramesOptions
 from me2e_compress.workflows.result import SILENT, Listener
@@ -64,7 +64,7 @@ def run_study(
         study.driven_by.check_takes(["engine"], "workers and engine: ")
     folder = Path(folder)
     check_folder(folder, study.inputs(), (JSON, MARKDOWN, HTML))
-    check_ours([folder / name for name in (JSON, MARKDOWN, HTML)], force=force)
+    check_replaceable([folder / name for name in (JSON, MARKDOWN, HTML)], force=force)
     with writing(folders=[folder]):
         cells, prepared = prepare_study(study, folder, engine, listener)
         # plans and drives of every variant are compared with the baseline's

@@ -83,7 +83,7 @@ class StudyResult(Result):
         """Return a variant by its name."""
         return next(each for each in self.variants if each.name == name)
 
-    def shown(self) -> Shown:
+    def view(self) -> View:
         """Return the title with numbers, every table, what failed, a busy machine."""
         study, (driven, whole) = self.study, self.coverage
         alerts = (
@@ -99,7 +99,7 @@ class StudyResult(Result):
             ),
             *([str(self.load)] if self.load is not None and self.load.busy else []),
         )
-        return Shown(
+        return View(
             f"{study.title}: {plural(len(study.variants), 'variant')} under"
             f" {plural(len(study.conditions), 'condition')} on {driven} of"
             f" {plural(whole, 'route')}",

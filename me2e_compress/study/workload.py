@@ -12,7 +12,7 @@ from me2e_compress.driving.realtime import LatencyModel, skipped_decisions
 from me2e_compress.study.condition import Condition
 from me2e_compress.study.definition import Study
 from me2e_compress.study.workspace import Workspace
-from me2e_compress.workflows.result import Result, Shown
+from me2e_compress.workflows.result import Result, View
 
 FRAME_S, DECISION_S = 0.0024, 0.021
 """CPU seconds of a frame of the world, and of a decision: six pictures and one
@@ -43,7 +43,7 @@ class Workload(Result):
     workers: int
     measured: bool
 
-    def shown(self) -> Shown:
+    def view(self) -> View:
         """Return numbers of drives and routes, the time left, and a row per drive."""
         headline = f"{self.title}: {plural(len(self.drives), 'drive')}"
         if self.set_size:
@@ -65,7 +65,7 @@ class Workload(Result):
             )
             for each in self.drives
         ]
-        return Shown(headline, [table("Drives", columns, rows, words=2)])
+        return View(headline, [table("Drives", columns, rows, words=2)])
 
 
 def workload(study: Study, folder: str | Path, workers: int = 1) -> Workload:

@@ -7,10 +7,10 @@ from pathlib import Path
 
 from me2e_compress.calibration.calibrator import Calibrator
 from me2e_compress.calibration.dataset import CalibrationSet
-from me2e_compress.calibration.exchange import read_cache, taken_from
+from me2e_compress.calibration.exchange import pick_ranges, read_cache
 from me2e_compress.calibration.observers import OBSERVERS
 from me2e_compress.calibration.ranges import Ranges, rms_of
-from me2e_compress.calibration.review import RangeFinding, not_in, review
+from me2e_compress.calibration.review import RangeFinding, missing_ranges, review
 from me2e_compress.calibration.sample import draw
 from me2e_compress.display import plural
 from me2e_compress.errors import FramesError
@@ -27,21 +27,21 @@ from me2e_compress.workflows.checks import (
 )
 from me2e_compress.workflows.options import CalibrateOptions
 from me2e_compress.workflows.plan import PreparedGraph
-from me2e_compress.workflows.result import SILENT, Listener, Result, Shown
+from me2e_compress.workflows.result import SILENT, Listener, Result, View
 
 
 def checkpoint_beside(output: Path) -> Path:
-    """Return where the progress of a calibration stands."""
+    """Return the file of a calibration's progress."""
     return output.with_name(output.name + ".checkpoint")
 
 
 def overrides_beside(output: Path) -> Path:
-    """Return where the overrides stand of what an imported cache lacks."""
+    """Return the file of overrides for what an imported cache lacks."""
     return output.with_name(f"{output.stem}.overrides.toml")
 
 
 def written_files(output: Path, options: CalibrateOptions) -> list[Path]:
-    """List the files that are written."""
+    """List the files that :func:`calibrate` may write."""
     files = [output, checkpoint_beside(output)]
     if options.imported is not None:
         files.append(overrides_beside(output))
@@ -62,7 +62,7 @@ class CalibrateResult(Result):
     findings: tuple[RangeFinding, ...] = ()
     overrides: Path | None = None
 
-    def shown(self) -> Shown:
+    def view(self) -> View:
         """Return the ranges that deserve a look, and how to keep floats."""
         ranges = self.ranges
         how = f"compress --ranges {self.output} --overrides {self.overrides}"
@@ -70,11 +70,11 @@ class CalibrateResult(Result):
             f"{self.output}: {plural(len(ranges.tensors), 'tensor')}, {ranges.method},"
             f" {plural(ranges.frames, 'frame')}"
         )
-        return Shown(
+        return View(
             headline,
-            lines=(headline, *_said(self.findings, "note")),
+            lines=(headline, *_texts(self.findings, "note")),
             alerts=(
-                *_said(self.findings, "warning"),
+                *_texts(self.findings, "warning"),
                 *([] if self.overrides is None else [f"These floats: {how}"]),
             ),
         )
@@ -119,15 +119,15 @@ def calibrate(
     outputs = written_files(output, options)
     inputs = (source, frames, *named)
     with writing(outputs, inputs, force=options.force):
-        ready, part = _ready(source, frames, options, listener)
+        prepared, part = _prepare(source, frames, options, listener)
         gc.collect()  # 150 MB of VAD-tiny as it was read; graphs are cycles
         with drafts.all_or_none():
             missing, overrides = list[str](), overrides_beside(output)
             if options.imported is not None:
-                ranges, missing = _imported(ready, part, options)
+                ranges, missing = _import(prepared, part, options)
             else:
                 assert part is not None
-                ranges = _measured(ready, part, output, options, listener)
+                ranges = _measure(prepared, part, output, options, listener)
             ranges.save(output)
             # what an imported cache has no range for stays in float
             cache = Path(options.imported or "")
@@ -136,21 +136,18 @@ def calibrate(
                 floats = (keep_readers(name, absent) for name in missing)
                 text = drafts.IN_TOML + overrides_text(floats)
                 write_bytes(overrides, text.encode())
-    findings = (*not_in(cache, missing), *review(ranges))
+    findings = (*missing_ranges(cache, missing), *review(ranges))
     written = overrides if missing else None
     return CalibrateResult(output, ranges.frames, ranges, findings, written)
 
 
-def _ready(
+def _prepare(
     source: Path,
     frames: str | Path | None,
     options: CalibrateOptions,
     listener: Listener,
 ) -> tuple[PreparedGraph, CalibrationSet | None]:
-    """Read the graph and its frames, and run the passes before int8.
-
-    Ranges belong to the graph as these passes leave it.
-    """
+    """Read the graph and its frames, and run the passes before int8, for its ranges."""
     loaded = read_graph(source, listener, options.adapter, options.module_map)
     # what is read is checked, and the graph is opened, before any pass runs
     if options.imported is not None:
@@ -172,40 +169,40 @@ def _ready(
     return PreparedGraph.of(source, loaded, options.module_map, passes), part
 
 
-def _measured(
-    ready: PreparedGraph,
+def _measure(
+    prepared: PreparedGraph,
     part: CalibrationSet,
     output: Path,
     options: CalibrateOptions,
     listener: Listener,
 ) -> Ranges:
-    tensors = ready.tensors()
+    tensors = prepared.tensors()
     # a checkpoint lets a run that was killed go on
-    method, provider = options.method or ready.method, options.runs_on
+    method, provider = options.method or prepared.method, options.runs_on
     checkpoint = checkpoint_beside(output)
     calibrator = Calibrator(
         method, options.threads, checkpoint=checkpoint, provider=provider
     )
     seen = calibrator.collect(
-        ready.model, tensors, part, listener.counting("calibrate", method)
+        prepared.model, tensors, part, listener.counting("calibrate", method)
     )
     return Ranges.of(seen, OBSERVERS.parse(method))
 
 
-def _imported(
-    ready: PreparedGraph, part: CalibrationSet | None, options: CalibrateOptions
+def _import(
+    prepared: PreparedGraph, part: CalibrationSet | None, options: CalibrateOptions
 ) -> tuple[Ranges, list[str]]:
-    """Take another tool's ranges; name the tensors that it has none for."""
-    path, tensors = Path(options.imported or ""), ready.tensors()
-    ranges = taken_from(read_cache(path), path, ready.model, tensors)
+    """Return another tool's ranges, and the tensors that it has none for."""
+    path, tensors = Path(options.imported or ""), prepared.tensors()
+    ranges = pick_ranges(read_cache(path), path, prepared.model, tensors)
     # two frames show the size of every tensor; the second has a state
     if part is not None:
         few = part.part(part.places[:2])
         calibrator = Calibrator(threads=options.threads, provider=options.runs_on)
-        seen = calibrator.collect(ready.model, tuple(ranges.tensors), few)
+        seen = calibrator.collect(prepared.model, tuple(ranges.tensors), few)
         ranges = dataclasses.replace(ranges, rms=rms_of(seen))
     return ranges, [name for name in tensors if name not in ranges.tensors]
 
 
-def _said(findings: Sequence[RangeFinding], severity: str) -> tuple[str, ...]:
+def _texts(findings: Sequence[RangeFinding], severity: str) -> tuple[str, ...]:
     return tuple(str(each) for each in findings if each.severity == severity)

@@ -57,17 +57,17 @@ Given: TypeAlias = str | Path | None
 """An input as the user names it; a word that does not name a file is harmless."""
 
 
-def model_path(text: str | Path, beside: Path = Path()) -> Path:
-    """Return the file that a path or a shipped name means; an existing file wins."""
-    path = beside / text
+def model_path(text: str | Path, folder: Path = Path()) -> Path:
+    """Return the file of a path, or else of a shipped name; a GraphError of neither."""
+    path = folder / text
     if path.is_file():
         return path
     if str(text) in SHIPPED:
         return shipped_model(str(text))
     line = f"{text}: no such file; models that ship: {', '.join(SHIPPED)}"
     name = str(text).partition(":")[0]
-    gone = FORMER_NAMES.get(f"model {name}", FORMER_NAMES.get(f"stack {name}", line))
-    raise GraphError(gone)
+    former = (FORMER_NAMES.get(f"{kind} {name}") for kind in ("model", "stack"))
+    raise GraphError(next(filter(None, former), line))
 
 
 def load_graph(path: Path) -> ir.Model:
@@ -104,18 +104,18 @@ def read_graph(
 
 
 def shortcomings(model: ir.Model) -> str:
-    """Name what passes do not see, and inputs that nothing reads.
+    """Name what passes do not see, and inputs that nothing reads; empty if all is well.
 
-    They see neither shapes behind unknown plugins nor layers in functions.
+    They see neither shapes after unknown plugins nor layers in functions.
     """
     unread = [str(each.name) for each in model.graph.inputs if not is_read(each)]
     idle = f"nothing reads input {', '.join(unread)}" if unread else ""
-    hints = _lacking_shapes(model), _in_functions(model), idle
+    hints = _shape_hint(model), _function_hint(model), idle
     return "; ".join(filter(None, hints))
 
 
-def _in_functions(model: ir.Model) -> str:
-    """Count the layers in functions of the file, as often as they are called."""
+def _function_hint(model: ir.Model) -> str:
+    """Describe the layers in functions of the file, by calls; empty without any."""
 
     @functools.cache
     def layers(node: ir.Node) -> int:
@@ -146,7 +146,7 @@ _INLINE = (
 )
 
 
-def _lacking_shapes(model: ir.Model) -> str:
+def _shape_hint(model: ir.Model) -> str:
     """Describe the plugins whose output shapes are unknown; empty if there are none."""
     if not unshaped_plugins(model):
         return ""
@@ -196,53 +196,53 @@ def check_output(outputs: Sequence[Path | None], inputs: Iterable[Given]) -> Non
             raise GraphError(f"{output} is a folder: name a file for the output")
         if output.exists() and not output.is_file():
             raise GraphError(f"{output} is a device or a pipe: name a file")
-        if named.setdefault(resolved(output), output) is not output:
+        if named.setdefault(real_path(output), output) is not output:
             raise GraphError(f"{output} is named for two outputs: choose another name")
         # no input may be overwritten
         for given in read:
-            _keep(output, given)
+            _check_input(output, given)
 
 
 def check_folder(
     folder: Path, inputs: Iterable[Given], files: Sequence[str] = ()
 ) -> None:
-    """Refuse a folder that could not be made, or whose `files` would harm an input."""
+    """Raise a GraphError if it cannot be made, or one of its `files` is an input."""
     read = list(inputs)
-    if not resolved(folder).name:
+    if not real_path(folder).name:
         raise GraphError(f"{folder} is the root of all files: name a folder")
     if folder.exists() and not folder.is_dir():
         raise GraphError(f"{folder} is a file: name a folder for the output")
     if not folder.is_dir():
         return
-    for given in (Path(each) for each in read if each is not None):
-        if given.is_dir() and folder.samefile(given):
+    for source in (Path(each) for each in read if each is not None):
+        if source.is_dir() and folder.samefile(source):
             raise GraphError(f"{folder} is the input: choose another folder")
     check_output([folder / name for name in files], read)
 
 
-def resolved(path: Path) -> Path:
+def real_path(path: Path) -> Path:
     """Resolve symbolic links; a path in a circle of links stays as it is."""
     return Path(os.path.realpath(path))
 
 
-def _keep(output: Path, given: Path) -> None:
-    """Refuse an output that would change an input."""
-    if given.is_dir():
-        inside = resolved(output).parent == resolved(given)
+def _check_input(output: Path, source: Path) -> None:
+    """Raise a GraphError for an output that would change an input."""
+    if source.is_dir():
+        inside = real_path(output).parent == real_path(source)
         if inside and (output.suffix == ".npz" or output.name == "scenes.json"):
             raise GraphError(
                 f"{output} would be a frame of the input: choose another name"
             )
-    elif output.exists() and given.is_file():
-        if output.samefile(given):
+    elif output.exists() and source.is_file():
+        if output.samefile(source):
             raise GraphError(
                 f"{output} is the input: choose another name for the output"
             )
-        if any(output.samefile(file) for file in _weights(given)):
-            raise GraphError(f"{output} holds the weights of {given}: not written")
+        if any(output.samefile(file) for file in _weight_files(source)):
+            raise GraphError(f"{output} holds the weights of {source}: not written")
 
 
-def _weights(given: Path) -> Iterator[Path]:
+def _weight_files(given: Path) -> Iterator[Path]:
     """Yield the external weight files of a model; none for other files."""
     try:
         model = graph.load(given)
@@ -278,20 +278,20 @@ def writing(
             another process works in one of the folders.
     """
     check_output(files, inputs)
-    check_ours(filter(None, files), trees=trees, force=force)
+    check_replaceable(filter(None, files), trees=trees, force=force)
     with contextlib.ExitStack() as stack:
         for folder in folders:
-            stack.enter_context(_alone_in(folder))
+            stack.enter_context(_lock_folder(folder))
         yield
 
 
-def check_ours(
+def check_replaceable(
     files: Iterable[Path], *, trees: Iterable[Path] = (), force: bool = False
 ) -> None:
-    """Refuse early what :func:`writing` would refuse."""
-    there = [file for file in files if file.parent.is_dir()]
-    check_output(there, ())
-    for output in (*there, *trees):
+    """Raise early the GraphErrors of :func:`writing` on files that exist."""
+    existing = [file for file in files if file.parent.is_dir()]
+    check_output(existing, ())
+    for output in (*existing, *trees):
         # nothing of the user is lost with a file that we wrote, or a copy of what ships
         ours = is_marked(output) or (not output.is_symlink() and is_copy(output))
         if os.path.lexists(output) and not force and not ours:
@@ -302,8 +302,8 @@ def check_ours(
 
 
 @contextlib.contextmanager
-def _alone_in(folder: Path) -> Iterator[None]:
-    """Hold a folder; another process that would do so is refused."""
+def _lock_folder(folder: Path) -> Iterator[None]:
+    """Lock a folder; a GraphError where another process has locked it."""
     is_new = not folder.is_dir()
     folder.mkdir(parents=True, exist_ok=True)
     handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)

@@ -41,7 +41,7 @@ from me2e_compress.runtime.session import Session
 from me2e_compress.targets.onnxruntime import slow_here
 from me2e_compress.workflows.checks import model_path, opened
 from me2e_compress.workflows.options import CompareOptions, GraphOptions
-from me2e_compress.workflows.result import SILENT, Listener, Result, Shown
+from me2e_compress.workflows.result import SILENT, Listener, Result, View
 from me2e_compress.workflows.runtime_loss import (
     RuntimeLoss,
     RuntimeTally,
@@ -82,22 +82,22 @@ class CompareResult(Comparison, Result):
     known: str
     not_finite: tuple[str, ...]
 
-    def shown(self) -> Shown:
+    def view(self) -> View:
         """Return how far outputs, agents and the plan moved, and what is dead."""
         fidelity, liveness = self.fidelity, self.liveness
         title = f"Fidelity over {plural(fidelity.frames, 'frame')}"
         outputs = outputs_table(title, fidelity, self.agents)
         faults = () if liveness is None else liveness.faults
         dead = "; ".join(faults)
-        return Shown(
-            _plan_moved(fidelity),
+        return View(
+            _plan_text(fidelity),
             (
                 outputs,
                 *([liveness.table()] if liveness and liveness.outputs else []),
             ),
             (
                 *filter(None, [self.known]),
-                _plan_moved(fidelity),
+                _plan_text(fidelity),
                 *(() if liveness is None else liveness.lines()),
                 *(() if self.runtime is None else self.runtime.lines()),
                 *(f"{name}: {why}" for name, why in self.slow_here.items()),
@@ -127,10 +127,10 @@ def outputs_table(
     ]
     columns = ("output", "SQNR dB", "by frame", "max|a-b|/max|a|", "floor")[:n]
     rows += [(name, "removed", *[""] * (n - 2)) for name in fidelity.missing]
-    return table(title, columns, rows, _agents(agents))
+    return table(title, columns, rows, _agents_note(agents))
 
 
-def _plan_moved(fidelity: Fidelity) -> str:
+def _plan_text(fidelity: Fidelity) -> str:
     if fidelity.plan is None:
         return f"plan displacement: not measured ({fidelity.plan_reason})"
     line = (
@@ -142,7 +142,7 @@ def _plan_moved(fidelity: Fidelity) -> str:
     return f"{line}; the same candidate on {fidelity.same_choice:.1%} of them"
 
 
-def _agents(sets: SetFidelity | None) -> str:
+def _agents_note(sets: SetFidelity | None) -> str:
     """Describe how outputs that are sets are compared; empty without any."""
     if sets is None:
         return ""
@@ -192,7 +192,7 @@ def compare(
     }
     total = len(recording)
 
-    def reported(frame: Frame) -> Frame:
+    def with_progress(frame: Frame) -> Frame:
         listener.on_progress("frames", frame.index, total, "")
         return frame
 
@@ -214,13 +214,13 @@ def compare(
     kernels, judged = None, graphs[paths[1]].model
     if not options.as_it_stands and has_int8_kernels(judged, provider):
         kernels = session(paths[1], stock=True)
-    shown, worst = map(reported, recording), _FirstBad()
-    comparison = compared(
-        left, right, shown, judged, kernels, sets, worst, alive=options.alive
+    shown_frames, bad_frame = map(with_progress, recording), _BadFrame()
+    comparison = compare_sessions(
+        left, right, shown_frames, judged, kernels, sets, bad_frame, alive=options.alive
     )
     makers = dict[str, str]()
     for path, each in zip(paths, (left, right), strict=True):
-        if made := worst.maker(graphs[path].model.clone(), each):
+        if made := bad_frame.maker(graphs[path].model.clone(), each):
             makers.setdefault(made, f"{path.name}: {made}")
     known = "; ".join(dict.fromkeys(graphs[path].known for path in paths))
     answers = (
@@ -233,7 +233,7 @@ def compare(
     return CompareResult(*answers, *paths, slow_here=slow, known=known, not_finite=bad)
 
 
-class _FirstBad:
+class _BadFrame:
     """Keeps the first frame, or the first of which an output holds NaN or infinity."""
 
     def __init__(self) -> None:
@@ -250,7 +250,7 @@ class _FirstBad:
         self._frame = self._frame or frame
 
     def maker(self, model: ir.Model, session: Session) -> str:
-        """Name the node that makes the first of it that an output or a place reads.
+        """Name the node that first makes NaN or infinity, in a sentence; else "".
 
         State is that of a scene's beginning.
         """
@@ -266,32 +266,33 @@ class _FirstBad:
             return ""
 
 
-def compared(
+def compare_sessions(
     reference: Session,
     candidate: Session,
     frames: Iterable[Frame],
     model: ir.Model,
     kernels: Session | None = None,
     sets: SetTally | None = None,
-    watch: _FirstBad | None = None,
+    bad_frame: _BadFrame | None = None,
     *,
     alive: float = ALIVE,
 ) -> Comparison:
     """Run two sessions over frames, and tally how far outputs are apart and move.
 
-    `model` is the candidate's graph, `kernels` runs it by onnxruntime's int8, and
-    `sets` is shown what both answer. `alive` 0 does not ask which outputs are dead.
+    `model` is the candidate's graph, `kernels` runs it by onnxruntime's int8; outputs
+    of both are added to `sets` and `bad_frame`. With `alive` 0 no output is dead.
     """
-    lively = LivenessTally(reference, candidate) if alive else None
-    frames, again = itertools.tee(frames)
-    runtime = None if kernels is None else RuntimeTally(kernels, again, sets)
-    del again  # what nobody reads must not be kept
-    watching = [each.add for each in (sets, watch, lively, runtime) if each is not None]
-    fidelity = measure(reference, candidate, frames, watching)
+    liveness = LivenessTally(reference, candidate) if alive else None
+    frames, for_kernels = itertools.tee(frames)
+    runtime = None if kernels is None else RuntimeTally(kernels, for_kernels, sets)
+    del for_kernels  # tee would store every frame that it has not read
+    tallies = (sets, bad_frame, liveness, runtime)
+    watchers = [each.add for each in tallies if each is not None]
+    fidelity = measure(reference, candidate, frames, watchers)
     agents = None if sets is None else sets.result()
     return Comparison(
         fidelity,
-        None if lively is None else lively.result(alive),
+        None if liveness is None else liveness.result(alive),
         None if runtime is None else runtime.result(model, fidelity, agents),
         agents,
     )
@@ -310,7 +311,7 @@ class FirstDifferenceResult(Result):
     candidate: Path
     difference: FirstDifference
 
-    def shown(self) -> Shown:
+    def view(self) -> View:
         """Return the worst value that each module hands on."""
         worst: dict[str, BorderValue] = {}
         for each in self.difference.values:
@@ -327,11 +328,11 @@ class FirstDifferenceResult(Result):
             f" {self.difference.unknown} of either graph have no namesake in the other."
         )
         modules = table("Modules", columns, rows, note, words=3)
-        return Shown(headline_of(self.difference), [modules])
+        return View(headline_of(self.difference), [modules])
 
 
 def headline_of(difference: FirstDifference) -> str:
-    """Name the first module that differs, or say that there is none."""
+    """Return the line that names the first module that differs, if one does."""
     if difference.first is not None:
         return f"first below {difference.floor_db:g} dB: {difference.first}"
     below = sum(each.sqnr_db < difference.floor_db for each in difference.values)
@@ -369,7 +370,7 @@ def first_difference(
     paths = model_path(reference), model_path(candidate)
     recording = CalibrationSet(Path(frames))
     models = {
-        path: with_modules(opened(path, recording, options, listener, paths).model)
+        path: stamp_modules(opened(path, recording, options, listener, paths).model)
         for path in dict.fromkeys(paths)
     }
     shown = tuple(itertools.islice(recording, FRAMES))
@@ -378,8 +379,8 @@ def first_difference(
     return FirstDifferenceResult(*paths, difference)
 
 
-def with_modules(model: ir.Model) -> ir.Model:
-    """Write the module of every node into its metadata, where it does not stand yet."""
+def stamp_modules(model: ir.Model) -> ir.Model:
+    """Write every node's module into its metadata, if missing; return the model."""
     if provenance.missing(model):
         try:
             placed = assign(model, map_of(model, None))

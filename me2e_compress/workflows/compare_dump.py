@@ -18,9 +18,9 @@ from me2e_compress.fidelity.first_difference import (
 from me2e_compress.runtime.session import Session
 from me2e_compress.targets.quantized import describe_quantized
 from me2e_compress.workflows.checks import model_path, opened
-from me2e_compress.workflows.compare import headline_of, with_modules
+from me2e_compress.workflows.compare import headline_of, stamp_modules
 from me2e_compress.workflows.options import CompareOptions
-from me2e_compress.workflows.result import SILENT, Listener, Result, Shown
+from me2e_compress.workflows.result import SILENT, Listener, Result, View
 
 SAME_DB = 60.0
 """Above, two float32 programs differ by the order of their sums (60 dB: 0.1 %)."""
@@ -51,7 +51,7 @@ class DumpResult(Result):
     notes: tuple[str, ...]
     inner: FirstDifference | None
 
-    def shown(self) -> Shown:
+    def view(self) -> View:
         """Return what every output lost to what, and where the inside differs."""
         worst = min(self.outputs, key=lambda each: each.compilation_db)
         verdict = "the engine answers as its graph does"
@@ -79,7 +79,7 @@ class DumpResult(Result):
         title = f"What the engine lost over {plural(self.frames, 'frame')}"
         inside = [] if self.inner is None else [f"inside: {headline_of(self.inner)}"]
         dead = tuple(each.dead for each in self.outputs if each.dead)
-        return Shown(
+        return View(
             headline,
             [table(title, columns, rows, note + source)],
             [headline, *inside, *self.notes],
@@ -112,24 +112,24 @@ def compare_dump(
             another shape.
     """
     path, options = model_path(model), options or CompareOptions()
-    recording, answered = CalibrationSet(Path(frames)), EngineDump(dump)
-    answered.check(recording)
-    notes, inner = _checked_names(answered, path, graph.load(path)), None
+    recording, engine = CalibrationSet(Path(frames)), EngineDump(dump)
+    engine.check(recording)
+    notes, inner = _check_names(engine, path, graph.load(path)), None
     opening = opened(path, recording, options, listener)
     loaded, metadata = opening.model, opening.metadata
     provider = options.runs_on
     session = Session(
         path, optimize=False, release=True, provider=provider, metadata=metadata
     )
-    run = EngineRun(session, recording, answered)
-    source, original, why = None, None, ""
+    run = EngineRun(session, recording, engine)
+    source, original, float_reason = None, None, ""
     if float_graph is not None:
         source = model_path(float_graph)
         original = Session(source, release=True, provider=provider, metadata=metadata)
     elif describe_quantized(loaded) is None:
-        why = f"{path.name} is not quantized"
+        float_reason = f"{path.name} is not quantized"
     else:
-        why = "--float names no source"
+        float_reason = "--float names no source"
     total = len(recording)
     try:
         outputs = split_losses(
@@ -139,17 +139,18 @@ def compare_dump(
             lambda at: listener.on_progress("frames", at, total, ""),
         )
     except EvaluationError as error:
-        raise EvaluationError(f"{answered.path}: {error}") from error
-    if set(answered.names) - set(session.outputs):
-        named = with_modules(loaded)
+        raise EvaluationError(f"{engine.path}: {error}") from error
+    if set(engine.names) - set(session.outputs):
+        named = stamp_modules(loaded)
         inner = first_difference_of_engine(named, run, provider)
     return DumpResult(
-        path, answered.path, source, why, total, _state(run), outputs, notes, inner
+        *(path, engine.path, source, float_reason, total, _state_text(run)),
+        *(outputs, notes, inner),
     )
 
 
-def _checked_names(dump: EngineDump, path: Path, loaded: ir.Model) -> tuple[str, ...]:
-    """Check that the dump is of this graph; return what of it is not compared."""
+def _check_names(dump: EngineDump, path: Path, loaded: ir.Model) -> tuple[str, ...]:
+    """Return a note on outputs that are not dumped; an EvaluationError of others."""
     outputs = [str(each.name) for each in loaded.graph.outputs]
     if not set(outputs) & set(dump.names):
         raise EvaluationError(
@@ -167,7 +168,8 @@ def _checked_names(dump: EngineDump, path: Path, loaded: ir.Model) -> tuple[str,
     return (f"not dumped: {', '.join(lacking)}",) if lacking else ()
 
 
-def _state(run: EngineRun) -> str:
+def _state_text(run: EngineRun) -> str:
+    """Describe whose recurrent state the graph reads."""
     pairs = run.session.recurrent
     own = [name for name, output in pairs.items() if output not in run.names]
     if not pairs:

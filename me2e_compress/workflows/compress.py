@@ -45,8 +45,8 @@ from me2e_compress.workflows.measured_loss import (
     split_frames,
 )
 from me2e_compress.workflows.options import CompressOptions
-from me2e_compress.workflows.result import SILENT, Listener, Result, Shown, plain
-from me2e_compress.workflows.written import larger, slower
+from me2e_compress.workflows.result import SILENT, Listener, Result, View, plain
+from me2e_compress.workflows.written import size_note, speed_note
 
 Recipe: TypeAlias = str | Path | Sequence[Pass]
 """A shipped recipe's name, a TOML file, or passes."""
@@ -94,13 +94,13 @@ class CompressResult(Result):
         share = self.output_bytes / self.source_bytes
         return f"{format_mb(self.output_bytes)} MB, {share:.1%} of {self.source.name}"
 
-    def shown(self) -> Shown:
+    def view(self) -> View:
         """Return passes and checks, what the outputs lost, time and size.
 
         An alert says that nothing became int8, that quality is below the floor, or
         that the target refuses the graph or computes it otherwise.
         """
-        report = beside(self.output, "report")
+        report = sidecar(self.output, "report")
         headline = f"{self.output}: {self.size}; report: {report}"
         weights = self.weights and f"weights: {self.weights}"
         time = f"took {self.seconds:.0f} CPU s"
@@ -113,21 +113,21 @@ class CompressResult(Result):
         error = None
         if lint is not None and lint.asked and lint.refusal is not None:
             error = PreconditionError(f"written, but {lint.refusal}")
-        return Shown(
+        return View(
             headline,
             (*self.report.tables(), *filter(None, [measured])),
-            filter(None, (*self.verdict(), time, headline, weights)),
+            filter(None, (*self.summary_lines(), time, headline, weights)),
             (
                 *(() if self.loss is None else self.loss.alerts()),
-                *filter(None, ["" if self.int8 is None else self.int8.empty]),
+                *filter(None, ["" if self.int8 is None else self.int8.why_empty]),
                 *(n for s in self.report.steps for n in s.notes if NOT_FINITE in n),
                 *(f"lint: {line}" for line in wrong),
             ),
             error,
         )
 
-    def verdict(self) -> Iterator[str]:
-        """Yield what became int8, what is proven, and how far the outputs moved."""
+    def summary_lines(self) -> Iterator[str]:
+        """Yield lines for people: int8, what is proven or not, loss, lint, size."""
         if self.int8 is not None:
             yield self.int8.line
             yield from filter(None, [self.int8.slow_here])
@@ -167,7 +167,7 @@ class CompressResult(Result):
             "int8": self.int8,
             "fidelity": None if self.loss is None else self.loss.record(),
             "lint": None if self.lint is None else self.lint.summary(),
-            "verdict": [*self.verdict(), *self.alerts()],
+            "verdict": [*self.summary_lines(), *self.alerts()],
         }
         return {name: plain(each) for name, each in findings.items()}
 
@@ -203,23 +203,23 @@ def passes_of(recipe: Recipe | None, options: CompressOptions) -> tuple[Pass, ..
         )
     if options.scheme is not None:
         passes = (*passes, QuantizeInt8(scheme=options.scheme))
-    return _with_int8(with_sizes(passes, options.dims), options)
+    return _set_int8(with_sizes(passes, options.dims), options)
 
 
-def _with_int8(passes: tuple[Pass, ...], options: CompressOptions) -> tuple[Pass, ...]:
-    """Set options of the passes that quantize, else of those that read ranges."""
+def _set_int8(passes: tuple[Pass, ...], options: CompressOptions) -> tuple[Pass, ...]:
+    """Return passes with the int8 options set where they quantize, else read ranges."""
     named = ("rules", "target", "method")
-    given: dict[str, object] = {n: v for n in named if (v := getattr(options, n))}
+    chosen: dict[str, object] = {n: v for n in named if (v := getattr(options, n))}
     files = {"overrides": options.overrides, "ranges": options.ranges}
-    given |= {name: Path(file) for name, file in files.items() if file is not None}
-    if not given:
+    chosen |= {name: Path(file) for name, file in files.items() if file is not None}
+    if not chosen:
         return passes
     # an option that no pass takes would be ignored without a word
     readers = [each for each in passes if each.quantizes] or [
         each for each in passes if each.reads_ranges
     ]
     known = {name for each in readers for name in each.option_names()}
-    if unknown := [name for name in given if name not in known]:
+    if unknown := [name for name in chosen if name not in known]:
         raise RecipeError(
             f"--{unknown[0].replace('_', '-')} is for int8, and the pipeline has no"
             f" {QuantizeInt8.name}: add --scheme"
@@ -227,7 +227,7 @@ def _with_int8(passes: tuple[Pass, ...], options: CompressOptions) -> tuple[Pass
     # each reader gets those options that it knows
     return tuple(
         dataclasses.replace(
-            each, **{n: v for n, v in given.items() if n in each.option_names()}
+            each, **{n: v for n, v in chosen.items() if n in each.option_names()}
         )
         if each in readers
         else each
@@ -264,7 +264,7 @@ def compress(
     named = recipe if isinstance(recipe, str | Path) else None
     # claim the outputs first; Python's cycle collector would walk every node
     inputs = (source, named, frames, options.module_map, options.adapter, *read)
-    reported = beside(output, "plan"), beside(output, "report")
+    reported = sidecar(output, "plan"), sidecar(output, "report")
     outputs = (output, *data_names(output), *reported)
     with writing(outputs, inputs, force=options.force), collector_paused():
         loaded = read_graph(source, listener, options.adapter, options.module_map)
@@ -283,27 +283,28 @@ def compress(
         manager = PassManager(passes, checked, output.parent, seen.samples, first)
         report = manager.run(loaded, context, partial(listener.on_progress, "passes"))
         int8 = Int8Outcome.of(report, context)
-        _refuse(report, int8, options, listener)
+        _check_int8(report, int8, options, listener)
         # measure what lossy passes cost, on the frames kept for it
         if report.lossy and seen.measured is not None:
             first(report.model, output.name)
         loss = measure_loss(report, provider, seen, Floor(options.floor), listener)
         linted = lint_written(report.model, passes, output, options.target)
         seconds = cpu_seconds() - start
-        made = _written(report, source, output, int8, loss, seconds, linted)
+        made = _write(report, source, output, int8, loss, seconds, linted)
         placed = () if int8 is None or int8.slow_here else report.lossy
         if shown is None or provider.native != CPU.native or not placed:
             return made
-        return dataclasses.replace(made, slower=slower(source, output, shown, provider))
+        slower = speed_note(source, output, shown, provider)
+        return dataclasses.replace(made, slower=slower)
 
 
-def _refuse(
+def _check_int8(
     report: Report,
     int8: Int8Outcome | None,
     options: CompressOptions,
     listener: Listener,
 ) -> None:
-    """Refuse exact passes that could not be run, and a graph without int8."""
+    """Raise a PreconditionError of unproven exact passes, or a graph without int8."""
     # who asked for no check gets none
     unproven = () if report.lossy or not options.verify_frames else report.unproven
     for check in unproven:
@@ -312,20 +313,20 @@ def _refuse(
             f" {check.unproven}; nothing is written; --verify-frames 0 writes it"
             " unproven"
         )
-    if int8 is None or not int8.empty:
+    if int8 is None or not int8.why_empty:
         return
     if not options.allow_empty:
         way = advice(report.model) or "-r exact writes a graph without int8"
-        raise PreconditionError(f"{int8.empty}; nothing is written; {way}")
-    listener.on_warning(int8.empty)
+        raise PreconditionError(f"{int8.why_empty}; nothing is written; {way}")
+    listener.on_warning(int8.why_empty)
 
 
-def beside(output: Path, what: str) -> Path:
+def sidecar(output: Path, what: str) -> Path:
     """Return the path of the ``plan`` or ``report`` beside a compressed graph."""
     return output.with_name(f"{output.stem}.{what}.json")
 
 
-def _written(
+def _write(
     report: Report,
     source: Path,
     output: Path,
@@ -339,12 +340,12 @@ def _written(
     with drafts.all_or_none():
         graph.save(with_own_domains(report.model), output)
         if plan is not None:
-            save_plan(plan, beside(output, "plan"))
+            save_plan(plan, sidecar(output, "plan"))
         sizes = graph.file_bytes(source), graph.file_bytes(output)
-        grown = larger(source, output)
-        made = CompressResult(
+        grown = size_note(source, output)
+        result = CompressResult(
             source, output, report, {}, *sizes, int8, loss, seconds, linted, grown
         )
-        record = report.record(source, output) | made.findings()
-        write_document(beside(output, "report"), record, indent=2)
-    return dataclasses.replace(made, record=record)
+        record = report.record(source, output) | result.findings()
+        write_document(sidecar(output, "report"), record, indent=2)
+    return dataclasses.replace(result, record=record)

@@ -29,7 +29,7 @@ from me2e_compress.simulator.routes import Route, pick_routes
 from me2e_compress.targets.onnxruntime import slow_here
 from me2e_compress.workflows.checks import check_folder, model_path, try_first, writing
 from me2e_compress.workflows.options import EvaluateOptions, GraphOptions
-from me2e_compress.workflows.result import SILENT, Listener, Result, Shown
+from me2e_compress.workflows.result import SILENT, Listener, Result, View
 from me2e_compress.workflows.score import driving_score, scores_table
 
 _FLAGS = {"module_map": "map"}
@@ -89,7 +89,7 @@ class EvaluateResult(Result):
     deadlines: Deadlines | None = None
     slow_here: str | None = None
 
-    def shown(self) -> Shown:
+    def view(self) -> View:
         """Return every score with its interval, and the latencies charged.
 
         Alerts are the routes that ended by a failure, and a form that is slow here.
@@ -98,7 +98,7 @@ class EvaluateResult(Result):
         if self.deadlines is not None:
             tables.append(deadlines_table(self.policy, self.deadlines))
         slow = self.slow_here and f"{self.policy}: {self.slow_here}"
-        return Shown(
+        return View(
             f"{self.policy}: {driving_score(self.scores)}",
             tables,
             lines=(),  # the tables say everything
@@ -141,10 +141,10 @@ def evaluate(
     files = [value for value in values if isinstance(value, Path)]
     check_folder(output, (*read, *files), (MANIFEST,))
     with writing([log_beside(output)], folders=[output], force=options.force):
-        return _evaluated(evaluator, policy, output, options, listener)
+        return _drive(evaluator, policy, output, options, listener)
 
 
-def _evaluated(
+def _drive(
     evaluator: Evaluator,
     policy: str | Path | None,
     output: Path,
@@ -214,7 +214,7 @@ class ModelCheck(Result):
     outputs: tuple[PortUse, ...]
     problems: tuple[str, ...]
 
-    def shown(self) -> Shown:
+    def view(self) -> View:
         """Return every port of the graph, and whether it could drive."""
         ports = [("input", each) for each in self.inputs]
         ports += [("output", each) for each in self.outputs]
@@ -226,10 +226,10 @@ class ModelCheck(Result):
         columns = ("", "name", "shape", "type", "fed by, or used as")
         tables = [table(self.policy, columns, rows, words=5)] if rows else []
         if not self.problems:
-            return Shown(f"{self.policy} could drive", tables)
+            return View(f"{self.policy} could drive", tables)
         could_not = f"{self.policy} could not drive"
         error = EvaluationError(f"{could_not}: {self.problems[0]}")
-        return Shown(could_not, tables, alerts=self.problems, error=error)
+        return View(could_not, tables, alerts=self.problems, error=error)
 
 
 def check_model(
@@ -267,14 +267,14 @@ def check_model(
     except (GraphError, FramesError) as error:
         raise EvaluationError(str(error)) from error
     recurrent = recurrent_of(session, read)
-    fed = input_uses(session, read, recurrent)
+    inputs = input_uses(session, read, recurrent)
     outputs, unread = output_uses(session, read, recurrent)
     # problems are listed once each; only a model without any is run
-    texts = [*(each.problem for each in fed), unread]
+    texts = [*(each.problem for each in inputs), unread]
     problems = dict.fromkeys(filter(None, texts))
     if not problems:
         try:
             OnnxPolicy.of(session, read)  # it runs the model on zeros
         except (GraphError, FramesError, EvaluationError) as error:
             problems[str(error)] = None
-    return ModelCheck(named, fed, outputs, tuple(problems))
+    return ModelCheck(named, inputs, outputs, tuple(problems))

@@ -13,7 +13,7 @@ from me2e_compress.graph.stack.split import split_stack
 from me2e_compress.registry import drafts
 from me2e_compress.shipped import drivers as shipped
 from me2e_compress.workflows.checks import check_folder, model_path, writing
-from me2e_compress.workflows.result import Result, Shown
+from me2e_compress.workflows.result import Result, View
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
@@ -76,12 +76,12 @@ class JoinResult(Result):
     parts: tuple[str, ...]
     fed: tuple[FedInput, ...]
 
-    def shown(self) -> Shown:
+    def view(self) -> View:
         """Return the file, its size and parts, and what feeds every input of a part."""
         size, parts = format_mb(self.file_bytes), plural(len(self.parts), "part")
         rows = [dataclasses.astuple(each) for each in self.fed]
         columns = ("part", "input", "fed by", "form")
-        return Shown(
+        return View(
             f"{self.output}: {size} MB, {parts}: {', '.join(self.parts)}",
             [table("What feeds what", columns, rows, words=4)],
         )
@@ -117,10 +117,10 @@ class SplitResult(Result):
     files: dict[str, Path]
     missing: tuple[str, ...]
 
-    def shown(self) -> Shown:
+    def view(self) -> View:
         """Return the folder, its files and the parts that are gone."""
         names = ", ".join(path.name for path in self.files.values())
-        return Shown(
+        return View(
             f"{self.output}: {plural(len(self.files), 'file')}: {names}",
             alerts=[f"{each}: no output is left of it" for each in self.missing],
         )

@@ -95,47 +95,48 @@ def record_frames(
         raise FramesError(f"{folder}: name a folder of its own: it is written anew")
     check_folder(folder, (source, options.adapter))
     with writing(trees=[folder], folders=[partial_of(folder)], force=options.force):
-        return _recorded(source, folder, log, options, listener)
+        return _record(source, folder, log, options, listener)
 
 
-def _recorded(
+def _record(
     source: str | Path,
     folder: Path,
     log: DriveLog | None,
     options: FramesOptions,
     listener: Listener,
 ) -> Path:
-    model, of = model_path(source), sha256_of(model_path(source))
+    model, digests = model_path(source), sha256_of(model_path(source))
     adapter = None
     pixels: Mapping[str, PixelInput] = {}
     # a recording is continued only if the sources and the adapter are the same
     if options.adapter is not None:
         adapter = adapter_file(Path(options.adapter))
-        of += f" {sha256_of(adapter)}"
+        digests += f" {sha256_of(adapter)}"
     # frames come from a log, or from the shipped driver's driving
     about: dict[str, str | int] = {"stack": str(source)}
     if log is not None:
         count, length, provider = options.count, options.scene_length, options.runs_on
         request = LogRequest(model, count, length, adapter, provider)
-        make: Source = partial(log.frames, request)
+        frames_from: Source = partial(log.frames, request)
         pixels, about["log"] = log.pixels(request), LOGS.text(log)
     else:
         try_first(model, model.name, listener=listener, provider=options.runs_on)
         metadata = adapted(load(model), None, options.module_map)
-        of += f" {metadata}" if metadata else ""
-        make, about["seed"] = _driven(model, adapter, metadata, options), options.seed
+        digests += f" {metadata}" if metadata else ""
+        frames_from = _drive_source(model, adapter, metadata, options)
+        about["seed"] = options.seed
 
-    def reported(begin: Begin) -> Iterator[Frame]:
-        for frame in make(begin):
+    def with_progress(begin: Begin) -> Iterator[Frame]:
+        for frame in frames_from(begin):
             yield frame
             done = frame.index + 1
             listener.on_progress("frames", done, options.count, folder.name)
 
-    key = f"{__version__} {of} {options.count} {options.scene_length}"
-    return write_recording(folder, reported, about, key, pixels)
+    key = f"{__version__} {digests} {options.count} {options.scene_length}"
+    return write_recording(folder, with_progress, about, key, pixels)
 
 
-def _driven(
+def _drive_source(
     model: Path,
     adapter: Path | None,
     metadata: Mapping[str, str],

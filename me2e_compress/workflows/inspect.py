@@ -27,11 +27,10 @@ from me2e_compress.workflows.checks import (
     shortcomings,
 )
 from me2e_compress.workflows.options import InspectOptions
-from me2e_compress.workflows.result import Result, Shown
+from me2e_compress.workflows.result import Result, View
 
 WEIGHTS = "me2e.weights"
 """Metadata key of what an exporter says of the checkpoint that it took."""
-
 _SHOWN = 8
 """Number of reasons for unknown MACs that are named."""
 
@@ -72,7 +71,7 @@ class InspectResult(Result):
     recurrent: dict[str, str] = dataclasses.field(default_factory=dict)
     weights: str = ""
 
-    def shown(self) -> Shown:
+    def view(self) -> View:
         """Return the interface, the modules, what is lacking and the checkpoint."""
         more = f" and {', '.join(self.domains)}" if self.domains else ""
         read = f" ({self.lowered})" if self.lowered else ""
@@ -100,7 +99,7 @@ class InspectResult(Result):
         back = f"fed back: {', '.join(pairs)}" if pairs else ""
         weights = self.weights and f"weights: {self.weights}"
         columns = ("module", "nodes", "parameters", "MB", "GMACs")
-        return Shown(
+        return View(
             headline,
             (
                 table("Interface", ("", "name", "type", "shape"), ports, back, words=4),
@@ -145,8 +144,8 @@ def inspect(model: str | Path, options: InspectOptions | None = None) -> Inspect
     inputs, outputs = graph.interface(loaded)
     items = itemise(loaded, modules, placed.module_of)
     # MACs need shapes, and folded shape arithmetic
-    folded = _folded(loaded, modules)
-    costs = {item.module: item for item in _costs(folded, modules)}
+    folded = _fold_shapes(loaded, modules)
+    costs = {item.module: item for item in _module_costs(folded, modules)}
     items = tuple(
         dataclasses.replace(
             item, macs=cost.macs, unknown_macs_nodes=cost.unknown_macs_nodes
@@ -187,11 +186,11 @@ def inspect(model: str | Path, options: InspectOptions | None = None) -> Inspect
 
 
 def weigh(model: ir.Model, modules: ModuleMap) -> tuple[Item, ...]:
-    """Weigh the modules after shape arithmetic is folded, which MACs depend on."""
-    return _costs(_folded(model, modules), modules)
+    """Return nodes, bytes and MACs by module, after shape arithmetic is folded."""
+    return _module_costs(_fold_shapes(model, modules), modules)
 
 
-def _folded(model: ir.Model, modules: ModuleMap) -> ir.Model:
+def _fold_shapes(model: ir.Model, modules: ModuleMap) -> ir.Model:
     """Return a graph imported, its shape arithmetic folded, its shapes inferred."""
     if provenance.missing(model):
         manager = PassManager(recipe.parse(_SHAPES), verify_frames=0)
@@ -200,5 +199,5 @@ def _folded(model: ir.Model, modules: ModuleMap) -> ir.Model:
     return model
 
 
-def _costs(model: ir.Model, modules: ModuleMap) -> tuple[Item, ...]:
+def _module_costs(model: ir.Model, modules: ModuleMap) -> tuple[Item, ...]:
     return itemise(model, modules, provenance.module_of, macs_counter(model))

@@ -22,7 +22,7 @@ _FLOATS = (ir.DataType.FLOAT, ir.DataType.FLOAT16, ir.DataType.DOUBLE)
 
 
 def float_bytes(model: ir.Model, plan: QuantPlan) -> dict[str, int]:
-    """Count the bytes of weights that stay float by rule, the most first.
+    """Return the bytes of weights that stay float by rule, the most first.
 
     Left out are weights that any node stores as int8, biases of int8 layers, and
     constants below a kilobyte. What the plan's target leaves in float is by ``target``.
@@ -127,8 +127,8 @@ class Int8Outcome:
         return line
 
     @property
-    def empty(self) -> str:
-        """Why nothing became int8, in one line; empty if something did."""
+    def why_empty(self) -> str:
+        """Why nothing became int8, with the two commonest rules; empty if some did."""
         if self.nodes:
             return ""
         # say what the layers are kept float by, the commonest rules first

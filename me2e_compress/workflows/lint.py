@@ -27,7 +27,7 @@ from me2e_compress.targets.tensorrt import TensorRT
 from me2e_compress.targets.tensorrt.rtx_check import BuildResult, check
 from me2e_compress.workflows.checks import model_path, try_first
 from me2e_compress.workflows.options import LintOptions
-from me2e_compress.workflows.result import SILENT, Listener, Result, Shown, Status
+from me2e_compress.workflows.result import SILENT, Listener, Result, Status, View
 
 
 @dataclasses.dataclass(frozen=True)
@@ -74,7 +74,7 @@ class LintResult(Result):
         return self._first("wrong", f"{self.options.target} computes it otherwise")
 
     def _first(self, severity: Severity, what: str) -> str | None:
-        """Count the findings of a severity, and tell the first."""
+        """Return the count of a severity's findings and the first; None without any."""
         matches = [each for each in self.findings if each.severity == severity]
         if not matches:
             return None
@@ -84,7 +84,7 @@ class LintResult(Result):
             f" {first.rule} {first.node!r}: {first.message}"
         )
 
-    def shown(self, every: bool = False) -> Shown:
+    def view(self, every: bool = False) -> View:
         """Return counts and findings, three nodes of each rule unless `every` is set.
 
         A note counts the others; lines say what TensorRT-RTX answers.
@@ -109,7 +109,7 @@ class LintResult(Result):
             if cut := build.cut:
                 answer.append(f"cut at {len(cut)} plugins: {', '.join(cut[:5])}")
         reason = self.refusal or self.miscomputed
-        return Shown(
+        return View(
             self.headline,
             [findings] if rows else [],
             (self.headline, *answer),
@@ -139,7 +139,7 @@ class LintResult(Result):
         )
 
     def summary(self) -> tuple[RuleSummary, ...]:
-        """Return one row per rule."""
+        """Return one row per severity and rule, in the order of the findings."""
         rows: dict[tuple[Severity, str], list[LintFinding]] = {}
         for each in self.findings:
             rows.setdefault((each.severity, each.rule), []).append(each)
@@ -170,35 +170,35 @@ def lint(
     """
     path = model_path(model)
     loaded = graph.load(path)
-    options = asked_of(loaded, options or LintOptions())
-    judge, provider = _judge(options), options.runs_on
-    findings = judge.lint(loaded)
+    options = retarget(loaded, options or LintOptions())
+    target, provider = _target_of(options), options.runs_on
+    findings = target.lint(loaded)
     if provider.native != CPU.native:  # the list of kernels is the CPU's
         findings = tuple(each for each in findings if each.rule != "kernel")
     # a graph that the rules refuse is not opened
     if not any(each.severity == "error" for each in findings):
-        if judge.opens:
+        if target.opens:
             try_first(loaded, path.name, listener=listener, provider=provider)
-        findings = worst_first((*findings, *judge.read_back(loaded, provider)))
+        findings = worst_first((*findings, *target.read_back(loaded, provider)))
     build = check(loaded, options.sm) if options.trt_check else None
     return LintResult(path, options, findings, build)
 
 
-def asked_of(model: ir.Model, options: LintOptions) -> LintOptions:
-    """Return the options with the target that a graph is asked for."""
+def retarget(model: ir.Model, options: LintOptions) -> LintOptions:
+    """Return options with the target named, or the plan's, or tensorrt; or refuse."""
     if options.target is None:
         plan = None if options.of_tensorrt else plan_of(model)
         written_for = "" if plan is None else plan.target
         options = dataclasses.replace(options, target=written_for or "tensorrt")
-    if options.runs_on != CPU and not _judge(options).opens:
+    if options.runs_on != CPU and not _target_of(options).opens:
         raise RecipeError(
             f"--provider is onnxruntime's: lint for {options.target} opens no session"
         )
     return options
 
 
-def _judge(options: LintOptions) -> Target:
-    """Return the target, whose rules judge the graph."""
+def _target_of(options: LintOptions) -> Target:
+    """Return the target whose rules judge the graph; a RecipeError if there is none."""
     if options.target_version is None:
         return TARGETS.parse(options.target or "tensorrt")
     try:
@@ -218,5 +218,5 @@ def lint_written(
     if not targets:
         return None
     options = LintOptions(target=targets[-1])
-    findings = _judge(options).lint(with_own_domains(model))
+    findings = _target_of(options).lint(with_own_domains(model))
     return LintResult(Path(output.name), options, findings, asked=asked is not None)

@@ -45,7 +45,7 @@ from me2e_compress.runtime.energy.energy_result import Absent
 from me2e_compress.runtime.providers import PROVIDERS
 from me2e_compress.shipped.drivers import SHIPPED
 from me2e_compress.targets import TARGETS
-from me2e_compress.workflows.result import Result, Shown
+from me2e_compress.workflows.result import Result, View
 
 _OURS = "me2e-compress"
 _COMMENT = re.compile(r"(?:#.*\n)+")
@@ -60,7 +60,7 @@ class ListResult(Result):
     kinds: Mapping[str, tuple[Entry, ...]]
     closely: bool = False
 
-    def shown(self) -> Shown:
+    def view(self) -> View:
         """Return a table of each kind: names, descriptions and options."""
         headline = ", ".join(f"{len(each)} {kind}" for kind, each in self.kinds.items())
         tables, by = list[Table](), "other packages add theirs by entry point: "
@@ -82,10 +82,10 @@ class ListResult(Result):
                 rows += [("", text.replace("`", "")) for text in words]
             note = by + REGISTRIES[kind].group if kind in REGISTRIES else ""
             tables.append(table(kind, ("name", "what it is"), rows, note, words=2))
-        return Shown(headline, tables, ())
+        return View(headline, tables, ())
 
 
-def _file(path: Traversable) -> Entry:
+def _toml_entry(path: Traversable) -> Entry:
     """Describe a TOML file by the first sentence of the comment at its head."""
     comment = _COMMENT.match(path.read_text(encoding="utf-8"))
     text = " ".join((comment.group() if comment else "").replace("#", " ").split())
@@ -113,14 +113,14 @@ REGISTRIES: Mapping[str, Registry[Any]] = {
 """Registries to which other packages add."""
 
 
-def _described(kind: str) -> tuple[Entry, ...]:
+def _entries(kind: str) -> tuple[Entry, ...]:
     return describe(REGISTRIES[kind])
 
 
 KINDS: Mapping[str, Callable[[], tuple[Entry, ...]]] = {
-    **{kind: partial(_described, kind) for kind in REGISTRIES},
+    **{kind: partial(_entries, kind) for kind in REGISTRIES},
     "recipes": lambda: tuple(
-        _file(path)
+        _toml_entry(path)
         for path in sorted(
             resources.files("me2e_compress").joinpath("recipes").iterdir(),
             key=lambda path: path.name.removesuffix(".toml"),
@@ -128,7 +128,7 @@ KINDS: Mapping[str, Callable[[], tuple[Entry, ...]]] = {
         if path.name.endswith(".toml")
     ),
     "adapters": lambda: tuple(
-        _file(adapter_file(Path(name))) for name in shipped_adapters()
+        _toml_entry(adapter_file(Path(name))) for name in shipped_adapters()
     ),
     "module-maps": lambda: tuple(
         Entry(each.name, _OURS, ", ".join(each.names()))
@@ -176,12 +176,12 @@ class DoctorResult(Result):
 
     checkups: tuple[Checkup, ...]
 
-    def shown(self) -> Shown:
+    def view(self) -> View:
         """Return what was found, and what to do for the rest."""
         count = sum(each.found is not None for each in self.checkups)
         rows = [(each.what, each.found or "no", each.advice) for each in self.checkups]
         columns = ("what", "found", "to have it")
-        return Shown(
+        return View(
             f"{count} of {len(self.checkups)} things found",
             [table("This machine", columns, rows, words=3)],
             (),
@@ -212,10 +212,10 @@ def doctor() -> DoctorResult:
     why, names = why_not(), ", ".join(each.op_type for each in KERNELS)
     advice = f"fused operators run as their bodies: {why}" if why else ""
     kernels = Checkup("compiled kernels", None if why else names, advice)
-    return DoctorResult((*machine, *packages, kernels, _gpu(), _energy()))
+    return DoctorResult((*machine, *packages, kernels, _check_gpu(), _check_energy()))
 
 
-def _energy() -> Checkup:
+def _check_energy() -> Checkup:
     counter = open_counter()
     if isinstance(counter, Absent):
         advice = f"joules are not measured here: {counter.reason}"
@@ -227,7 +227,7 @@ def _energy() -> Checkup:
         return Checkup("energy counter", what)
 
 
-def _gpu() -> Checkup:
+def _check_gpu() -> Checkup:
     # a driver without a GPU fails later than a missing driver
     try:
         pynvml.nvmlInit()

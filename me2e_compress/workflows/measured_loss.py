@@ -26,16 +26,14 @@ from me2e_compress.runtime.providers import Provider
 from me2e_compress.runtime.session import Session
 from me2e_compress.shipped.drivers import frames_of
 from me2e_compress.targets import TARGETS
-from me2e_compress.workflows.compare import compared, outputs_table
+from me2e_compress.workflows.compare import compare_sessions, outputs_table
 from me2e_compress.workflows.result import Listener
 from me2e_compress.workflows.runtime_loss import RuntimeLoss, has_int8_kernels
 
 NOT_ASKED = "--measure-frames 0"
-
 FEW_NODES = 3
 """So many int8 nodes are named where the loss is."""
-
-FEW = 3
+FEW_FRAMES = 3
 """Fewer frames say little: four of one drive lay 12 to 15 dB from four others."""
 
 
@@ -113,10 +111,10 @@ class MeasuredLoss:
             yield f"the outputs cannot be compared: {self.on}"
         if self.liveness is not None:
             yield from self.liveness.faults
-        if self.fidelity is not None and self.fidelity.frames < FEW:
+        if self.fidelity is not None and self.fidelity.frames < FEW_FRAMES:
             yield (
                 f"this verdict rests on {plural(self.fidelity.frames, 'frame')}:"
-                f" record {3 * FEW} or more, a third of which is measured on"
+                f" record {3 * FEW_FRAMES} or more, a third of which is measured on"
             )
         if self.fidelity is not None:
             yield from self.fidelity.stray_texts
@@ -148,7 +146,7 @@ class MeasuredLoss:
         return {name: getattr(self, name) for name in names if name != "seconds"}
 
 
-RUN = 4
+RUN_FRAMES = 4
 """Frames measured in a row of a model that has a state."""
 
 KEPT_OUT = "kept out of calibration"
@@ -198,7 +196,7 @@ def split_frames(
     if recording is None:
         reason = "no recorded frames" if samples is None else SHIPPED_FRAMES
         return SplitFrames(None, samples, reason, samples)
-    run = RUN if recurrent_inputs(model) else 1
+    run = RUN_FRAMES if recurrent_inputs(model) else 1
     calibration, measured = hold_out(recording, most, run)
     if any(each.reads_ranges and not each.needs_frames for each in passes):
         return SplitFrames(recording, measured, PERHAPS_SHARED)
@@ -225,7 +223,7 @@ def measure_loss(
     listener.on_progress("fidelity", 0, 1, "")
     # a graph that does not run or compare is a finding, not a failure
     try:
-        loss = _compared(loss, report, provider, frames.measured, frames.seen)
+        loss = _compare(loss, report, provider, frames.measured, frames.seen)
     except (FramesError, GraphError) as error:
         loss = dataclasses.replace(loss, on=str(error))
     except EvaluationError as error:  # not finite, or of another shape
@@ -233,14 +231,14 @@ def measure_loss(
     return dataclasses.replace(loss, seconds=cpu_seconds() - start)
 
 
-def _compared(
+def _compare(
     loss: MeasuredLoss,
     report: Report,
     provider: Provider,
     frames: Frames,
     seen: Frames | None,
 ) -> MeasuredLoss:
-    """Measure, and name what is below the floor."""
+    """Return the loss with fidelity, liveness and the outputs below the floor."""
     passes = [each.applied for each in report.lossy]
     before, after = report.lossy[0].before, report.model
     open_session = partial(Session, release=True, provider=provider)
@@ -255,7 +253,7 @@ def _compared(
     if written and has_int8_kernels(after, provider):
         kernels = open_session(after, stock=True)
     sets = SetTally.of(reference, session)
-    comparison = compared(reference, session, frames, after, kernels, sets)
+    comparison = compare_sessions(reference, session, frames, after, kernels, sets)
     if seen is not None:
         beside = comparison.fidelity.widen(compare(reference, session, seen))
         comparison = dataclasses.replace(comparison, fidelity=beside)

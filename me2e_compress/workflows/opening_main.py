@@ -28,7 +28,7 @@ def main(model: str, inputs: str, kernels: str, *disabled: str) -> None:
         from me2e_compress.operators.kernels import custom_ops
 
         custom_ops.register_named(options, kernels.split(","))
-    _say("open")
+    _print("open")
     open_it = functools.partial(
         ort.InferenceSession,
         model,
@@ -40,8 +40,8 @@ def main(model: str, inputs: str, kernels: str, *disabled: str) -> None:
         session = open_it()
     except Exception as refusal:  # whatever it raises: it is tried once more
         options.graph_optimization_level = ort.GraphOptimizationLevel.ORT_DISABLE_ALL
-        _say(" ".join(str(refusal).split()))
-        _say("plain")
+        _print(" ".join(str(refusal).split()))
+        _print("plain")
         session = open_it()
     if not Path(inputs).exists():
         return
@@ -53,11 +53,11 @@ def main(model: str, inputs: str, kernels: str, *disabled: str) -> None:
         if port.name not in feeds:
             word = port.type.removeprefix("tensor(").removesuffix(")")
             feeds[port.name] = np.zeros(port.shape, _NUMPY.get(word, word))
-    _say("run")
+    _print("run")
     session.run(None, {port.name: feeds[port.name] for port in session.get_inputs()})
 
 
-def _say(step: str) -> None:
+def _print(step: str) -> None:
     sys.stdout.write(f"{step}\n")
     sys.stdout.flush()
 

@@ -37,9 +37,9 @@ from me2e_compress.workflows.checks import (
     writing,
 )
 from me2e_compress.workflows.options import PlanOptions
-from me2e_compress.workflows.result import Result, Shown
+from me2e_compress.workflows.result import Result, View
 
-_MOST = "paper{without=[fused-operator]}"
+_MOST_RANGES = "paper{without=[fused-operator]}"
 """The rules that need all ranges that others do: an override may lift those."""
 
 
@@ -113,7 +113,7 @@ class PreparedGraph:
                 f"it tells every range that {self.reader.name} needs: none to measure"
             )
         else:
-            sets, none = (*RULE_SETS.usable(), _MOST), "no node can become int8"
+            sets, none = (*RULE_SETS.usable(), _MOST_RANGES), "no node can become int8"
             for rules, target in itertools.product(sets, TARGETS.usable()):
                 every = QuantizeInt8(
                     modules=self.modules.names(), rules=rules, target=target
@@ -139,7 +139,7 @@ class PlanResult(Result):
     plan: QuantPlan
     hint: str = ""
 
-    def shown(self, every: bool = False) -> Shown:
+    def view(self, every: bool = False) -> View:
         """Return how many nodes of each module became what by which rule.
 
         With `every` a row a node that could be int8, and what was decided together.
@@ -147,7 +147,7 @@ class PlanResult(Result):
         lines = filter(None, (self.hint, self.plan.headline))
         tables = list(self.plan.tables())
         if not every:
-            return Shown(self.plan.headline, tables, lines)
+            return View(self.plan.headline, tables, lines)
         rows = list[tuple[str, str]]()
         for each in self.plan.decisions:
             if each.could_be_int8:
@@ -163,7 +163,7 @@ class PlanResult(Result):
         if groups:
             columns = ("Concat", "tensors", "read by")
             tables.append(table("On one scale", columns, groups, words=3))
-        return Shown(self.plan.headline, tables, lines)
+        return View(self.plan.headline, tables, lines)
 
 
 def plan(
@@ -190,7 +190,7 @@ def plan(
     inputs = (source, options.overrides, options.module_map)
     with writing([written], inputs, force=options.force):
         # a file is a plan, carries one, or is a float graph to plan
-        read = _read(source)
+        read = _read_file(source)
         if isinstance(read, QuantPlan):
             # options that would change nothing
             names = ("overrides", "scheme", "rules", "target")
@@ -201,13 +201,13 @@ def plan(
                 )
             result = PlanResult(read)
         else:
-            result = _planned(source, read, options)
+            result = _plan(source, read, options)
         if written is not None:
             save_plan(result.plan, written)
     return result
 
 
-def _read(path: Path) -> QuantPlan | ir.Model:
+def _read_file(path: Path) -> QuantPlan | ir.Model:
     """Read the plan that a file is or carries, else its graph."""
     if path.suffix == ".json":
         return load_plan(path)
@@ -215,7 +215,7 @@ def _read(path: Path) -> QuantPlan | ir.Model:
     return plan_of(model) or model
 
 
-def _planned(file: Path, model: ir.Model, options: PlanOptions) -> PlanResult:
+def _plan(file: Path, model: ir.Model, options: PlanOptions) -> PlanResult:
     """Plan a float graph after the exact passes."""
     quantizer = QuantizeInt8(
         scheme=options.scheme or "full",
@@ -225,7 +225,7 @@ def _planned(file: Path, model: ir.Model, options: PlanOptions) -> PlanResult:
     )
     adapted(model, None, options.module_map or map_name(file))
     ready = PreparedGraph.of(file, model, options.module_map)
-    made = quantizer.plan(ready.model, Context(ready.modules))
-    TARGETS.parse(quantizer.target).check_types(made, ready.model)
+    decided = quantizer.plan(ready.model, Context(ready.modules))
+    TARGETS.parse(quantizer.target).check_types(decided, ready.model)
     hints = filter(None, (shortcomings(model), advice(model)))
-    return PlanResult(made, "; ".join(hints))
+    return PlanResult(decided, "; ".join(hints))

@@ -27,14 +27,13 @@ from me2e_compress.runtime.profile import profile as measure
 from me2e_compress.targets.onnxruntime import slow_here
 from me2e_compress.workflows.checks import load_map, model_path, opened, writing
 from me2e_compress.workflows.options import ProfileOptions, check_number
-from me2e_compress.workflows.result import SILENT, Listener, Result, Shown
+from me2e_compress.workflows.result import SILENT, Listener, Result, View
 
 _SHOWN = 12
 """Number of operators in a table."""
 BEYOND_P99 = 5
 """Samples beyond the 99th percentile from which on it is steady: with fewer, one
-disturbance more or less moves it.
-"""
+disturbance more or less moves it."""
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
@@ -63,7 +62,7 @@ class ProfileResult(Result):
         """The samples held against the budget."""
         return deadlines(self.trace.samples_us, self.budget_ms)
 
-    def shown(self) -> Shown:
+    def view(self) -> View:
         """Return percentiles, then modules, energy and operators.
 
         Lines tell how far the last percentile can be trusted; alerts what puts joules
@@ -100,7 +99,7 @@ class ProfileResult(Result):
         busy = str(load) if load is not None and load.busy else None
         slow = self.slow_here and f"{self.model.name}: {self.slow_here}"
         doubts = () if energy is None else energy.alerts()
-        return Shown(headline, tables, lines, (*doubts, *filter(None, (busy, slow))))
+        return View(headline, tables, lines, (*doubts, *filter(None, (busy, slow))))
 
     def to_json(self) -> object:
         """Return the trace, deadlines, shares, joules, and how busy the machine was."""
@@ -232,7 +231,7 @@ def import_profile(
     )
 
 
-def refuse_both(frames: Path | None, options: ProfileOptions) -> None:
+def check_import(frames: Path | None, options: ProfileOptions) -> None:
     """Refuse options that measure where latencies are imported."""
     asked = {
         "FRAMES": frames,

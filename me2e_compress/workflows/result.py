@@ -18,8 +18,8 @@ Status = Literal["ok", "warning", "refused"]
 
 
 @dataclasses.dataclass(frozen=True)
-class Shown:
-    """What is printed of a result: tables, then lines, then alerts in bold.
+class View:
+    """What people see of a result: tables, then lines, then alerts in bold.
 
     Attributes:
         headline: what it is, in one line.
@@ -46,41 +46,41 @@ class Result:
 
     keys: ClassVar[tuple[str, ...]] = ()
 
-    def shown(self) -> Shown:
-        """Return what is printed."""
-        return Shown(self.headline)
+    def view(self) -> View:
+        """Return what is printed; by default the headline alone."""
+        return View(self.headline)
 
     @property
     def headline(self) -> str:
         """What it is, in one line."""
-        return self.shown().headline
+        return self.view().headline
 
     def __repr__(self) -> str:
         """Show the class and the one line."""
         return f"<{type(self).__name__}: {self.headline}>"
 
     def tables(self) -> tuple[Table, ...]:
-        """Return what is printed first."""
-        return tuple(self.shown().tables)
+        """Return the tables, which are printed first."""
+        return tuple(self.view().tables)
 
     def lines(self) -> tuple[str, ...]:
-        """Return what is said below the tables."""
-        lines = self.shown().lines
+        """Return the lines below the tables."""
+        lines = self.view().lines
         return (self.headline,) if lines is None else tuple(lines)
 
     def alerts(self) -> tuple[str, ...]:
-        """Return what must not be overlooked: said last, in bold."""
-        return tuple(self.shown().alerts)
+        """Return what must not be overlooked: printed last, in bold."""
+        return tuple(self.view().alerts)
 
     def check(self) -> None:
-        """Raise the error of what is refused."""
-        if (error := self.shown().error) is not None:
+        """Raise the error of a result that is refused, if there is one."""
+        if (error := self.view().error) is not None:
             raise error
 
     @property
     def status(self) -> Status:
         """What a program acts on: ``refused`` where the command's exit code is 1."""
-        if self.shown().error is not None:
+        if self.view().error is not None:
             return "refused"
         return "warning" if self.alerts() else "ok"
 
@@ -140,15 +140,15 @@ class Listener:
         on_warning: gets one line per surprise.
     """
 
-    on_progress: Progress = field(default_factory=lambda: _silent, repr=False)
-    on_warning: Warn = field(default_factory=lambda: _silent, repr=False)
+    on_progress: Progress = field(default_factory=lambda: _ignore, repr=False)
+    on_warning: Warn = field(default_factory=lambda: _ignore, repr=False)
 
     def counting(self, stage: str, words: str = "") -> Callable[[int, int], None]:
         """Return a function of things done, and in all, that reports a stage."""
         return lambda done, total: self.on_progress(stage, done, total, words)
 
 
-def _silent(*words: object) -> None:
+def _ignore(*words: object) -> None:
     """Say nothing."""
 
 

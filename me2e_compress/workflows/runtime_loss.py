@@ -14,18 +14,15 @@ from me2e_compress.runtime.session import Session, replay
 from me2e_compress.targets.onnxruntime import int8_rewrites
 from me2e_compress.targets.quantized import describe_quantized
 
-APART_DB = 6.0
+NOISIER_DB = 6.0
 """From how much more noise on, in dB, an output is named: twice the amplitude."""
-
 QUIET_DB = 30.0
 """Outputs with an SQNR above that are not named: int8 kernels round ties otherwise than
 the nodes do, which is 36 dB of the driver's noisiest output (without any overflow)."""
-
 _OVERFLOW = (
     "sums of uint8 by int8 overflow 16 bits on this processor, which has no VNNI: set"
     " session.x64quantprecision to 1, as profile and evaluate do"
 )
-
 _NAMED = 5
 """How many layers a line names."""
 
@@ -48,11 +45,11 @@ class RuntimeLoss:
         """Yield what the runtime answers otherwise, and why; nothing if it does not."""
         if not self.sqnr_db:
             return
-        apart = ", ".join(
+        outputs = ", ".join(
             f"{name} {value:z.1f} dB (its nodes {self.nodes_db[name]:z.1f})"
             for name, value in self.sqnr_db.items()
         )
-        yield f"onnxruntime's int8 answers otherwise than the file: {apart}"
+        yield f"onnxruntime's int8 answers otherwise than the file: {outputs}"
         more = len(self.causes) - _NAMED
         for cause in self.causes[:_NAMED]:
             yield f"the runtime's, not the file's: {cause}"
@@ -79,7 +76,7 @@ class RuntimeTally:
     def add(
         self, reference: dict[str, Array], nodes: dict[str, Array], frame: Frame
     ) -> None:
-        """Add a frame: what the reference and the nodes of the graph answered."""
+        """Add the next frame's outputs: those of the reference and of the nodes."""
         answers = next(self._answers)
         for name in (each for each in nodes if each in reference):
             tally = self._tallies.setdefault(name, Tally(name))
@@ -90,18 +87,20 @@ class RuntimeTally:
     def result(
         self, model: ir.Model, fidelity: Fidelity, agents: SetFidelity | None = None
     ) -> RuntimeLoss:
-        """Return what is noisier than by the nodes, and the causes."""
+        """Return the outputs noisier than by the nodes, by `NOISIER_DB`, and causes."""
         nodes = {each.name: each.sqnr_db for each in fidelity.outputs}
         runs = {name: tally.sqnr_db for name, tally in self._tallies.items()}
         if agents is not None and self._sets is not None:
             nodes.update(agents.sqnr_db)
             runs.update(self._sets.result().sqnr_db)
-        apart = [
+        noisier = [
             name
             for name, sqnr in runs.items()
-            if sqnr < QUIET_DB and sqnr < nodes[name] and sqnr <= nodes[name] - APART_DB
+            if sqnr < QUIET_DB
+            and sqnr < nodes[name]
+            and sqnr <= nodes[name] - NOISIER_DB
         ]
-        if not apart:
+        if not noisier:
             return RuntimeLoss({}, {})
         shaped = model.clone()
         graph.infer_shapes(shaped)
@@ -109,8 +108,8 @@ class RuntimeTally:
         if not causes and int8_entry()[1] == "1":
             causes = [_OVERFLOW]
         return RuntimeLoss(
-            {name: runs[name] for name in apart},
-            {name: nodes[name] for name in apart},
+            {name: runs[name] for name in noisier},
+            {name: nodes[name] for name in noisier},
             tuple(causes),
         )
 

@@ -24,7 +24,7 @@ from me2e_compress.metrics.scores import (
     leaderboard_scores,
 )
 from me2e_compress.workflows.options import check_number
-from me2e_compress.workflows.result import SILENT, Listener, Result, Shown
+from me2e_compress.workflows.result import SILENT, Listener, Result, View
 from me2e_compress.workflows.score_eer import EerScores, estimate_cells, score_eer
 
 _NAMED = 5
@@ -49,16 +49,16 @@ class RealRun:
         Each figure is shown over the whole set, and over what was driven.
         """
         collected, off_rate = self.collected, self.collected.off_rate
-        broken = tuple(collected.broken)
+        broken, lists = tuple(collected.broken), self._route_lists()
         counts = [
             ("evaluated", "", str(len(collected.episodes))),
-            *((key, join_names(of), str(len(of))) for key, of in self._named().items()),
+            *((key, join_names(ids), str(len(ids))) for key, ids in lists.items()),
             ("not at 20 Hz", join_names(tuple(off_rate)), str(len(off_rate))),
             ("unfinished files", "", str(len(collected.unfinished))),
             ("broken", join_names(broken), str(len(broken))),
         ]
         # not every figure is both given by the simulator and computed here
-        of = self.leaderboard
+        board = self.leaderboard
         figures = [
             ("driving score", "driving_score", "%"),
             ("success rate", "success_rate", "%"),
@@ -67,12 +67,14 @@ class RealRun:
         ]
         rows = list[tuple[str, ...]]()
         for label, key, unit in figures:
-            both = [each.get(key, Quotients()) for each in (of.given, of.computed)]
+            both = [
+                each.get(key, Quotients()) for each in (board.given, board.computed)
+            ]
             if unit == "%":  # a missing route has no penalty
                 values = [format_number(each.set, ".4f") for each in both]
-                rows.append((label, "set", *values, str(of.set_size), unit))
+                rows.append((label, "set", *values, str(board.set_size), unit))
             values = [format_number(each.driven, ".4f") for each in both]
-            rows.append((label, "driven", *values, str(of.driven), unit))
+            rows.append((label, "driven", *values, str(board.driven), unit))
         real = f"{name}: real runs, Bench2Drive's routes"
         words = "given by the simulator, and computed with Bench2Drive's penalties"
         columns = ("score", "over", "given", "computed", "n", "unit")
@@ -112,14 +114,14 @@ class RealRun:
             },
             "records": {
                 "evaluated": len(collected.episodes),
-                **self._named(),
+                **self._route_lists(),
                 "unfinished": collected.unfinished,
                 "broken": collected.broken,
                 "intervals_s": collected.off_rate,
             },
         }
 
-    def _named(self) -> dict[str, Sequence[str]]:
+    def _route_lists(self) -> dict[str, Sequence[str]]:
         names = (
             *("crashed", "missing", "foreign", "repeated", "rerun"),
             *("contradictory", "unrecorded"),
@@ -161,7 +163,7 @@ class ScoreResult(Result):
     eer: EerScores | None = None
     late: Mapping[str, Deadlines] = dataclasses.field(default_factory=dict)
 
-    def shown(self) -> Shown:
+    def view(self) -> View:
         """Return a table a folder, records of real runs, EER_AV and its order.
 
         Alerts are failures that ended routes, and wrong records of real runs.
@@ -180,7 +182,7 @@ class ScoreResult(Result):
         )
         real = [line for name, each in self.real.items() for line in each.alerts(name)]
         eer = self.eer
-        return Shown(
+        return View(
             headline,
             (*tables, *(() if eer is None else eer.tables())),
             () if eer is None else eer.lines(),
@@ -241,8 +243,8 @@ def score(
                 f"{path}: not a results folder: it holds neither {MANIFEST} nor "
                 "records of a leaderboard"
             )
-        apart = None if real_metrics is None else Path(real_metrics)
-        run = score_real_run(path, apart, *named)
+        recordings = None if real_metrics is None else Path(real_metrics)
+        run = score_real_run(path, recordings, *named)
         scores[str(path)], runs[str(path)] = run.scores, run
         driven[str(path)] = run.collected.episodes
     # it would be ignored without a word
@@ -276,11 +278,11 @@ def driving_score(scores: Scores) -> str:
     if score.value is None:
         return f"driving score not measured ({score.measure.reason}); {routes}"
     room = scores.safety.room_kept
-    kept = "" if room.value is None else f", room kept {_between(room)} %"
-    return f"driving score {_between(score)}{kept}; {routes}"
+    kept = "" if room.value is None else f", room kept {_interval(room)} %"
+    return f"driving score {_interval(score)}{kept}; {routes}"
 
 
-def _between(estimate: Estimate) -> str:
+def _interval(estimate: Estimate) -> str:
     low, high = format_number(estimate.low, ".1f"), format_number(estimate.high, ".1f")
     return f"{format_number(estimate.value, '.1f')} ({low} to {high})"
 

@@ -49,7 +49,7 @@ from me2e_compress.workflows.options import (
     TrialOptions,
 )
 from me2e_compress.workflows.plan import PreparedGraph
-from me2e_compress.workflows.result import SILENT, Listener, Result, Shown
+from me2e_compress.workflows.result import SILENT, Listener, Result, View
 
 
 @dataclasses.dataclass(frozen=True)
@@ -60,15 +60,15 @@ class TrialFiles:
     frames: Path
     output: Path
 
-    def claimed(self, options: TrialOptions) -> AbstractContextManager[None]:
-        """Claim the recipe and its overrides while they are made."""
+    def claim_outputs(self, options: TrialOptions) -> AbstractContextManager[None]:
+        """Check the recipe and its overrides as outputs; see :func:`writing`."""
         output = output_path(self.output)
         named = (options.ranges, options.module_map, options.adapter)
         read = (self.model, self.frames, *named)
         overrides = output.with_name(output.stem + ".overrides.toml")
         return writing([output, overrides], read, force=options.force)
 
-    def trials(
+    def prepare(
         self, options: TrialOptions, listener: Listener
     ) -> tuple[Trials, tuple[str, ...]]:
         """Prepare the graph, calibrate once, and name the modules to try."""
@@ -120,7 +120,7 @@ class SearchResult(Result):
     limits: tuple[tuple[str, float], ...]
     written: str
 
-    def shown(self) -> Shown:
+    def view(self) -> View:
         """Return the recipe, and what was tried, best first."""
         rows = [
             (
@@ -136,7 +136,7 @@ class SearchResult(Result):
         )
         columns = ("int8", "loss", "predicted", *(unit for unit, _ in self.limits))
         tried = table("Tried, best first", columns, rows, f"budget: {limits}")
-        return Shown(self.written, [tried])
+        return View(self.written, [tried])
 
     def to_json(self) -> object:
         """Return the budgets, and what was tried."""
@@ -170,7 +170,7 @@ def search(
             f" slow: use --target {DEFAULT_TARGET}"
         )
     files = TrialFiles(model_path(model), Path(frames), Path(output))
-    with files.claimed(options):
+    with files.claim_outputs(options):
         if options.max_joules is not None:
             counter = open_counter()
             if isinstance(counter, Absent):
@@ -178,13 +178,13 @@ def search(
             if isinstance(counter, Reader):
                 counter.close()
         # calibrate once, then search variants of that one graph
-        trials, modules = files.trials(options, listener)
+        trials, modules = files.prepare(options, listener)
         # sizes and seconds in base units, as they are measured
         mb, ms, most_j = options.max_mb, options.max_ms, options.max_joules
         asked = (
             (mb and mb * 1e6, "bytes of weights", _weight_bytes),
-            (ms and ms / 1e3, "s", partial(_seconds, trials)),
-            (most_j, "J", partial(_joules, trials)),
+            (ms and ms / 1e3, "s", partial(_measure_seconds, trials)),
+            (most_j, "J", partial(_measure_joules, trials)),
         )
         budgets = [Budget(m, unit, of) for m, unit, of in asked if m is not None]
         report = partial(listener.on_progress, "modules")
@@ -194,18 +194,18 @@ def search(
     return SearchResult(files.output, tried, limits, written)
 
 
-def _weight_bytes(made: ir.Model) -> float:
-    return float(graph.size(made).weight_bytes)
+def _weight_bytes(model: ir.Model) -> float:
+    return float(graph.size(model).weight_bytes)
 
 
-def _joules(trials: Trials, made: ir.Model) -> float:
-    """Measure joules per frame over the fewest windows that give an interval."""
+def _measure_joules(trials: Trials, model: ir.Model) -> float:
+    """Return joules per frame over the fewest windows that give an interval."""
     provider, frames = trials.reference.session.provider, trials.reference.frames
     schedule = EnergySchedule(windows=FEWEST_WINDOWS)
     # energy is measured of a file
     with TemporaryDirectory() as folder:
         file = Path(folder) / "int8.onnx"
-        graph.save(made, file)
+        graph.save(model, file)
         energy = measure_energy(
             {"model": file}, frames, schedule=schedule, threads=0, provider=provider
         )["model"]
@@ -214,10 +214,10 @@ def _joules(trials: Trials, made: ir.Model) -> float:
     return energy.j_per_frame
 
 
-def _seconds(trials: Trials, made: ir.Model) -> float:
+def _measure_seconds(trials: Trials, model: ir.Model) -> float:
     """Return the least wall time of a frame in 5 runs."""
     provider = trials.reference.session.provider
-    session = Session(made, int8_kernels=True, release=True, provider=provider)
+    session = Session(model, int8_kernels=True, release=True, provider=provider)
     first = next(iter(trials.reference.frames))
     times = repeat(lambda: list(replay(session, [first])), number=1, repeat=6)
     return min(times[1:])  # the first warms up
@@ -239,7 +239,7 @@ class SensitivityResult(Result):
     limit: float
     written: str
 
-    def shown(self) -> Shown:
+    def view(self) -> View:
         """Return what int8 costs by module, the nodes to blame, recipe and its loss."""
         sensitivity, unit = self.sensitivity, self.sensitivity.together.unit
         rows = [
@@ -260,7 +260,7 @@ class SensitivityResult(Result):
             loss = f"{format_significant(self.score.loss)} {self.score.unit}"
             lines.append(f"its loss: {loss}, limit {format_significant(self.limit)}")
         modules = table("Int8 module by module", columns, rows, note)
-        return Shown(self.written, [modules], lines)
+        return View(self.written, [modules], lines)
 
 
 def measure_sensitivity(
@@ -284,9 +284,9 @@ def measure_sensitivity(
     """
     options = options or SensitivityOptions()
     files = TrialFiles(model_path(model), Path(frames), Path(output))
-    with files.claimed(options):
+    with files.claim_outputs(options):
         # calibrate once, try modules and nodes, then choose within the limit
-        trials, modules = files.trials(options, listener)
+        trials, modules = files.prepare(options, listener)
         report, most = partial(listener.on_progress, "modules"), options.node_trials
         sensitivity = analyse(trials, modules, node_trials=most, progress=report)
         choice = advise(trials, sensitivity, options.limit)

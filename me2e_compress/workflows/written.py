@@ -13,13 +13,12 @@ from me2e_compress.runtime.session import Session, replay
 
 ROUNDS = 5
 """Runs of each file, the least of which counts."""
-
 ENOUGH_S = 3.0
 """So long is measured at most, but for the first round."""
 
 
-def larger(source: Path, output: Path) -> str:
-    """Say by how much a file is larger than its source, and why; empty if it is not."""
+def size_note(source: Path, output: Path) -> str:
+    """Return by how much a file is larger than its source, and why; else empty."""
     more = file_bytes(output) - file_bytes(source)
     if more <= 0:
         return ""
@@ -33,8 +32,8 @@ def larger(source: Path, output: Path) -> str:
     )
 
 
-def slower(source: Path, output: Path, frames: Frames, provider: Provider) -> str:
-    """Say how much longer than its source a file takes here; empty if it is faster.
+def speed_note(source: Path, output: Path, frames: Frames, provider: Provider) -> str:
+    """Return how much longer than its source a file takes here; empty if not longer.
 
     CPU time of one frame on one thread, in turn, as anybody opens the files. Empty,
     too, where one of them does not run.

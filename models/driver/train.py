@@ -8,7 +8,7 @@ The same command again goes on where it was interrupted.
 
 import sys
 
-from me2e_compress.cli import AGAIN, run_in_order
+from me2e_compress.cli import RUN_AGAIN, run_command
 from me2e_compress.cli.app import build_app
 from me2e_compress.cli.commands import Output
 from me2e_compress.cli.console import listening, show
@@ -54,7 +54,7 @@ def main() -> int:
     """Run the command, with one line for an error, as ``me2e-compress`` does."""
     app = build_app("python -m models.driver.train")
     app.default(command)
-    return run_in_order(lambda: app.meta(sys.argv[1:]), AGAIN)
+    return run_command(lambda: app.meta(sys.argv[1:]), RUN_AGAIN)
 
 
 if __name__ == "__main__":

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from me2e_compress.calibration.exchange import read_cache, taken_from
+from me2e_compress.calibration.exchange import pick_ranges, read_cache
 from me2e_compress.calibration.observers import QUANT_MAX, scale_of
 from me2e_compress.calibration.ranges import IMPORTED, Ranges
 from me2e_compress.errors import FramesError, RecipeError
@@ -101,12 +101,12 @@ def cache(*names: str) -> Ranges:
 
 
 def test_tensors_are_taken_from_a_cache_by_their_names() -> None:
-    found = taken_from(cache("x", "c", "other"), Path("c"), model("/c"), "xcr")
+    found = pick_ranges(cache("x", "c", "other"), Path("c"), model("/c"), "xcr")
 
     assert found.tensors == {"x": (-2.0, 2.0), "c": (-2.0, 2.0)}
     assert found.model == digest(model("/c"))
     merged = model("/conv", "/norm")  # whose name is not trusted
-    assert list(taken_from(cache("x", "c"), Path("c"), merged, "xc").tensors) == ["x"]
+    assert list(pick_ranges(cache("x", "c"), Path("c"), merged, "xc").tensors) == ["x"]
 
 
 @pytest.mark.parametrize("names", [("n1",), ("c", "n1", "n2")])
@@ -115,4 +115,4 @@ def test_a_cache_with_less_than_half_is_of_another_graph(
 ) -> None:
     message = rf"another graph: of 3 .* it lacks \w and . more; it has {names[0]}"
     with pytest.raises(FramesError, match=message):
-        taken_from(cache(*names), Path("c"), model("/c"), "xcr")
+        pick_ranges(cache(*names), Path("c"), model("/c"), "xcr")

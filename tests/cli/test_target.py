@@ -16,7 +16,7 @@ from me2e_compress.passes.quantize_int8 import QuantizeInt8
 from me2e_compress.quantization.decision import plan_of
 from me2e_compress.runtime.providers import CudaProvider
 from me2e_compress.simulator.routes import save_routes
-from me2e_compress.workflows.lint import asked_of
+from me2e_compress.workflows.lint import retarget
 from me2e_compress.workflows.options import LintOptions
 from tests.evaluators.highway.drivers import PARKED, slow_here, straight_on
 from tests.support.command import Cli, write_frames
@@ -110,16 +110,16 @@ def test_lint_asks_tensorrt_of_files_that_do_not_say(cli: Cli, model: Path) -> N
         assert cli.document(f"lint {file}", code=1)["target"] == "tensorrt"
     for option in ("--target tensorrt", "--target-version 10.13"):
         assert cli.document(f"lint out.onnx {option}", code=1)["target"] == "tensorrt"
-    assert asked_of(made, LintOptions(trt_check=True)).target == "tensorrt"
+    assert retarget(made, LintOptions(trt_check=True)).target == "tensorrt"
 
 
 def test_a_provider_is_for_whom_opens_a_session(model: Path, cli: Cli) -> None:
     cli.done(f"{INT8} -o out.onnx")
     options = LintOptions(provider=CudaProvider())
 
-    assert asked_of(graph.load(model / "out.onnx"), options).provider == CudaProvider()
+    assert retarget(graph.load(model / "out.onnx"), options).provider == CudaProvider()
     with pytest.raises(RecipeError, match="lint for tensorrt opens no session"):
-        asked_of(graph.load(model / "m.onnx"), options)
+        retarget(graph.load(model / "m.onnx"), options)
 
 
 def test_lowered_int8_is_for_onnxruntime(cli: Cli, model: Path) -> None:

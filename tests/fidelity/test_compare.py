@@ -388,7 +388,7 @@ def test_compare_matches_what_both_graphs_have(
     found = compare_files(one, other, frames, CompareOptions(alive=0.0))
 
     assert found.fidelity.outputs[0].sqnr_db < 6.0
-    (outputs,) = found.shown().tables
+    (outputs,) = found.view().tables
     if has_scores:
         assert found.agents is not None
         assert found.agents.sqnr_db["boxes"] == math.inf

@@ -32,7 +32,7 @@ if __name__ == "__main__":
     place = Path(sys.argv[1])
     script = place / "sleeper.py"
     said = children.run_script(place / "printer.py", ["word"])
-    with children.pool(1) as processes:
+    with children.process_pool(1) as processes:
         worker, is_deaf = processes.submit(look).result()
         processes.submit(stay)
         sleeper = threading.Thread(

@@ -126,7 +126,7 @@ def test_what_was_measured_otherwise_is_measured_again(
         days = len(paced)
         clock_of(changed, tmp_path)
         assert len(paced) == days + 1
-    monkeypatch.setattr(outcome, "describe_machine", lambda *_: "an Orin")
+    monkeypatch.setattr(outcome, "in_turn_text", lambda *_: "an Orin")
     clock_of(ours, tmp_path)
     assert len(paced) == 6
 

@@ -15,7 +15,7 @@ from me2e_compress.errors import GraphError
 from me2e_compress.registry.drafts import MARK
 from me2e_compress.runtime.frames import Frame
 from me2e_compress.shipped import drivers as shipped
-from me2e_compress.workflows.checks import check_ours, writing
+from me2e_compress.workflows.checks import check_replaceable, writing
 from me2e_compress.workflows.frames import record_frames
 
 THEIRS = "is there, and me2e-compress did not write it"
@@ -43,7 +43,7 @@ def test_one_file_of_the_user_among_ours_stays(tmp_path: Path) -> None:
     (tmp_path / "one").write_text(OURS)
     (tmp_path / "other").write_text("theirs")
     with pytest.raises(GraphError, match=rf"other {THEIRS}"):
-        check_ours([tmp_path / "one", tmp_path / "other"])
+        check_replaceable([tmp_path / "one", tmp_path / "other"])
 
 
 @pytest.mark.parametrize("target", ["ours", "nothing"])
@@ -68,9 +68,9 @@ def test_a_copy_of_a_model_that_ships_is_replaced_and_a_link_to_it_is_not(
 ) -> None:
     shipped.copy("highway", tmp_path / "copy.onnx")
     (tmp_path / "link.onnx").symlink_to("copy.onnx")
-    check_ours([tmp_path / "copy.onnx"])
+    check_replaceable([tmp_path / "copy.onnx"])
     with pytest.raises(GraphError, match=THEIRS):
-        check_ours([tmp_path / "link.onnx"])
+        check_replaceable([tmp_path / "link.onnx"])
 
 
 @pytest.fixture
@@ -83,20 +83,20 @@ def tree(tmp_path: Path) -> Path:
 
 
 def test_a_folder_is_ours_if_all_of_it_is(tree: Path) -> None:
-    check_ours([], trees=[tree, tree.parent / "new"])
+    check_replaceable([], trees=[tree, tree.parent / "new"])
     (tree / "in" / "notes.txt").write_text("theirs")
     with pytest.raises(GraphError, match=THEIRS):
-        check_ours([], trees=[tree])
-    check_ours([], trees=[tree], force=True)
+        check_replaceable([], trees=[tree])
+    check_replaceable([], trees=[tree], force=True)
 
 
 def test_a_link_in_a_folder_or_to_a_folder_is_not_ours(tree: Path) -> None:
     (tree.parent / "link").symlink_to(tree.name)
     with pytest.raises(GraphError, match=THEIRS):
-        check_ours([], trees=[tree.parent / "link"])
+        check_replaceable([], trees=[tree.parent / "link"])
     (tree / "in" / "link").symlink_to("other")
     with pytest.raises(GraphError, match=THEIRS):
-        check_ours([], trees=[tree])
+        check_replaceable([], trees=[tree])
 
 
 BUSY = """
@@ -174,4 +174,4 @@ def test_unfinished_frames_of_another_run_are_cleared_under_the_lock(
         write_recording(tmp_path / "out", source, {})
     names = sorted(each.name for each in (tmp_path / "out").iterdir())
     assert names == ["000000.npz", "scenes.json"]
-    check_ours([], trees=[tmp_path / "out"])
+    check_replaceable([], trees=[tmp_path / "out"])

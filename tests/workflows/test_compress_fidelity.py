@@ -257,16 +257,16 @@ def test_a_file_that_is_larger_or_no_faster_says_so(
     options = me2e.CompressOptions(scheme="full", rules="paper", module_map="map.toml")
     found = me2e.compress("in.onnx", "out.onnx", frames="frames", options=options)
 
-    more = larger(found.output, found.source)
+    more = size_note(found.output, found.source)
     count = found.source_bytes - found.output_bytes
     assert more.startswith(f"in.onnx is {count:,} bytes larger than out.onnx: origins")
     assert found.larger == ""
-    assert more in dataclasses.replace(found, larger=more).verdict()
+    assert more in dataclasses.replace(found, larger=more).summary_lines()
     # one second of the source, then so many of what was written
     for seconds, said in ((2, "out.onnx takes 2.00 times as long as in"), (0.9, "")):
         clock = itertools.accumulate(itertools.cycle([0, 1, 0, seconds]))
         monkeypatch.setattr("time.process_time", clock.__next__)
-        taken = slower(found.source, found.output, CalibrationSet("frames"), CPU)
+        taken = speed_note(found.source, found.output, CalibrationSet("frames"), CPU)
         assert (taken[: len(said)], bool(taken)) == (said, bool(said))
 
 

@@ -103,10 +103,7 @@ class EnergyRecording:
         return summarise(self.cut_windows(schedule), by, self.idle_w(schedule))
 
     def cut_windows(self, schedule: EnergySchedule) -> list[Window]:
-        """Cut windows in a row after the warm-up, and drop the rest of the work.
-
-        An EnergyError says that there are too few, or that the counter is stuck.
-        """
+        """Cut windows in a row after the warm-up; an EnergyError of too few."""
         # Find the stretch in which frames are done, and skip the warm-up.
         working = np.flatnonzero(np.diff(self.frames) > 0)
         if not len(working):

@@ -159,7 +159,7 @@ def compressed(
     """
     options = CompressOptions(target=target)
     result = compress(written.file, file, recipe, written.frames, options)
-    assert result.status != "refused", result.verdict
+    assert result.status != "refused", result.summary_lines
     for runtime in TARGETS if target is None else (target,):
         assert lint(file, LintOptions(target=runtime)).refusal is None
     sessions = Session(written.file), Session(file)
