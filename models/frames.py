@@ -8,7 +8,7 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 
-from me2e_compress.calibration.recording import Begin, partial_of, write_recording
+from me2e_compress.calibration.recording import Begin, partial_folder, write_recording
 from me2e_compress.errors import Me2eError
 from me2e_compress.runtime.frames import Frame
 from me2e_compress.version import __version__
@@ -49,7 +49,7 @@ def record(
 
     about: dict[str, str | int] = {"stack": stack, "seed": seed}
     key = f"{__version__} {stack} {count} {scene_length}"
-    with writing(trees=[folder], folders=[partial_of(folder)], force=force):
+    with writing(trees=[folder], folders=[partial_folder(folder)], force=force):
         return write_recording(folder, drawn, about, key)
 
 

@@ -52,7 +52,7 @@ def test_dots_in_a_string_are_no_key() -> None:
 def test_a_pipe_is_no_text_file(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe")
     with pytest.raises(MalformedError, match="not a regular file"):
-        documents.content(tmp_path / "pipe")
+        documents.read_bytes(tmp_path / "pipe")
 
 
 @pytest.mark.parametrize(

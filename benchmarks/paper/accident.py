@@ -78,14 +78,14 @@ class Accident:
 
     def save(self, path: Path) -> None:
         """Write it as JSON."""
-        with drafts.written(path, StudyError):
+        with drafts.writing_errors(path, StudyError):
             write_json(path, _ACCIDENT.dump_python(self, mode="json"))
 
     @classmethod
     def load(cls, path: Path) -> "Accident":
         """Read a file that `save` wrote."""
         with documents.reading(path, StudyError, "not an accident"):
-            content = documents.from_json(documents.content(path))
+            content = documents.from_json(documents.read_bytes(path))
             return _ACCIDENT.validate_python(content)
 
 

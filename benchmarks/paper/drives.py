@@ -112,7 +112,7 @@ class KeptFacts:
 
     def save(self, path: Path) -> None:
         """Write them as JSON."""
-        with drafts.written(path, StudyError):
+        with drafts.writing_errors(path, StudyError):
             path.parent.mkdir(parents=True, exist_ok=True)
             write_json(path, _KEPT.dump_python(self, mode="json"))
 
@@ -120,7 +120,7 @@ class KeptFacts:
     def load(cls, path: Path) -> "KeptFacts":
         """Read a file that `save` wrote."""
         with documents.reading(path, StudyError, "not facts of variants"):
-            content = documents.from_json(documents.content(path))
+            content = documents.from_json(documents.read_bytes(path))
             return _KEPT.validate_python(content)
 
     @property

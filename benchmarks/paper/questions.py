@@ -157,7 +157,7 @@ class PaperQuestions:
         """
         path = path or SHIPPED
         with documents.reading(path, StudyError, "not questions"):
-            content = documents.content(path)
+            content = documents.read_bytes(path)
             found = documents.from_toml(content)
             found["name"] = path.name
             found["sha256"] = hashlib.sha256(content).hexdigest()

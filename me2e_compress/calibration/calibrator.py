@@ -14,7 +14,7 @@ import onnx_ir as ir
 import onnx_ir.passes.common as common
 
 from me2e_compress import graph
-from me2e_compress.calibration.dataset import CalibrationSet, archive_of, load_arrays
+from me2e_compress.calibration.dataset import CalibrationSet, load_arrays, npz_bytes
 from me2e_compress.calibration.observers import DEFAULT_METHOD, OBSERVERS
 from me2e_compress.calibration.ranges import Ranges
 from me2e_compress.calibration.statistics import (
@@ -22,11 +22,11 @@ from me2e_compress.calibration.statistics import (
     NOT_FINITE,
     Floats,
     Statistics,
-    are_bad,
     check_finite,
     checksum,
-    first_maker,
-    places_of,
+    first_bad_node,
+    index_inputs,
+    is_not_finite,
 )
 from me2e_compress.errors import FramesError, GraphError
 from me2e_compress.graph.nodes import makers_of, reads_of
@@ -43,8 +43,6 @@ from me2e_compress.runtime.probing import (
 from me2e_compress.runtime.providers import CPU, Provider
 from me2e_compress.runtime.runnable import why_unsupported
 from me2e_compress.runtime.session import DTYPES, Session, feed_forward
-
-# The probes of a calibration: extremes, and histograms of magnitudes.
 
 
 @dataclasses.dataclass(frozen=True)
@@ -92,7 +90,7 @@ class Counts:
     width: int = BINS
 
     def read(self, where: ir.Graph, value: ir.Value, at: int) -> Reading:
-        """Compute bin numbers, and count them as a text's words are counted.
+        """Compute bin numbers, and count them as TF-IDF counts the words of a text.
 
         TfidfVectorizer is the one standard operator that counts integers: exact,
         available from opset 9 on, without a second array as large as the tensor.
@@ -192,7 +190,7 @@ class CalibrationCheckpoint:
         state = {_STATE + name: array for name, array in progress.state.items()}
         # The state shares the archive, under a prefix.
         head = {"key": np.array(json.dumps(self.key)), "done": np.array(progress.done)}
-        write_bytes(self.path, archive_of({**head, **progress.results, **state}))
+        write_bytes(self.path, npz_bytes({**head, **progress.results, **state}))
 
 
 Progress: TypeAlias = Callable[[int, int], None]
@@ -254,27 +252,27 @@ class Calibrator:
         counting = OBSERVERS.parse(self.method).counts
         if not len(frames):
             raise FramesError("no frames to calibrate on")
-        blank = Statistics(
+        empty = Statistics(
             graph.digest(model),
             frames.fingerprint,
             tuple(tensors),
             tuple(frames.places),
             np.empty((0, len(tensors), Extremes().width), np.float32),
-            inputs=_ports(model.graph.inputs),
-            outputs=_ports(model.graph.outputs),
+            inputs=_numeric_names(model.graph.inputs),
+            outputs=_numeric_names(model.graph.outputs),
             scenes=tuple(frames.places[at] for at in frames.scenes),
         )
         # Without tensors to measure, nothing is run.
         if not tensors:
             nothing = np.empty((len(frames), 0, Extremes().width), np.float32)
-            return dataclasses.replace(blank, measured=nothing, inputs=(), outputs=())
+            return dataclasses.replace(empty, measured=nothing, inputs=(), outputs=())
         if reason := why_unsupported(model, self.provider):
             raise GraphError(
                 f"{reason}; ranges that TensorRT measured are taken by `calibrate"
                 " --import CACHE`, and then by `compress --ranges`"
             )
         # Extremes first: they decide the bins of the histograms.
-        job = _Job(self, model, blank, frames, progress, 2 if counting else 1)
+        job = _Job(self, model, empty, frames, progress, 2 if counting else 1)
         job.extremes()
         if counting:
             job.counts()
@@ -314,7 +312,7 @@ class _Job:
         self.checkpoint = CalibrationCheckpoint(settings.checkpoint, key)
         self.begun = self.checkpoint.read()
         known = set(blank.tensors)
-        self.places = [name for name in places_of(model) if name not in known]
+        self.places = [name for name in index_inputs(model) if name not in known]
         # Continue from the checkpoint, if there is one.
         measured = self.begun.results.get("measured", blank.measured)
         counts = self.begun.results.get("counts")
@@ -332,13 +330,13 @@ class _Job:
         """Measure minimum, maximum and mean square of every tensor and frame."""
         rows, sums = list(self.seen.measured), self.seen.checksums.tolist()
         ports = (*self.seen.inputs, *self.seen.outputs)
-        for readings, held, place in self._pass(Extremes(), 0, self.places):
-            sums.append([checksum(held[name]) for name in ports])
+        for readings, arrays, place in self._pass(Extremes(), 0, self.places):
+            sums.append([checksum(arrays[name]) for name in ports])
             cause = self.seen.not_finite
-            if not cause and (are_bad(readings).any() or NOT_FINITE in sums[-1]):
+            if not cause and (is_not_finite(readings).any() or NOT_FINITE in sums[-1]):
                 seen = {*self.seen.tensors, *self.places, *self.seen.outputs}
                 provider = self.settings.provider
-                cause = first_maker(self.model, held, seen, Extremes(), provider)
+                cause = first_bad_node(self.model, arrays, seen, Extremes(), provider)
             watched = readings[: len(self.seen.tensors)]
             check_finite(watched, self.seen.tensors, place, cause)
             rows.append(watched)
@@ -359,12 +357,12 @@ class _Job:
             np.add(total, readings.astype(np.int64), out=total)
 
     def _pass(
-        self, probe: Probe, before: int, beside: Sequence[str] = ()
+        self, probe: Probe, before: int, others: Sequence[str] = ()
     ) -> Iterator[tuple[Floats, Mapping[str, Array], int]]:
         """Run the rest of a pass; ``before`` frames belong to earlier passes.
 
-        Yields the readings of each frame [tensors, width of the probe], then those of
-        tensors ``beside``, its inputs and outputs, and its index.
+        Yields the readings of each frame, float32 [tensors and ``others``, width of the
+        probe], its inputs and outputs, and its index.
         """
         # Skip what an interrupted run has done.
         begin = max(self.begun.done - before, 0)
@@ -372,7 +370,7 @@ class _Job:
             return
         session = probed_session(
             self.model,
-            (*self.seen.tensors, *beside),
+            (*self.seen.tensors, *others),
             probe,
             threads=self.settings.threads,
             optimize=self.settings.optimize,
@@ -401,8 +399,8 @@ class _Job:
                 self.progress(done, self.total)
 
 
-def _ports(values: Iterable[ir.Value]) -> tuple[str, ...]:
-    """Return the names of inputs or outputs that hold numbers."""
+def _numeric_names(values: Iterable[ir.Value]) -> tuple[str, ...]:
+    """Return the names of inputs or outputs of a type that numpy has."""
     numbers = [
         each
         for each in values

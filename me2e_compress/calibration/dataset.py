@@ -35,30 +35,27 @@ from me2e_compress.errors import FramesError, PreconditionError
 from me2e_compress.graph import array_of, static_shape
 from me2e_compress.graph.recurrence import not_fed_back, recurrent_inputs, sides
 from me2e_compress.registry import documents, drafts
-from me2e_compress.registry.documents import UNREADABLE, check_regular
+from me2e_compress.registry.documents import NPZ_ERRORS, check_regular
 from me2e_compress.runtime.frames import Array, Frame
-
-# Write ``.npz`` files, and read them, checking their sizes first.
-
 
 LARGEST_BYTES = 2 << 30
 """The most bytes of all arrays of one file. Six full-size camera images have 0.1 GB."""
 
 
 @dataclasses.dataclass(frozen=True)
-class Declared:
+class Header:
     """Shape and type of an array, as its file states."""
 
     shape: tuple[int, ...]
     dtype: np.dtype[np.generic]
 
 
-def declared(path: Path, what: str = "a readable .npz") -> Mapping[str, Declared]:
+def read_headers(path: Path, what: str = "a readable .npz") -> Mapping[str, Header]:
     """Read the headers of an ``.npz`` by array name, without the arrays.
 
-    The message calls the expected content ``what``.
+    ``what`` is the expected content, for the FramesError of a file that is none.
     """
-    arrays, total = dict[str, Declared](), 0
+    arrays, total = dict[str, Header](), 0
     try:
         check_regular(path)
         with path.open("rb") as source, zipfile.ZipFile(source) as archive:
@@ -76,7 +73,7 @@ def declared(path: Path, what: str = "a readable .npz") -> Mapping[str, Declared
                 if name in arrays:
                     raise ValueError("an array is there twice")
                 arrays[name], total = about, total + size
-    except UNREADABLE as error:
+    except NPZ_ERRORS as error:
         raise FramesError(f"{path}: not {what} ({error_line(error)})") from error
     # A header could claim any size: check before reading.
     if total > LARGEST_BYTES:
@@ -89,15 +86,15 @@ def declared(path: Path, what: str = "a readable .npz") -> Mapping[str, Declared
 
 def load_arrays(path: Path, what: str = "a readable .npz") -> dict[str, Array]:
     """Read every array of an ``.npz`` by name, after the checks of :func:`declared`."""
-    declared(path, what)
+    read_headers(path, what)
     try:
         with path.open("rb") as source, np.load(source, allow_pickle=False) as content:
             return {name: np.asarray(content[name]) for name in content}
-    except UNREADABLE as error:
+    except NPZ_ERRORS as error:
         raise FramesError(f"{path}: not {what} ({error_line(error)})") from error
 
 
-def archive_of(
+def npz_bytes(
     arrays: Mapping[str, Array], compression: int = zipfile.ZIP_STORED
 ) -> bytes:
     """Return an ``.npz`` of arrays; equal arrays give equal bytes."""
@@ -112,7 +109,7 @@ def archive_of(
     return content.getvalue()
 
 
-def _header(stream: IO[bytes]) -> Declared:
+def _header(stream: IO[bytes]) -> Header:
     version = np.lib.format.read_magic(stream)
     if version == (1, 0):
         shape, _, dtype = np.lib.format.read_array_header_1_0(stream)
@@ -125,10 +122,10 @@ def _header(stream: IO[bytes]) -> Declared:
         raise ValueError("an array of Python objects")
     if any(side < 0 for side in shape):
         raise ValueError(f"an array of shape {shape}")
-    return Declared(tuple(shape), dtype)
+    return Header(tuple(shape), dtype)
 
 
-_Spread: TypeAlias = Annotated[FiniteFloat, Field(gt=0)]
+_PositiveFloat: TypeAlias = Annotated[FiniteFloat, Field(gt=0)]
 
 CHANNELS = 3
 
@@ -151,12 +148,12 @@ class PixelInput(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     mean: tuple[FiniteFloat, FiniteFloat, FiniteFloat]
-    std: tuple[_Spread, _Spread, _Spread]
+    std: tuple[_PositiveFloat, _PositiveFloat, _PositiveFloat]
     order: Literal["rgb", "bgr"]
     rows: PositiveInt
     columns: PositiveInt
 
-    def fed(self, stored: Declared) -> Declared:
+    def fed_header(self, stored: Header) -> Header:
         """Return shape and type of a stored input when it is fed.
 
         Raises:
@@ -174,11 +171,11 @@ class PixelInput(BaseModel):
                 f" {self.columns} columns"
             )
         shape = (*stored.shape[:-2], self.rows, self.columns)
-        return Declared(shape, np.dtype(np.float32))
+        return Header(shape, np.dtype(np.float32))
 
-    def normalised(self, stored: Array) -> npt.NDArray[np.float32]:
-        """Return the input, float32 [..., 3, rows, columns]; errors as :meth:`fed`."""
-        shape = self.fed(Declared(stored.shape, stored.dtype)).shape
+    def normalise(self, stored: Array) -> npt.NDArray[np.float32]:
+        """Return the input, float32 [..., 3, rows, columns]; raises as `fed_header`."""
+        shape = self.fed_header(Header(stored.shape, stored.dtype)).shape
         height, width = stored.shape[-2:]
         ready = np.zeros(shape, np.float32)
         picture = ready[..., :height, :width]
@@ -202,7 +199,7 @@ class PixelInputs(BaseModel):
     inputs: dict[str, PixelInput] = {}
 
 
-T = TypeVar("T", Array, Declared)
+T = TypeVar("T", Array, Header)
 
 _KEYS = ("scenes", "pixels", "generator", "stack", "seed", "log", "count")
 """Keys of ``scenes.json``: two are read, the others say who wrote it."""
@@ -239,10 +236,10 @@ class CalibrationSet:
                 f'{path}: missing; {{"scenes": [0]}} if the frames are one scene'
             )
         with documents.reading(path, FramesError, "not JSON"):
-            content = documents.from_json(documents.content(path))
+            content = documents.from_json(documents.read_bytes(path))
         index = content if isinstance(content, dict) else {}
         self.places: Sequence[int] = range(len(self.files))
-        self._starts = _scenes(path, index, len(self.files))
+        self._starts = _starts_of(path, index, len(self.files))
         if unknown := [key for key in index if key not in _KEYS]:
             raise FramesError(
                 f"{path}: unknown key {unknown[0]!r}; there are {', '.join(_KEYS)}"
@@ -261,7 +258,7 @@ class CalibrationSet:
         self.pixels = entry.inputs
 
     def part(self, places: Iterable[int]) -> Self:
-        """Return the frames of some places in the whole; after a gap a scene starts."""
+        """Return the frames at indices of the whole; after a gap a scene starts."""
         part = copy.copy(self)
         part.places = tuple(places)
         return part
@@ -269,9 +266,9 @@ class CalibrationSet:
     @property
     def scenes(self) -> tuple[int, ...]:
         """Positions among these frames where a scene begins."""
-        return tuple(at for at in range(len(self)) if self._begins(at))
+        return tuple(at for at in range(len(self)) if self._starts_scene(at))
 
-    def _begins(self, index: int) -> bool:
+    def _starts_scene(self, index: int) -> bool:
         place = self.places[index]
         return not index or place in self._starts or place - 1 != self.places[index - 1]
 
@@ -286,18 +283,18 @@ class CalibrationSet:
         """Read one frame and normalise its pixels; its index is that in the whole."""
         place = self.places[index]
         path = self.files[place]
-        arrays = self._as_fed(path, load_arrays(path), PixelInput.normalised)
-        return Frame(place, self._begins(index), arrays)
+        arrays = self._convert_pixels(path, load_arrays(path), PixelInput.normalise)
+        return Frame(place, self._starts_scene(index), arrays)
 
-    def _as_fed(
-        self, path: Path, held: Mapping[str, T], turn: Callable[[PixelInput, T], T]
+    def _convert_pixels(
+        self, path: Path, arrays: Mapping[str, T], convert: Callable[[PixelInput, T], T]
     ) -> dict[str, T]:
-        """Convert the pixel inputs of a frame to what is fed."""
-        ready = dict(held)
+        """Return a frame's arrays, or headers, with its pixel inputs converted."""
+        ready = dict(arrays)
         for name, pixels in self.pixels.items():
             try:
                 if name in ready:
-                    ready[name] = turn(pixels, ready[name])
+                    ready[name] = convert(pixels, ready[name])
             except ValueError as error:
                 raise FramesError(f"{path}: {name} {error}") from error
         return ready
@@ -348,11 +345,12 @@ class CalibrationSet:
                 )
         for path in self.files:
             # Compare headers before any array is read.
-            held = self._as_fed(path, declared(path), PixelInput.fed)
-            for name in held:
+            headers = read_headers(path)
+            arrays = self._convert_pixels(path, headers, PixelInput.fed_header)
+            for name in arrays:
                 if (array := array_of(weights.get(name))) is not None:
                     frozen.setdefault(name, digest_of(array))
-            asked = {name: held[name] for name in held if name not in frozen}
+            asked = {name: arrays[name] for name in arrays if name not in frozen}
             _check_frame(asked, model, str(path))
             for name, array in load_arrays(path).items():
                 if array.dtype.kind == "f" and not np.isfinite(array).all():
@@ -380,8 +378,8 @@ def digest_of(array: Array) -> str:
     return hashlib.blake2b(head + array.tobytes(), digest_size=16).hexdigest()
 
 
-def _check_frame(frame: Mapping[str, Declared], model: ir.Model, source: str) -> None:
-    """Check names, dtypes and shapes before arrays are read."""
+def _check_frame(frame: Mapping[str, Header], model: ir.Model, source: str) -> None:
+    """Raise a FramesError where names, dtypes or shapes are not the model's."""
     ports = {str(value.name): value for value in model.graph.inputs}
     # Recurrent inputs may come from the model itself.
     optional = recurrent_inputs(model)
@@ -401,24 +399,24 @@ def _check_frame(frame: Mapping[str, Declared], model: ir.Model, source: str) ->
         )
 
 
-def check_array(array: Declared | Array, value: ir.Value, where: str) -> None:
+def check_array(array: Header | Array, value: ir.Value, where: str) -> None:
     """Raise a FramesError where an array has not an input's dtype and shape."""
     if value.dtype is not None and array.dtype != value.dtype.numpy():
         raise FramesError(f"{where} is {array.dtype}, expected {value.dtype.numpy()}")
-    if value.shape is not None and not _fits(array.shape, value.shape):
+    if value.shape is not None and not _matches(array.shape, value.shape):
         raise FramesError(
             f"{where} has shape {list(array.shape)}, expected {value.shape}"
         )
 
 
-def _fits(shape: tuple[int, ...], expected: ir.Shape) -> bool:
+def _matches(shape: tuple[int, ...], expected: ir.Shape) -> bool:
     return len(shape) == len(expected) and all(
         not isinstance(want, int) or have == want
         for have, want in zip(shape, expected, strict=True)
     )
 
 
-def synthetic(model: ir.Model, *, seed: int, count: int) -> Iterator[Frame]:
+def draw_frames(model: ir.Model, *, seed: int, count: int) -> Iterator[Frame]:
     """Draw random inputs for a model: one scene of ``count`` frames.
 
     Floats are standard normal, integers and booleans 0 or 1. They show that two graphs
@@ -446,7 +444,7 @@ def synthetic(model: ir.Model, *, seed: int, count: int) -> Iterator[Frame]:
     # Frames are drawn lazily, all from one generator.
     generator = np.random.default_rng(seed)
 
-    def drawn(value: ir.Value) -> Array:
+    def draw_array(value: ir.Value) -> Array:
         shape = static_shape(value) or ()
         dtype = np.dtype(np.float32) if value.dtype is None else value.dtype.numpy()
         if dtype.kind == "f":
@@ -454,13 +452,13 @@ def synthetic(model: ir.Model, *, seed: int, count: int) -> Iterator[Frame]:
         return np.asarray(generator.integers(0, 2, shape)).astype(dtype)
 
     return (
-        Frame(index, index == 0, {str(v.name): drawn(v) for v in ports})
+        Frame(index, index == 0, {str(v.name): draw_array(v) for v in ports})
         for index in range(count)
     )
 
 
-def _scenes(path: Path, index: Mapping[str, object], count: int) -> tuple[int, ...]:
-    """Read and check where scenes begin."""
+def _starts_of(path: Path, index: Mapping[str, object], count: int) -> tuple[int, ...]:
+    """Return the indices where scenes begin, ascending from 0; else a FramesError."""
     starts = index.get("scenes")
     if not isinstance(starts, list) or not all(type(at) is int for at in starts):
         raise FramesError(f'{path}: must hold {{"scenes": [0, ...]}}')

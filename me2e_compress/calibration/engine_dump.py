@@ -7,13 +7,13 @@ import functools
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 
-from me2e_compress.calibration.dataset import CalibrationSet, declared, load_arrays
+from me2e_compress.calibration.dataset import CalibrationSet, load_arrays, read_headers
 from me2e_compress.display import plural
 from me2e_compress.errors import FORMER_NAMES, FramesError
 from me2e_compress.runtime.frames import Array
 
-_KEPT = 8
-"""Frames in memory: some are read again and again."""
+_CACHED = 8
+"""Most frames in memory: some are read again and again."""
 
 
 class EngineDump:
@@ -35,7 +35,7 @@ class EngineDump:
         self.stems = tuple(sorted(each.stem for each in self.path.glob("*.npz")))
         if not self.stems:
             raise FramesError(f"{self.path}: {FORMER_NAMES['dump json']}")
-        self._at = functools.lru_cache(maxsize=_KEPT)(self._read)
+        self._at = functools.lru_cache(maxsize=_CACHED)(self._read)
         self.names = tuple(self[0])
 
     def __len__(self) -> int:
@@ -50,7 +50,7 @@ class EngineDump:
         return (self[index] for index in range(len(self)))
 
     def where(self, index: int) -> str:
-        """Name a frame's answers in a message."""
+        """Return how a message names a frame's answers."""
         return str(self.path / self.stems[index])
 
     def _read(self, index: int) -> Mapping[str, Array]:
@@ -68,8 +68,8 @@ class EngineDump:
         """
         stems = {each.stem: None for each in frames.files}
         if len(self) != len(frames):
-            lacking = [each for each in stems if each not in self.stems]
-            first = f"{lacking[0]} is not answered: " if lacking else ""
+            missing = [each for each in stems if each not in self.stems]
+            first = f"{missing[0]} is not answered: " if missing else ""
             raise FramesError(
                 f"{self.path}: {first}answers to {plural(len(self), 'frame')},"
                 f" {frames.folder} has {len(frames)}: the dump is of other frames"
@@ -81,11 +81,11 @@ class EngineDump:
                 f" {frames.folder}, whose first is {frames.files[0].stem}"
             )
         for index in range(len(self)):
-            tensors = declared(self._file(index))
-            if lacking := [each for each in self.names if each not in tensors]:
+            tensors = read_headers(self._file(index))
+            if missing := [each for each in self.names if each not in tensors]:
                 where = self.where(index)
                 raise FramesError(
-                    f"{where}: {lacking[0]} is missing; other frames have it"
+                    f"{where}: {missing[0]} is missing; other frames have it"
                 )
             if more := [each for each in tensors if each not in self.names]:
                 raise FramesError(

@@ -16,7 +16,7 @@ from me2e_compress.display import join_names, plural
 from me2e_compress.errors import FramesError
 from me2e_compress.graph import digest, provenance
 
-_LEAST = 0.5
+_LEAST_SHARE = 0.5
 """Least share of the needed tensors that a cache of this graph has."""
 
 
@@ -41,9 +41,9 @@ def read_cache(path: Path) -> Ranges:
             (scale,) = struct.unpack("!f", bytes.fromhex(text))
             return float(scale) * QUANT_MAX
 
-        reach = _parse(path, lines, 1, ": ", number)
+        reach = _parse_lines(path, lines, 1, ": ", number)
     else:
-        reach = _parse(path, lines, 0, " ", float)
+        reach = _parse_lines(path, lines, 0, " ", float)
     if not reach:
         raise FramesError(f"{path}: a calibration cache without a tensor")
     bounds = {name: (-each, each) for name, each in reach.items()}
@@ -53,10 +53,10 @@ def read_cache(path: Path) -> Ranges:
 def pick_ranges(
     cache: Ranges, path: Path, model: ir.Model, tensors: Sequence[str]
 ) -> Ranges:
-    """Take those of ``tensors`` that a cache has, by their names in ``model``.
+    """Return the ranges of ``tensors`` that a cache has, by their names in ``model``.
 
-    A node that stands for several of the file may have kept the name of the first, and
-    gives what the last gave: its output is not taken.
+    A node that replaces several of the file may have the name of the first, and the
+    output of the last: its range is not used.
 
     Raises:
         FramesError: the cache is of another graph: it has less than half of them.
@@ -69,7 +69,7 @@ def pick_ranges(
     }
     known = cache.tensors.keys() - merged
     bounds = {name: cache.tensors[name] for name in tensors if name in known}
-    if len(bounds) < _LEAST * len(tensors):
+    if len(bounds) < _LEAST_SHARE * len(tensors):
         missing = [name for name in tensors if name not in bounds]
         raise FramesError(
             f"{path}: a cache of another graph: of {plural(len(tensors), 'tensor')}"
@@ -78,12 +78,12 @@ def pick_ranges(
     return dataclasses.replace(cache, tensors=bounds, model=digest(model))
 
 
-def _parse(
+def _parse_lines(
     path: Path, lines: list[str], first: int, mark: str, read: Callable[[str], float]
 ) -> dict[str, float]:
     values = {}
     for number, line in enumerate(lines[first:], first + 1):
-        name, parted, text = line.rpartition(mark)
+        name, separator, text = line.rpartition(mark)
         if name in values:
             raise FramesError(f"{path}: line {number} names {name} again")
         try:
@@ -92,6 +92,6 @@ def _parse(
             raise FramesError(
                 f"{path}: line {number} is not a name and a number: {line[:60]!r}"
             ) from error
-        if not parted or not 0 <= values[name] <= LARGEST:
+        if not separator or not 0 <= values[name] <= LARGEST:
             raise FramesError(f"{path}: line {number} is not a range: {line[:60]!r}")
     return values

@@ -38,11 +38,11 @@ def token_means(
         return {}
     # A copy of the graph has the values as further outputs.
     copy = model.clone()
-    made = {value.name: value for node in copy.graph for value in node.outputs}
-    if missing := [name for name in values if name not in made]:
+    computed = {value.name: value for node in copy.graph for value in node.outputs}
+    if missing := [name for name in values if name not in computed]:
         raise GraphError(f"the graph has no value {missing[0]}")
-    shown = {value.name for value in copy.graph.outputs}
-    more = (made[name] for name in dict.fromkeys(values) if name not in shown)
+    outputs = {value.name for value in copy.graph.outputs}
+    more = (computed[name] for name in dict.fromkeys(values) if name not in outputs)
     copy.graph.outputs.extend(more)
     session = Session(copy, threads=threads, provider=provider)
     # One pass: the averages are updated frame by frame.

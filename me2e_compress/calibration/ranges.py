@@ -75,8 +75,8 @@ class Ranges:
             seen.source,
             rms=rms_of(seen),
             scenes=len(seen.scenes) or None,
-            inputs=_activities(seen, seen.inputs, 0),
-            outputs=_activities(seen, seen.outputs, len(seen.inputs)),
+            inputs=_activities_of(seen, seen.inputs, 0),
+            outputs=_activities_of(seen, seen.outputs, len(seen.inputs)),
             not_finite=seen.not_finite,
         )
 
@@ -121,11 +121,11 @@ class Ranges:
 
     @classmethod
     def load(cls, path: Path) -> Self:
-        """Read what :meth:`save` wrote; what contradicts itself is refused."""
+        """Read what :meth:`save` wrote; a FramesError if it contradicts itself."""
         if not path.is_file():
             raise FramesError(f"{path}: no such ranges file")
         with documents.reading(path, FramesError, "not ranges"):
-            content = documents.content(path)
+            content = documents.read_bytes(path)
             ranges = pydantic.TypeAdapter(cls).validate_json(content)
         # Bounds must be finite and in order.
         for name, (low, high) in ranges.tensors.items():
@@ -134,12 +134,12 @@ class Ranges:
                     f"{path}: not ranges: {name} has {low:g} to {high:g}; a range is"
                     " two float32 bounds, the lower one first"
                 )
-        if lie := ranges._contradiction():
+        if lie := ranges._why_invalid():
             raise FramesError(f"{path}: not ranges: {lie}")
         return ranges
 
-    def _contradiction(self) -> str:
-        """Say what of a file cannot be true; empty if nothing is."""
+    def _why_invalid(self) -> str:
+        """Return what in a file cannot be true; empty if all can."""
         imported = self.method == IMPORTED
         if self.frames < 1 and not imported:
             return f"{self.method} of {self.frames} frames; give a recording"
@@ -215,7 +215,7 @@ def rms_of(seen: Statistics) -> dict[str, float]:
     return {name: float(f"{each:.4g}") for name, each in pairs if math.isfinite(each)}
 
 
-def _activities(
+def _activities_of(
     seen: Statistics, names: Sequence[str], begin: int
 ) -> dict[str, Activity]:
     """Return what inputs or outputs did, from their checksums from column ``begin``."""

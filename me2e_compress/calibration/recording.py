@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar, TypeAlias
 
-from me2e_compress.calibration.dataset import PixelInput, PixelInputs, archive_of
+from me2e_compress.calibration.dataset import PixelInput, PixelInputs, npz_bytes
 from me2e_compress.errors import FramesError
 from me2e_compress.registry import Registry, documents, drafts
 from me2e_compress.runtime.atomic import write_document
@@ -60,7 +60,7 @@ def write_recording(
     _check_replaceable(folder)
     folder.parent.mkdir(parents=True, exist_ok=True)
     # Write into a hidden folder first; it may hold an earlier run.
-    partial = partial_of(folder)
+    partial = partial_folder(folder)
     _check_replaceable(partial, PROGRESS)
     described = dict[str, object](about)
     if pixels:
@@ -74,13 +74,13 @@ def write_recording(
         if not draft.scenes:
             raise FramesError(f"{folder}: there are no frames to write")
         # The index makes the folder a recording; a kill may have left drafts.
-        for left in partial.glob(f".{PROGRESS}.*"):
-            left.unlink()
+        for leftover in partial.glob(f".{PROGRESS}.*"):
+            leftover.unlink()
         count = {"count": draft.count}
         index = {**drafts.IN_JSON, "scenes": draft.scenes, **described, **count}
-        with drafts.naming(partial / INDEX):
+        with drafts.naming_file(partial / INDEX):
             (partial / INDEX).write_text(json.dumps(index, indent=1) + "\n")
-        drafts.put(partial, folder)
+        drafts.put_in_place(partial, folder)
         (folder / PROGRESS).unlink()
     finally:
         if len(draft.scenes) < 2:  # nothing to go on from
@@ -88,7 +88,7 @@ def write_recording(
     return folder
 
 
-def partial_of(folder: Path) -> Path:
+def partial_folder(folder: Path) -> Path:
     """Return the folder in which a recording is written until it is complete."""
     return folder.with_name(f".{folder.name}.partial")
 
@@ -129,8 +129,8 @@ class _Draft:
             record = {"scenes": self.scenes, "places": self.places}
             write_document(self.folder / PROGRESS, {"key": self.key, **record})
         path = self._frame(self.count)
-        with drafts.naming(path):
-            path.write_bytes(archive_of(frame.arrays, zipfile.ZIP_DEFLATED))
+        with drafts.naming_file(path):
+            path.write_bytes(npz_bytes(frame.arrays, zipfile.ZIP_DEFLATED))
         self.count += 1
 
     def _frame(self, index: int) -> Path:

@@ -8,7 +8,7 @@ from typing import Literal
 from me2e_compress.calibration.ranges import OUTLIER_CREST, Activity, Ranges
 from me2e_compress.display import plural
 
-ROUNDS_AWAY = 254
+ROUND_CREST = 254
 """Crest factor from which half an int8 step (range / 254) exceeds the root mean square,
 so that most elements round to zero."""
 
@@ -19,7 +19,7 @@ FEW_SCENES = 8
 
 NOT_FINITE = "Runtimes answer it each in their own way: guard what makes it"
 
-_SHOWN = 5
+_MOST_NAMES = 5
 """Number of tensors that a line lists."""
 
 Kind = Literal[
@@ -50,7 +50,7 @@ class RangeFinding:
 
     def __str__(self) -> str:
         """Write one line, with the worst names."""
-        shown = list(self.names[:_SHOWN])
+        shown = list(self.names[:_MOST_NAMES])
         if self.ratios:
             pairs = zip(shown, self.ratios, strict=False)
             shown = [f"{name} ({ratio:.3g})" for name, ratio in pairs]
@@ -62,8 +62,8 @@ class RangeFinding:
 
 
 def review(ranges: Ranges) -> tuple[RangeFinding, ...]:
-    """Judge ranges by what they say themselves; warnings first."""
-    findings = [*_scales(ranges), *_ports(ranges)]
+    """Return findings on ranges, of their own values alone; warnings first."""
+    findings = [*_range_findings(ranges), *_port_findings(ranges)]
     if said := ranges.not_finite:
         findings.append(RangeFinding("not finite", "warning", said, advice=NOT_FINITE))
     if ranges.scenes is not None and ranges.scenes < FEW_SCENES:
@@ -77,7 +77,7 @@ def review(ranges: Ranges) -> tuple[RangeFinding, ...]:
 
 
 def missing_ranges(cache: Path, missing: Sequence[str]) -> tuple[RangeFinding, ...]:
-    """Name the tensors that an imported cache lacks."""
+    """Return a finding on the tensors that an imported cache lacks, if any."""
     if not missing:
         return ()
     said = f"{plural(len(missing), 'tensor')} not in {cache}"
@@ -87,26 +87,26 @@ def missing_ranges(cache: Path, missing: Sequence[str]) -> tuple[RangeFinding, .
     )
 
 
-def _scales(ranges: Ranges) -> Iterable[RangeFinding]:
-    """Hold the range of each tensor against its own root mean square."""
+def _range_findings(ranges: Ranges) -> Iterable[RangeFinding]:
+    """Compare the range of each tensor with its root mean square."""
     crests = sorted(ranges.crests.items(), key=lambda item: -item[1])
-    yield from _named(
+    yield from _name_finding(
         "rounds to zero",
         "warning",
-        f"range of {ROUNDS_AWAY} or more times the root mean square, where most"
+        f"range of {ROUND_CREST} or more times the root mean square, where most"
         " elements round to zero",
-        {name: crest for name, crest in crests if crest >= ROUNDS_AWAY},
+        {name: crest for name, crest in crests if crest >= ROUND_CREST},
         "Look for a frame in other units or with a wrong number type; else clip by"
         " --method, or keep the readers float",
     )
-    yield from _named(
+    yield from _name_finding(
         "few elements",
         "note",
         f"range of over {OUTLIER_CREST} times the root mean square, which a few"
         " elements make",
-        {name: crest for name, crest in crests if OUTLIER_CREST < crest < ROUNDS_AWAY},
+        {name: crest for name, crest in crests if OUTLIER_CREST < crest < ROUND_CREST},
     )
-    yield from _named(
+    yield from _name_finding(
         "clipped",
         "warning",
         "range below the root mean square, which cuts most of the signal",
@@ -118,7 +118,7 @@ def _scales(ranges: Ranges) -> Iterable[RangeFinding]:
         "These ranges are of other frames or units, or the method clips too much:"
         " calibrate again, by max-min",
     )
-    yield from _named(
+    yield from _name_finding(
         "dead tensor",
         "note",
         "tensor always zero",
@@ -128,37 +128,37 @@ def _scales(ranges: Ranges) -> Iterable[RangeFinding]:
     )
 
 
-def _ports(ranges: Ranges) -> Iterable[RangeFinding]:
-    """Name inputs and outputs that never changed, unless there is one frame only."""
-    yield from _named(
+def _port_findings(ranges: Ranges) -> Iterable[RangeFinding]:
+    """Yield findings on inputs and outputs that are constant, zero or not finite."""
+    yield from _name_finding(
         "unfed input",
         "warning",
         "input zero in every frame",
-        _those(ranges.inputs, "zero"),
+        _of_kind(ranges.inputs, "zero"),
         "A state or history of zeros gives ranges that no second frame fits: record"
         " scenes of frames in a row, and let `inspect` show what is fed back"
         " (--adapter)",
     )
     if ranges.frames > 1:
-        yield from _named(
+        yield from _name_finding(
             "constant input",
             "note",
             "input the same in every frame",
-            _those(ranges.inputs, "constant"),
+            _of_kind(ranges.inputs, "constant"),
             "The ranges hold for these values alone: record other commands and speeds;"
             " camera matrices of one vehicle fit that vehicle only",
         )
-    yield from _named(
+    yield from _name_finding(
         "not finite",
         "warning",
         "output with NaN or infinity",
-        _those(ranges.outputs, "not finite"),
+        _of_kind(ranges.outputs, "not finite"),
         "Find the frame by `compare M.onnx M.onnx FRAMES`, and leave it out",
     )
-    still = _those(ranges.outputs, "zero")
+    still = _of_kind(ranges.outputs, "zero")
     if ranges.frames > 1:
-        still |= _those(ranges.outputs, "constant")
-    yield from _named(
+        still |= _of_kind(ranges.outputs, "constant")
+    yield from _name_finding(
         "dead output",
         "warning",
         "output the same in every frame",
@@ -167,18 +167,18 @@ def _ports(ranges: Ranges) -> Iterable[RangeFinding]:
     )
 
 
-def _those(activities: Mapping[str, Activity], kind: Activity) -> dict[str, None]:
+def _of_kind(activities: Mapping[str, Activity], kind: Activity) -> dict[str, None]:
     return dict.fromkeys(name for name, did in activities.items() if did == kind)
 
 
-def _named(
+def _name_finding(
     kind: Kind,
     severity: Literal["warning", "note"],
     said: str,
     ratio_of: Mapping[str, float | None],
     advice: str = "",
 ) -> Iterable[RangeFinding]:
-    """Yield one finding about several names, or none; ``said`` begins with a noun."""
+    """Yield a finding on the names, if any; ``said`` begins with the noun to count."""
     if ratio_of:
         noun, rest = said.split(" ", 1)
         ratios = tuple(each for each in ratio_of.values() if each is not None)

@@ -23,7 +23,7 @@ BINS = 2048
 them in use, 8 for each of the 127 int8 steps. (TensorRT divides the range up to the
 largest magnitude into 2,048, onnxruntime's percentile each side of zero.)"""
 
-_SMALLEST = -100
+_LEAST_EXPONENT = -100
 """Least exponent of a histogram: below, float32 cannot hold bins per unit."""
 
 ALL_ZERO, NOT_FINITE = 0, -1
@@ -72,7 +72,7 @@ class Statistics:
         The value is that of the last frame with an element, else of the first such
         frame; 0 if there is none.
         """
-        empty = no_element(self.measured)
+        empty = is_empty(self.measured)
         if not empty.any():
             return self.measured
         rows = np.arange(len(self.frames))[:, None]
@@ -106,7 +106,7 @@ class Statistics:
     @property
     def exponents(self) -> npt.NDArray[np.int64]:
         """The least e for which 2^e exceeds the reach: int64 [tensors]."""
-        return np.maximum(np.frexp(self.reach)[1], _SMALLEST).astype(np.int64)
+        return np.maximum(np.frexp(self.reach)[1], _LEAST_EXPONENT).astype(np.int64)
 
     def histograms(self) -> npt.NDArray[np.int64]:
         """Return the histograms; FramesError if none were collected."""
@@ -119,7 +119,7 @@ class Statistics:
 
 
 def checksum(array: Array) -> int:
-    """Return what tells two arrays apart: the CRC-32 of the bytes, plus 1.
+    """Return a number that distinguishes arrays: the CRC-32 of the bytes, plus 1.
 
     It is :data:`ALL_ZERO` where every element is zero, and :data:`NOT_FINITE` where one
     is NaN or infinite.
@@ -131,16 +131,16 @@ def checksum(array: Array) -> int:
     return zlib.crc32(np.ascontiguousarray(array).data.cast("B")) + 1
 
 
-def no_element(measured: Floats) -> npt.NDArray[np.bool_]:
-    """Return which tensors had no element to measure, from float32 [..., 3]."""
+def is_empty(measured: Floats) -> npt.NDArray[np.bool_]:
+    """Return which tensors had no element: bool [...], of readings float32 [..., 3]."""
     return np.asarray((measured[..., 0] == np.inf) & (measured[..., 1] == -np.inf))
 
 
 # NaN and infinities: where they show, and who made them first.
 
 
-def places_of(model: ir.Model) -> list[str]:
-    """Name the computed floats that say where to read: what is read shows no NaN."""
+def index_inputs(model: ir.Model) -> list[str]:
+    """Name the computed floats that are positions to read at, which hide a NaN."""
     places = dict[str, None]()
     for node in model.graph:
         value = grid_of(node)
@@ -154,7 +154,7 @@ def places_of(model: ir.Model) -> list[str]:
 _INDICES = (ir.DataType.INT32, ir.DataType.INT64)
 
 
-def first_maker(
+def first_bad_node(
     model: ir.Model,
     inputs: Mapping[str, Array],
     read: Set[str],
@@ -163,15 +163,15 @@ def first_maker(
 ) -> str:
     """Name the node that first makes NaN or infinity of one frame, in a sentence.
 
-    What ends before one of the tensors ``read``, such as a mask of -infinity before a
-    Softmax, is no cause. ``probe`` takes extremes and mean squares.
+    NaN that reaches none of the tensors ``read`` is no cause, such as a mask of
+    -infinity before a Softmax. Empty if there is none; ``probe`` is `Extremes`.
     """
     made = [value for node in model.graph for value in node.outputs]
     floats = [str(value.name) for value in made if value.dtype in FLOATS]
     probed = insert_probes(model, floats, probe)
     session = Session(probed, optimize=False, provider=provider)
     readings = session.run(inputs, [READINGS])[READINGS].astype(np.float32)
-    bad = are_bad(readings.reshape(len(floats), -1))
+    bad = is_not_finite(readings.reshape(len(floats), -1))
     names = {name for name, each in zip(floats, bad, strict=True) if each}
     ends = {*read} & names
     for node in reversed(model.graph):
@@ -187,17 +187,20 @@ def first_maker(
     return ""
 
 
-def are_bad(readings: Floats) -> npt.NDArray[np.bool_]:
-    """Tell which tensors hold NaN or infinity; mean squares may overflow."""
+def is_not_finite(readings: Floats) -> npt.NDArray[np.bool_]:
+    """Return which tensors hold NaN or infinity: bool [n], of readings [n, 3].
+
+    Mean squares may overflow to infinity.
+    """
     bad = np.isnan(readings).any(1) | np.isinf(readings[:, :2]).any(1)
-    return np.asarray(bad & ~no_element(readings))
+    return np.asarray(bad & ~is_empty(readings))
 
 
 def check_finite(
     readings: Floats, tensors: Sequence[str], place: int, cause: str = ""
 ) -> None:
     """Raise a FramesError for a NaN or infinite element, whose ``cause`` is told."""
-    bad = are_bad(readings)
+    bad = is_not_finite(readings)
     if not bad.any():
         return
     # Name the first tensor, and how many more there are.

@@ -47,7 +47,7 @@ class ResultsFolder:
         from; None if none are drawn.
         """
         # claim an empty folder
-        with drafts.written(path, EvaluationError):
+        with drafts.writing_errors(path, EvaluationError):
             path.mkdir(parents=True, exist_ok=True)
             if not (path / MANIFEST).exists():
                 # a killed run of ours leaves only drafts
@@ -78,7 +78,7 @@ class ResultsFolder:
     def open(cls, path: Path) -> Self:
         """Open an existing folder."""
         with documents.reading(path / MANIFEST, EvaluationError, "not JSON"):
-            made_by = documents.from_json(documents.content(path / MANIFEST))
+            made_by = documents.from_json(documents.read_bytes(path / MANIFEST))
         _check_manifest(path, made_by)
         return cls(path, made_by)
 
@@ -101,7 +101,7 @@ class ResultsFolder:
     def keep(self, episode: Episode) -> None:
         """Write one route."""
         record = {"fingerprint": self._digest, "episode": episode.to_json()}
-        with drafts.written(self._file(episode.route), EvaluationError):
+        with drafts.writing_errors(self._file(episode.route), EvaluationError):
             write_json(self._file(episode.route), record)
 
     @property
@@ -117,7 +117,7 @@ class ResultsFolder:
         if not path.exists():
             return None
         try:
-            record = documents.from_json(documents.content(path))
+            record = documents.from_json(documents.read_bytes(path))
             if (
                 not isinstance(record, dict)
                 or record.get("fingerprint") != self._digest
@@ -149,7 +149,7 @@ def log_cost(folder: Path, driven: Driven) -> None:
         "memory_mb": round(driven.memory_bytes / 1e6, 1),
     }
     with (
-        drafts.written(log, EvaluationError),
+        drafts.writing_errors(log, EvaluationError),
         log.open("a", encoding="utf-8") as lines,
     ):
         mark = {} if lines.tell() else drafts.IN_JSON

@@ -153,7 +153,7 @@ def save(model: ir.Model, path: str | Path, *, external: bool | None = None) -> 
     if external is None:
         external = bool(stored) or weight_bytes(model) > INLINE_LIMIT_BYTES
     with (
-        drafts.naming(path),
+        drafts.naming_file(path),
         tempfile.TemporaryDirectory(dir=path.parent, prefix=".saving-") as folder,
     ):
         draft = Path(folder) / path.name
@@ -166,8 +166,8 @@ def save(model: ir.Model, path: str | Path, *, external: bool | None = None) -> 
         if draft_data.exists():
             with draft_data.open("ab") as stream:
                 stream.write(drafts.BYTES)
-            drafts.put(draft_data, data)
-        drafts.put(draft, path)
+            drafts.put_in_place(draft_data, data)
+        drafts.put_in_place(draft, path)
     for old in earlier:
         drafts.remove(old)
 

@@ -23,14 +23,14 @@ from me2e_compress.passes.base import Context, Pass, PassResult
 def attempt(
     current: Pass, model: ir.Model, context: Context, digest: str | None = None
 ) -> tuple[PassResult, str]:
-    """Run a pass on a clone, check its contract, and infer the shapes behind it.
+    """Run a pass on a clone, check its contract, and infer the new shapes.
 
     Returns what the pass returned and the digest of its graph. Shapes are inferred in
     both graphs; ``digest`` is that of the first, if known.
 
     Raises:
-        VerificationError: the pass lied about having changed something, changed the
-            interface, lost or made up the past of a node, or left an invalid graph.
+        VerificationError: the pass misreports its changes, changed the interface, lost
+            or invented the provenance of a node, or left an invalid graph.
         PassError: it broke.
         Me2eError: it refused the graph.
     """
@@ -92,11 +92,7 @@ def check_valid(
 
 
 def blame_file(name: str, before: ir.Model, error: Me2eError) -> None:
-    """Refuse a graph that was as invalid before the pass that left it invalid.
-
-    Raises:
-        GraphError: it was; no pass is to blame.
-    """
+    """Raise a GraphError if a graph was as invalid before a pass; else return."""
     try:
         check_valid(name, before)
     except VerificationError as earlier:
@@ -135,11 +131,11 @@ def _check_interface(current: Pass, before: ir.Model, result: PassResult) -> Non
     )
     for old, new in zip((inputs, kept), graph.interface(result.model), strict=True):
         if old != new:
-            gone = [port for port in old if port not in new]
-            come = [port for port in new if port not in old]
+            removed = [port for port in old if port not in new]
+            added = [port for port in new if port not in old]
             raise VerificationError(
-                f"{current.name} changed the interface: {gone or old} became"
-                f" {come or new}"
+                f"{current.name} changed the interface: {removed or old} became"
+                f" {added or new}"
             )
 
 
@@ -160,17 +156,17 @@ def check_shapes(name: str, before: ir.Model, after: ir.Model) -> None:
     opset = opset_of(after)
     for node in nodes_in(after.graph):
         was = old.get(node.outputs[0].name) if node.outputs else None
-        if was is not None and _reads_alike(was, node) and is_same(was, node):
+        if was is not None and _reads_same(was, node) and is_same(was, node):
             continue
-        reason = contradiction(node, opset)
-        if reason and (was is None or contradiction(was, opset_of(before)) is None):
+        reason = why_contradictory(node, opset)
+        if reason and (was is None or why_contradictory(was, opset_of(before)) is None):
             raise VerificationError(
                 f"{name} left node {node.name} ({node.op_type}) that does not fit what"
                 f" it reads: {reason}"
             )
 
 
-def _reads_alike(one: ir.Node, other: ir.Node) -> bool:
+def _reads_same(one: ir.Node, other: ir.Node) -> bool:
     """Return whether two nodes read the same names, types, shapes and constants."""
     return len(one.inputs) == len(other.inputs) and all(
         a is b  # both left out
@@ -186,8 +182,11 @@ def _reads_alike(one: ir.Node, other: ir.Node) -> bool:
     )
 
 
-def contradiction(node: ir.Node, opset: int) -> str | None:
-    """Return why a node of ONNX's own cannot give what the graph says it gives."""
+def why_contradictory(node: ir.Node, opset: int) -> str | None:
+    """Return why a standard node cannot have the types and shapes that it has, or None.
+
+    None also of nodes with bodies, or with inputs of unknown type.
+    """
     typed = all(isinstance(v.type, ir.TensorType) for v in filter(None, node.inputs))
     if not is_standard(node) or has_subgraph(node) or not typed:
         return None

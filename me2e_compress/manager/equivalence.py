@@ -20,8 +20,8 @@ from me2e_compress.manager.verification_inputs import (
     TOLERANCES,
     Outputs,
     VerificationInputs,
-    errors,
-    relative,
+    relative_error,
+    relative_errors,
     tolerances,
 )
 from me2e_compress.runtime.frames import Frames
@@ -45,15 +45,17 @@ def verify(
 ) -> Verification:
     """Compare two graphs on the same inputs; one that no longer runs differs by inf.
 
-    A body that the passes attached is held against its kernel beside the outputs.
+    1. Outputs within their tolerance pass; those drawn at random are not judged.
+    2. Else both are compared piece by piece (:mod:`me2e_compress.manager.pieces`).
+    3. Outputs that rounding alone moves as far, by inputs nudged in their last places,
+       are unsteady and not judged.
+    4. Else both run without onnxruntime's optimizations, some of which were wrong in
+       every release; a remark says so.
 
-    An output that is drawn anew at every run tells nothing about the passes, and is
-    named; so is one that differs but that rounding alone moves as far: inputs that
-    change in their last places (a choice between candidates that are nearly equal).
-    What differs still is compared piece by piece, between the nodes whose answer jumps
-    (:mod:`me2e_compress.manager.pieces`), then without onnxruntime's own optimizations:
-    a rewrite of its that is wrong for a graph (there were some in every release) is not
-    the fault of a pass.
+    Bodies that ``after`` adds are compared with their kernels; ``passes`` are names.
+
+    Raises:
+        GraphError: ``before`` does not run; or a FramesError: the inputs do not fit.
     """
     result = _verify_outputs(passes, before, after, inputs)
     if not after.functions.keys() - before.functions.keys():
@@ -75,7 +77,7 @@ def _verify_outputs(
     left = list(inputs.run(before))
     allowed = tolerances(left[0])
     try:
-        gaps = errors(left, inputs.run(after))
+        gaps = relative_errors(left, inputs.run(after))
     except GraphError:
         gaps = dict.fromkeys(left[0], float("inf"))
     result = Verification(
@@ -85,10 +87,10 @@ def _verify_outputs(
     if result.passed:
         return result
     # Piece by piece, then without what rounding alone moves as far
-    proven, breach = _by_pieces(result, before, after, inputs)
+    proven, breach = _verify_pieces(result, before, after, inputs)
     if proven is not None:
         return proven
-    rounding = unsteadiness(before, left, inputs)
+    rounding = rounding_effect(before, left, inputs)
     unsteady = tuple(
         name for name in result.judged if allowed[name] < gaps[name] <= rounding[name]
     )
@@ -100,13 +102,13 @@ def _verify_outputs(
     # By the nodes as they stand, where onnxruntime's rewrites are what differs
     try:
         as_written = list(inputs.run(before, optimize=False))
-        plain_gaps = errors(as_written, inputs.run(after, optimize=False))
+        plain_gaps = relative_errors(as_written, inputs.run(after, optimize=False))
     except GraphError:
         return steady
     plain = dataclasses.replace(steady, errors=plain_gaps)
     if not plain.passed:
         return steady
-    rewritten = errors(as_written, left)
+    rewritten = relative_errors(as_written, left)
     remarks = [
         f"onnxruntime gives another {name} of the graph"
         f" {'before' if rewritten[name] > allowed[name] else 'after'} the passes where"
@@ -117,7 +119,7 @@ def _verify_outputs(
     return dataclasses.replace(plain, remarks=tuple(remarks))
 
 
-def unsteadiness(
+def rounding_effect(
     model: ir.Model, answers: Sequence[Outputs], inputs: VerificationInputs
 ) -> dict[str, float]:
     """Measure how far each output moves when inputs change in their last places.
@@ -128,20 +130,20 @@ def unsteadiness(
     session = Session(model, provider=inputs.provider)
     worst = dict.fromkeys(answers[0], 0.0)
     for seed in range(NUDGES):
-        moved = errors(answers, replay(session, inputs.nudged(seed).frames))
+        moved = relative_errors(answers, replay(session, inputs.nudged(seed).frames))
         worst = {name: max(worst[name], moved[name]) for name in worst}
     return worst
 
 
-def _by_pieces(
+def _verify_pieces(
     result: Verification, before: ir.Model, after: ir.Model, inputs: VerificationInputs
 ) -> tuple[Verification | None, bool]:
-    """Judge each piece between steps: a proof, or none and whether there is a breach.
+    """Compare the pieces between steps: return a proof, or None and whether one breaks.
 
-    A piece that differs by more than rounding moves it is a breach of the promise,
-    however far rounding moves the outputs behind it.
+    A piece breaks the promise that differs by more than rounding moves it, however far
+    rounding moves the outputs after it.
     """
-    steps = pieces.steps_behind_changes(before, after)
+    steps = pieces.steps_after_changes(before, after)
     if not steps:
         return None, False
     try:
@@ -164,14 +166,14 @@ def _by_pieces(
             (pieces.nudged_weights(before, seed), inputs.nudged(seed))
             for seed in range(NUDGES)
         ]
-        moved, _ = pieces.piece_errors(before, trials, steps, inputs)
+        nudged_errors, _ = pieces.piece_errors(before, trials, steps, inputs)
     except (FramesError, GraphError):
         return None, False
-    return None, any(gaps[n] > max(trial[n] for trial in moved) for n in wrong)
+    return None, any(gaps[n] > max(trial[n] for trial in nudged_errors) for n in wrong)
 
 
-def where(before: ir.Model, after: ir.Model, inputs: VerificationInputs) -> str:
-    """Name the first module of a changed graph whose values differ, if there is one."""
+def difference(before: ir.Model, after: ir.Model, inputs: VerificationInputs) -> str:
+    """Return the end of a message on the first module that differs; "" if none does."""
     try:
         first = find_first_difference(
             before, after, inputs.frames, inputs.provider
@@ -181,27 +183,27 @@ def where(before: ir.Model, after: ir.Model, inputs: VerificationInputs) -> str:
     return "" if first is None else f"; first difference: {first}"
 
 
-def skipped(passes: tuple[str, ...], why: str) -> Verification:
-    """Say that nothing was measured, and why."""
+def unverified(passes: tuple[str, ...], why: str) -> Verification:
+    """Return a verification in which nothing was measured, and why."""
     return Verification(passes, "none", {}, {}, why)
 
 
 def random_outputs(model: ir.Model) -> tuple[str, ...]:
-    """Name the outputs of a graph that depend on what it draws without a seed."""
+    """Name the outputs of a graph that depend on random numbers without a seed."""
     drawn = set[ir.Value]()
     for node in model.graph:
-        if _draws(node, model) or not drawn.isdisjoint(reads_of(node)):
+        if _draws_random(node, model) or not drawn.isdisjoint(reads_of(node)):
             drawn.update(node.outputs)
     return tuple(str(each.name) for each in model.graph.outputs if each in drawn)
 
 
-def _draws(node: ir.Node, model: ir.Model) -> bool:
+def _draws_random(node: ir.Node, model: ir.Model) -> bool:
     """Return whether a node draws, or one in its bodies or its function does."""
     if draws(node):
         return "seed" not in node.attributes
     function = model.functions.get(node.op_identifier())
     bodies = bodies_of(node) if function is None else (function,)
-    return any(_draws(each, model) for body in bodies for each in body)
+    return any(_draws_random(each, model) for body in bodies for each in body)
 
 
 def _body_errors(
@@ -234,31 +236,31 @@ def _body_errors(
         assert call is not None
         for place, value in enumerate(call.inputs):
             if value is not None:
-                pieces.show(bare, value, _name(node, place))
-        pieces.show(bare, call.outputs[0], _name(node, None))
+                pieces.add_output(bare, value, _probe_name(node, place))
+        pieces.add_output(bare, call.outputs[0], _probe_name(node, None))
     first = dataclasses.replace(inputs, frames=inputs.frames[:1])
     (values,) = first.run(bare)
     for identifier, node in calls.items():
-        body = _alone(node, after.functions[identifier], after)
+        body = _one_call_model(node, after.functions[identifier], after)
         reads = {
-            str(value.name): values[_name(node, place)]
+            str(value.name): values[_probe_name(node, place)]
             for place, value in enumerate(node.inputs)
             if value is not None
         }
-        by_kernel = values[_name(node, None)]
+        by_kernel = values[_probe_name(node, None)]
         try:
-            error = relative(by_kernel, run_once(body, reads)["answer"])
+            error = relative_error(by_kernel, run_once(body, reads)["answer"])
         except (FramesError, GraphError):
             error = math.inf
         yield node.op_type, error, TOLERANCES.get(by_kernel.dtype.name, 0.0)
 
 
-def _name(node: ir.Node, place: int | None) -> str:
+def _probe_name(node: ir.Node, place: int | None) -> str:
     return f"call/{node.outputs[0].name}/{'answer' if place is None else place}"
 
 
-def _alone(node: ir.Node, function: ir.Function, model: ir.Model) -> ir.Model:
-    """Return a graph of one call, whose body no kernel stands in for."""
+def _one_call_model(node: ir.Node, function: ir.Function, model: ir.Model) -> ir.Model:
+    """Return a graph of one call, which runs its body instead of a kernel."""
     reads = [
         value and ir.Value(name=value.name, type=value.type, shape=value.shape)
         for value in node.inputs

@@ -1,4 +1,4 @@
-"""The pass manager: clone, run, check, commit; verify exact passes; find the guilty."""
+"""The pass manager: clone, run, check, commit; verify exact passes; name culprits."""
 
 import contextlib
 import dataclasses
@@ -26,13 +26,13 @@ from me2e_compress.manager.recipe import to_text
 from me2e_compress.manager.report import LossyPass, Report, Step, Verification
 from me2e_compress.manager.verification_inputs import (
     VerificationInputs,
-    first_seeded,
-    sized_as,
+    resize_as,
+    seeded_frame,
 )
 from me2e_compress.passes.base import Context, Pass
 from me2e_compress.passes.import_normalize import ImportNormalize, needs_import
 
-NOT_ASKED = "no frame was asked for (--verify-frames 0)"
+NOT_REQUESTED = "no frame was asked for (--verify-frames 0)"
 
 Progress = Callable[[int, int, str], None]
 Stretch = list[tuple[Pass, ir.Model]]
@@ -75,9 +75,9 @@ class PassManager:
             PassError: a pass broke.
             VerificationError: a pass broke the contract or changed the outputs.
         """
-        with collector_paused():
-            say = progress or (lambda done, total, what: None)
-            report = self._run(model.clone(), context, say)
+        with pause_collector():
+            report_progress = progress or (lambda done, total, what: None)
+            report = self._run(model.clone(), context, report_progress)
             return dataclasses.replace(report, read_as=read_as(model))
 
     def _run(self, model: ir.Model, context: Context, progress: Progress) -> Report:
@@ -104,8 +104,8 @@ class PassManager:
 
 
 @contextlib.contextmanager
-def collector_paused() -> Iterator[None]:
-    """Let Python's cycle collector rest: it would walk a million live nodes in vain.
+def pause_collector() -> Iterator[None]:
+    """Pause Python's cycle collector: it would walk a million live nodes in vain.
 
     A quarter of a run goes into that otherwise; what is left is collected at its end.
     """
@@ -176,19 +176,19 @@ class _Run:
         return result.model
 
     def verify(self, model: ir.Model) -> None:
-        """Check the exact passes since the last check, and name the guilty one."""
+        """Verify the exact passes since the last time; raise with the culprit."""
         stretch, self._stretch = self._stretch, []
         if self._unchecked:
             names, self._unchecked = tuple(self._unchecked), []
-            self.verifications.append(equivalence.skipped(names, NOT_ASKED))
+            self.verifications.append(equivalence.unverified(names, NOT_REQUESTED))
         if not stretch:
             return
         # a size that a pass gave to an input holds before it, too
-        stretch = [(current, sized_as(before, model)) for current, before in stretch]
+        stretch = [(current, resize_as(before, model)) for current, before in stretch]
         # what onnxruntime dies of is refused here, not merely unproven
         if self.manager.try_first is not None:
             what = f"the graph after {stretch[-1][0].name}"
-            seeded = first_seeded(model, self.context.seed)
+            seeded = seeded_frame(model, self.context.seed)
             self.manager.try_first(model, what, self._frames() or seeded)
         check, runnable, inputs = self._compare(stretch, model)
         self.verifications.append(check)
@@ -202,7 +202,7 @@ class _Run:
             f"{who} promises the same outputs and changed {worst} by"
             f" {check.errors[worst]:.3g} of its range"
             f" (allowed {check.tolerances[worst]:.0e}, {check.inputs} inputs)"
-            f"{equivalence.where(guilty, changed, inputs)}"
+            f"{equivalence.difference(guilty, changed, inputs)}"
             + (f"; inputs were drawn (seed {self.context.seed}):{_RECORD}" * drawn)
         )
         raise self._with_reproducer(current, guilty, error)
@@ -226,20 +226,20 @@ class _Run:
             remarks = (*check.remarks, *self._leave_out(stretch[:first], reason))
             return dataclasses.replace(check, remarks=remarks), stretch[first:], inputs
         names = tuple(current.name for current, _ in stretch)
-        return equivalence.skipped(names, reason), stretch, None
+        return equivalence.unverified(names, reason), stretch, None
 
     def _frames(self) -> CalibrationSet | None:
         return self.context.frames or self.manager.samples
 
     def _leave_out(self, stretch: Stretch, reason: str) -> tuple[str, ...]:
-        """Say what is not proven since the graph did not run before it.
+        """Record what is not proven since the graph did not run before it.
 
-        An import alone is what makes a graph run that somebody else exported: what it
-        has to say of that, such as types that it changed, is returned.
+        Of an import alone, which often makes an exported graph run, remarks are
+        returned instead, with its notes.
         """
         names = tuple(current.name for current, _ in stretch)
         if set(names) - {ImportNormalize.name}:
-            self.verifications.append(equivalence.skipped(names, reason))
+            self.verifications.append(equivalence.unverified(names, reason))
             return ()
         notes = [n for each in self.steps if each.name in names for n in each.notes]
         begins = "what is proven begins with what it made"
@@ -248,12 +248,12 @@ class _Run:
     def _with_reproducer(
         self, current: Pass, model: ir.Model, error: Me2eError
     ) -> Me2eError:
-        """Shrink the failure and add to the message where it lies."""
+        """Return the error with the path of its reproducer, which is written."""
         folder = self.manager.reproducers
         if folder is None:
             return error
         piece = reproducer.shrink(
-            model, lambda part: _fails_alike(current, part, self.context, error)
+            model, lambda part: _fails_same(current, part, self.context, error)
         )
         where = reproducer.write(
             folder, piece, to_text((current,)), self.context.seed, str(error)
@@ -279,10 +279,10 @@ def _bisect(
     return [each for each, _ in stretch[good:bad]], models[good], models[bad]
 
 
-def _fails_alike(
+def _fails_same(
     current: Pass, part: ir.Model, context: Context, error: Me2eError
 ) -> bool:
-    """Say whether a part of the graph shows the failure that the whole shows."""
+    """Return whether a part of the graph fails as the whole does."""
     try:
         result, _ = attempt(current, part, context)
     except Me2eError as other:

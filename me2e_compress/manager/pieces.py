@@ -29,7 +29,7 @@ from me2e_compress.manager.verification_inputs import (
     TOLERANCES,
     VerificationInputs,
     nudge,
-    relative,
+    relative_error,
 )
 from me2e_compress.runtime.frames import Array
 from me2e_compress.runtime.session import Session
@@ -63,9 +63,9 @@ Errors: TypeAlias = dict[str, float]
 
 
 def operand_names(steps: Sequence[Jump]) -> dict[str, str]:
-    """Map what a graph gives of the operands of steps to how messages call them."""
+    """Map the outputs that hold operands of steps to their names in messages."""
     return {
-        _name(_OPERAND, index, place): f"operand {place} of {step.outputs[0]}"
+        _step_name(_OPERAND, index, place): f"operand {place} of {step.outputs[0]}"
         for index, step in enumerate(steps)
         for place in step.operands
     }
@@ -90,12 +90,12 @@ def piece_errors(
     worst, allowed = [Errors() for _ in others], Errors()
     sessions = [
         Session(
-            _continued(model, steps), optimize=False, release=True, provider=provider
+            _substitute(model, steps), optimize=False, release=True, provider=provider
         )
         for model, _ in others
     ]
     state: Mapping[str, Array] = {}
-    for index, left in enumerate(inputs.run(_observed(before, steps), optimize=False)):
+    for index, left in enumerate(inputs.run(_expose(before, steps), optimize=False)):
         for session, errors, (_, own) in zip(sessions, worst, others, strict=True):
             # A frame, and state and answers of the first graph
             frame = own.frames[index]
@@ -105,7 +105,7 @@ def piece_errors(
             right = session.run({**frame.arrays, **state, **answers})
             for name, value in right.items():
                 called = names.get(name, name)
-                error = relative(left[name], value)
+                error = relative_error(left[name], value)
                 errors[called] = max(errors.get(called, 0.0), error)
                 if name in names:
                     allowed[called] = TOLERANCES.get(value.dtype.name, 0.0)
@@ -124,25 +124,25 @@ def nudged_weights(model: ir.Model, seed: int) -> ir.Model:
     return copy
 
 
-def steps_behind_changes(before: ir.Model, after: ir.Model) -> tuple[Jump, ...]:
-    """Return the steps of both graphs that read what a pass changed, first ones alone.
+def steps_after_changes(before: ir.Model, after: ir.Model) -> tuple[Jump, ...]:
+    """Return the first steps of both graphs that read what a pass changed.
 
-    Behind a step nothing counts as changed, until another node is.
+    After a step nothing counts as changed, until another node is.
     """
     makers = {value.name: node for node in before.graph for value in node.outputs}
     changed, steps = set[ir.Value](), list[Jump]()
     for node in after.graph:
         twin = makers.get(node.outputs[0].name) if node.outputs else None
         moved = not changed.isdisjoint(reads_of(node))
-        alike = twin is not None and _is_alike(twin, node, before, after)
+        alike = twin is not None and _is_twin(twin, node, before, after)
         if twin is not None and alike and is_step(node) and is_step(twin):
             operands = _operands(twin, node)
             if operands is not None:
-                if moved or _reads_others(twin, node):
+                if moved or _reads_differ(twin, node):
                     outputs = tuple(str(v.name) for v in node.outputs if v.name)
                     steps.append(Jump(outputs, operands))
                 continue
-        if moved or twin is None or not alike or _reads_others(twin, node):
+        if moved or twin is None or not alike or _reads_differ(twin, node):
             changed.update(node.outputs)
     return tuple(steps)
 
@@ -159,8 +159,8 @@ def is_step(node: ir.Node) -> bool:
     return node.op_type in STEPS
 
 
-def _is_alike(twin: ir.Node, node: ir.Node, before: ir.Model, after: ir.Model) -> bool:
-    """Return whether two nodes compute the same of equal inputs, and give as much."""
+def _is_twin(twin: ir.Node, node: ir.Node, before: ir.Model, after: ir.Model) -> bool:
+    """Return whether two nodes compute the same outputs of equal inputs."""
     if has_subgraph(node) or len(twin.inputs) != len(node.inputs):
         return False
     if node.op_identifier() in (*before.functions, *after.functions):
@@ -169,7 +169,7 @@ def _is_alike(twin: ir.Node, node: ir.Node, before: ir.Model, after: ir.Model) -
     return is_same(twin, node) and names == [value.name for value in twin.outputs]
 
 
-def _reads_others(twin: ir.Node, node: ir.Node) -> bool:
+def _reads_differ(twin: ir.Node, node: ir.Node) -> bool:
     """Return whether one of two nodes reads another value, or another constant."""
     return not all(map(_is_same_value, twin.inputs, node.inputs))
 
@@ -189,7 +189,7 @@ def _is_one_constant(mine: ir.Value, theirs: ir.Value) -> bool:
 
 
 def _operands(twin: ir.Node, node: ir.Node) -> tuple[int, ...] | None:
-    """Return the places of the operands to compare; None if constants differ."""
+    """Return the indices of the operands to compare; None if constants differ."""
     places = []
     for place, (mine, theirs) in enumerate(zip(twin.inputs, node.inputs, strict=True)):
         if mine is None or theirs is None:
@@ -202,39 +202,39 @@ def _operands(twin: ir.Node, node: ir.Node) -> tuple[int, ...] | None:
     return tuple(places)
 
 
-def _observed(
+def _expose(
     model: ir.Model, steps: Sequence[Jump], *, answers: bool = True
 ) -> ir.Model:
-    """Return a copy that also gives what each step reads, and what it gives."""
+    """Return a copy whose outputs include each step's operands and answers."""
     copy = model.clone()
     values = {value.name: value for node in copy.graph for value in node.outputs}
     for index, step in enumerate(steps):
         node = values[step.outputs[0]].producer()
         assert node is not None
         for place in step.operands:
-            show(copy, node.inputs[place], _name(_OPERAND, index, place))
+            add_output(copy, node.inputs[place], _step_name(_OPERAND, index, place))
         for place, name in enumerate(step.outputs if answers else ()):
-            show(copy, values[name], _name(_ANSWER, index, place))
+            add_output(copy, values[name], _step_name(_ANSWER, index, place))
     return copy
 
 
-def _continued(model: ir.Model, steps: Sequence[Jump]) -> ir.Model:
-    """Return a copy that gives what each step reads, and is fed what each gives."""
-    copy = _observed(model, steps, answers=False)
+def _substitute(model: ir.Model, steps: Sequence[Jump]) -> ir.Model:
+    """Return a copy with outputs for each step's operands, inputs for its answers."""
+    copy = _expose(model, steps, answers=False)
     values = {value.name: value for node in copy.graph for value in node.outputs}
     for index, step in enumerate(steps):
         for place, name in enumerate(step.outputs):
-            _feed(copy, values[name], _name(_ANSWER, index, place))
+            _replace_by_input(copy, values[name], _step_name(_ANSWER, index, place))
     sweep(copy)
     return copy
 
 
-def _name(kind: str, index: int, place: int) -> str:
+def _step_name(kind: str, index: int, place: int) -> str:
     return f"{kind}/{index}/{place}"
 
 
-def show(model: ir.Model, value: ir.Value | None, name: str) -> None:
-    """Give a value of the graph as an output of another name."""
+def add_output(model: ir.Model, value: ir.Value | None, name: str) -> None:
+    """Add a copy of a value to the graph's outputs, under another name."""
     assert value is not None
     node = ir.node("Identity", [value])
     node.outputs[0].name = node.name = name
@@ -243,8 +243,8 @@ def show(model: ir.Model, value: ir.Value | None, name: str) -> None:
     model.graph.outputs.append(node.outputs[0])
 
 
-def _feed(model: ir.Model, value: ir.Value, name: str) -> None:
-    """Let an input of a name stand for a value; an output keeps its own name."""
+def _replace_by_input(model: ir.Model, value: ir.Value, name: str) -> None:
+    """Replace a value by a new input; where it is an output, that keeps its name."""
     given = ir.Value(name=name, type=value.type, shape=value.shape)
     model.graph.inputs.append(given)
     known = str(value.name)

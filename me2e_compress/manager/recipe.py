@@ -40,10 +40,10 @@ def load(name: str | Path) -> tuple[Pass, ...]:
     Raises:
         RecipeError: no such recipe, not TOML, or a pass or option nobody knows.
     """
-    path, beside = Path(name), Path()
+    path, base = Path(name), Path()
     try:
         if path.is_file():
-            content, beside = documents.content(path), path.parent
+            content, base = documents.read_bytes(path), path.parent
         elif str(name) in shipped():
             folder = resources.files("me2e_compress") / "recipes"
             content = (folder / f"{name}.toml").read_bytes()
@@ -69,7 +69,7 @@ def load(name: str | Path) -> tuple[Pass, ...]:
         current = PASSES.build(str(options.pop("name", "")), options)
         # Files that it names are in the folder of its recipe
         files = {
-            field.name: beside / value
+            field.name: base / value
             for field in dataclasses.fields(current)
             if isinstance(value := getattr(current, field.name), Path)
         }

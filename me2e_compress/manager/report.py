@@ -120,8 +120,8 @@ class Verification:
         return "; ".join(f"{', '.join(n)}: {reason}" for reason, n in why.items() if n)
 
     @property
-    def fed(self) -> str:
-        """The inputs in a word or two, drawn sizes with them."""
+    def inputs_text(self) -> str:
+        """The kind of inputs with drawn sizes: ``synthetic, n=2 and n=3``."""
         drawn = " and ".join(
             ", ".join(f"{name}={size}" for name, size in each.items())
             for each in self.sizes
@@ -178,7 +178,7 @@ class Report:
 
 
 def versions() -> dict[str, str]:
-    """Name the versions that decide the result."""
+    """Return the versions of Python and of the packages that decide the result."""
     versions = {"python": platform.python_version()}
     for package in _PACKAGES:
         try:
@@ -216,16 +216,16 @@ def _verification_table(verifications: Iterable[Verification]) -> Table:
     """Show how far exact passes moved the outputs."""
     rows, notes = list[tuple[str, ...]](), dict[str, None]()
     for check in verifications:
-        names = ", ".join(check.passes)
+        names, inputs = ", ".join(check.passes), check.inputs_text
         if check.skipped is not None:
             rows.append((names, f"not proven: {check.skipped}", "", "", ""))
             continue
         for worst in sorted(check.judged, key=lambda name: -check.errors[name])[:1]:
             error, allowed = check.errors[worst], check.tolerances[worst]
-            rows.append((names, check.fed, worst, f"{error:.1e}", f"{allowed:.0e}"))
+            rows.append((names, inputs, worst, f"{error:.1e}", f"{allowed:.0e}"))
         for listed, why in ((check.unsteady, UNSTEADY), (check.random, RANDOM)):
             if listed:
-                rows.append((names, check.fed, ", ".join(listed), "not judged", ""))
+                rows.append((names, inputs, ", ".join(listed), "not judged", ""))
                 notes[why] = None
         notes |= dict.fromkeys(check.remarks)
     return table(

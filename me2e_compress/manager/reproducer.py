@@ -11,7 +11,7 @@ from me2e_compress import graph
 from me2e_compress.graph.nodes import reads_of
 
 PIPELINE = "pipeline.txt"
-"""Says what fails, and by that whose folder it is."""
+"""The file that names the failing pipeline, and so marks the folder as its own."""
 
 Failing = Callable[[ir.Model], bool]
 
@@ -29,7 +29,7 @@ def shrink(model: ir.Model, fails: Failing) -> ir.Model:
         half = (count + 1) // 2
         starts = dict.fromkeys((0, count - half, (count - half) // 2))
         for start in starts:
-            part = window(model, start, start + half)
+            part = cut_window(model, start, start + half)
             if part is not None and len(part.graph) < count and fails(part.clone()):
                 model = part
                 break
@@ -38,7 +38,7 @@ def shrink(model: ir.Model, fails: Failing) -> ir.Model:
     return model
 
 
-def window(model: ir.Model, start: int, stop: int) -> ir.Model | None:
+def cut_window(model: ir.Model, start: int, stop: int) -> ir.Model | None:
     """Cut nodes start..stop out of a graph; what they read becomes an input.
 
     None where a value that crosses the cut has no known type and shape, since the
@@ -77,7 +77,7 @@ def window(model: ir.Model, start: int, stop: int) -> ir.Model | None:
     return part
 
 
-def write(folder: Path, model: ir.Model, pipeline: str, seed: int, why: str) -> Path:
+def write(folder: Path, model: ir.Model, pipeline: str, seed: int, reason: str) -> Path:
     """Write the piece, the pipeline that fails on it and the reason into a folder."""
     name = re.sub(r"[^a-z0-9]+", "-", pipeline.lower()).strip("-")[:60]
     wanted = folder / f"reproducer-{name}"
@@ -92,5 +92,5 @@ def write(folder: Path, model: ir.Model, pipeline: str, seed: int, why: str) -> 
     target.mkdir(parents=True, exist_ok=True)
     graph.save(model, target / "model.onnx")
     (target / PIPELINE).write_text(pipeline + "\n", encoding="utf-8")
-    (target / "why.txt").write_text(f"{why}\nseed {seed}\n", encoding="utf-8")
+    (target / "why.txt").write_text(f"{reason}\nseed {seed}\n", encoding="utf-8")
     return target

@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 import onnx_ir as ir
 
-from me2e_compress.calibration.dataset import CalibrationSet, synthetic
+from me2e_compress.calibration.dataset import CalibrationSet, draw_frames
 from me2e_compress.errors import FramesError, GraphError, PreconditionError
 from me2e_compress.graph.shapes import static_shape
 from me2e_compress.passes.fix_shapes import open_dimensions, sized_inputs
@@ -27,15 +27,14 @@ networks of a few hundred layers (float32: 1e-6 to 1e-5 measured on VAD-tiny); e
 other dtype must be equal."""
 
 NUDGE_ULPS = 4
-"""By how many units in the last place inputs are nudged."""
+"""Units in the last place by which inputs are nudged."""
+SIZE_TRIALS = 2
+"""Number of sizes at which a graph with open dimensions is run."""
 
-TRIALS = 2
-"""At how many sizes a graph with open dimensions is run."""
-
-DISTINCT = (2, 3, 5, 7, 11, 13)
+DISTINCT_SIZES = (2, 3, 5, 7, 11, 13)
 """Sizes that are all different: what mixes up two open dimensions shows."""
 
-EQUAL = (
+EQUAL_SIZES = (
     *((2, 2), (3, 3), (1, 1)),
     *(
         (lead, size)
@@ -47,7 +46,7 @@ EQUAL = (
 of them to be equal, or pictures that can be halved again and again."""
 
 MOST_ELEMENTS = 1 << 25
-"""Inputs of more numbers than this (128 MB) are not made up."""
+"""Most numbers of drawn inputs: 128 MB of float32."""
 
 Outputs: TypeAlias = Mapping[str, npt.NDArray[np.generic]]
 Sizes: TypeAlias = Mapping[str, int]
@@ -97,7 +96,7 @@ class VerificationInputs:
             sizes = tuple(sizes for sizes, _ in scenes)
             return cls(made, "synthetic", provider, sizes)
         return cls(
-            list(synthetic(model, seed=seed, count=count)), "synthetic", provider
+            list(draw_frames(model, seed=seed, count=count)), "synthetic", provider
         )
 
     def run(self, model: ir.Model, *, optimize: bool = True) -> Iterator[Outputs]:
@@ -128,8 +127,8 @@ class VerificationInputs:
         return dataclasses.replace(self, frames=frames)
 
 
-def sized_as(model: ir.Model, other: ir.Model) -> ir.Model:
-    """Return a graph, its open inputs of the sizes that they have in another."""
+def resize_as(model: ir.Model, other: ir.Model) -> ir.Model:
+    """Return a graph whose open inputs have the sizes of another's; maybe itself."""
     sized = {each.name: each.shape for each in other.graph.inputs}
     wanted = {
         at: shape
@@ -146,10 +145,10 @@ def sized_as(model: ir.Model, other: ir.Model) -> ir.Model:
     return copy
 
 
-def first_seeded(model: ir.Model, seed: int) -> tuple[Frame, ...] | None:
-    """Return the frame that a graph without frames is run on first, if it has sizes."""
+def seeded_frame(model: ir.Model, seed: int) -> tuple[Frame, ...] | None:
+    """Return one drawn frame; None if an input has an open shape or is not numeric."""
     try:
-        return tuple(synthetic(model, seed=seed, count=1))
+        return tuple(draw_frames(model, seed=seed, count=1))
     except PreconditionError:
         return None
 
@@ -167,15 +166,15 @@ def nudge(
 def _runnable_scenes(
     model: ir.Model, seed: int, count: int, provider: Provider
 ) -> list[tuple[Sizes, list[Frame]]]:
-    """Search sizes that a graph runs at, and make a scene of frames of each."""
+    """Return sizes that a graph runs at, with scenes; a PreconditionError if none."""
     session, reason = Session(model, provider=provider), ""
     scenes: list[tuple[Sizes, list[Frame]]] = []
-    for sizes in drawn_sizes(model):
+    for sizes in size_candidates(model):
         inputs = sized_inputs(model, sizes)
         made = [math.prod(static_shape(each) or ()) for each in inputs.graph.inputs]
         if sum(made) > MOST_ELEMENTS:
             continue
-        scene = list(synthetic(inputs, seed=seed + len(scenes), count=count))
+        scene = list(draw_frames(inputs, seed=seed + len(scenes), count=count))
         try:
             for _ in replay(session, scene):
                 pass  # to run is all that is asked
@@ -183,7 +182,7 @@ def _runnable_scenes(
             reason = reason or f" ({error})"
             continue
         scenes.append((sizes, scene))
-        if len(scenes) == TRIALS:
+        if len(scenes) == SIZE_TRIALS:
             break
     if not scenes:
         names = ", ".join(open_dimensions(model))
@@ -194,17 +193,17 @@ def _runnable_scenes(
     return scenes
 
 
-def drawn_sizes(model: ir.Model) -> Iterator[Sizes]:
+def size_candidates(model: ir.Model) -> Iterator[Sizes]:
     """Yield sizes of the open dimensions of a graph's inputs, the likeliest first."""
     axes = open_dimensions(model)
-    for start in range(TRIALS):
-        sizes = itertools.islice(itertools.cycle(DISTINCT), start, None)
+    for start in range(SIZE_TRIALS):
+        sizes = itertools.islice(itertools.cycle(DISTINCT_SIZES), start, None)
         yield dict(zip(axes, sizes, strict=False))
-    for lead, other in EQUAL:
+    for lead, other in EQUAL_SIZES:
         yield {name: other if axis else lead for name, axis in axes.items()}
 
 
-def errors(a: Iterable[Outputs], b: Iterable[Outputs]) -> dict[str, float]:
+def relative_errors(a: Iterable[Outputs], b: Iterable[Outputs]) -> dict[str, float]:
     """Measure max|a-b|/max|a| of every output over all frames, in float64.
 
     NaN and infinities count as equal where both graphs give the same one; anything
@@ -213,12 +212,12 @@ def errors(a: Iterable[Outputs], b: Iterable[Outputs]) -> dict[str, float]:
     worst: dict[str, float] = {}
     for left, right in zip(a, b, strict=True):
         for name, value in left.items():
-            worst[name] = max(worst.get(name, 0.0), relative(value, right[name]))
+            worst[name] = max(worst.get(name, 0.0), relative_error(value, right[name]))
     return worst
 
 
-def relative(a: npt.NDArray[np.generic], b: npt.NDArray[np.generic]) -> float:
-    """Give max|a-b|/max|a|; infinite where shapes or kinds differ."""
+def relative_error(a: npt.NDArray[np.generic], b: npt.NDArray[np.generic]) -> float:
+    """Return max|a-b|/max|a|; infinite where shapes or dtypes differ."""
     if a.shape != b.shape or a.dtype != b.dtype:
         return float("inf")
     if a.size == 0:
@@ -241,5 +240,5 @@ def relative(a: npt.NDArray[np.generic], b: npt.NDArray[np.generic]) -> float:
 
 
 def tolerances(outputs: Outputs) -> dict[str, float]:
-    """Look up what each output may differ by."""
+    """Return the largest relative error that each output may have, by its dtype."""
     return {name: TOLERANCES.get(v.dtype.name, 0.0) for name, v in outputs.items()}

@@ -20,7 +20,7 @@ from me2e_compress.quantization.decision import (
 from me2e_compress.quantization.plan import make_plan
 from me2e_compress.quantization.rules import DEFAULT_RULES, RULE_SETS, RuleSet
 from me2e_compress.quantization.scheme import QuantScheme
-from me2e_compress.registry.registry import WRITTEN
+from me2e_compress.registry.registry import IN_TEXT
 from me2e_compress.targets import DEFAULT_TARGET, TARGETS, Target, onnxruntime
 from me2e_compress.targets.quantized import describe_quantized
 
@@ -58,7 +58,7 @@ class QuantizeInt8(Pass):
     modules: tuple[str, ...] = ()
     rules: str | RuleSet = DEFAULT_RULES
     # what a text means must not change with the default
-    target: str = dataclasses.field(default=DEFAULT_TARGET, metadata=WRITTEN)
+    target: str = dataclasses.field(default=DEFAULT_TARGET, metadata=IN_TEXT)
     overrides: Path | None = None
     method: str | None = None
     ranges: Path | None = None

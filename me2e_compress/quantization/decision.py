@@ -177,7 +177,7 @@ def load_plan(path: Path) -> QuantPlan:
     if not path.is_file():
         raise RecipeError(f"{path}: no such plan")
     with documents.reading(path, RecipeError, "not a plan"):
-        return pydantic.TypeAdapter(QuantPlan).validate_json(documents.content(path))
+        return pydantic.TypeAdapter(QuantPlan).validate_json(documents.read_bytes(path))
 
 
 def stamp_plan(model: ir.Model, plan: QuantPlan) -> None:
@@ -302,7 +302,7 @@ class Overrides(_Strict):
         if not path.is_file():
             raise RecipeError(f"{path}: no such file of overrides")
         with documents.reading(path, RecipeError, "not TOML"):
-            content = documents.content(path)
+            content = documents.read_bytes(path)
         return cls.parse(content, str(path))
 
     @classmethod

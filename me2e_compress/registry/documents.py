@@ -31,7 +31,7 @@ LARGEST_TOML_BYTES = 4_000_000
 KEY_PARTS = 64
 """The most parts of a dotted TOML key."""
 
-UNREADABLE = (
+NPZ_ERRORS = (
     OSError,
     EOFError,
     ValueError,  # pickled objects, headers that lie
@@ -46,11 +46,11 @@ UNREADABLE = (
 """What numpy and zipfile raise on a file that holds no valid arrays."""
 
 
-def _refuse(word: str) -> None:
+def _reject_constant(word: str) -> None:
     raise ValueError(f"{word} is not a number")
 
 
-_DECODER = json.JSONDecoder(parse_constant=_refuse)
+_DECODER = json.JSONDecoder(parse_constant=_reject_constant)
 _ANY_NUMBER = json.JSONDecoder()
 _TOKEN = re.compile(r'"(?:[^"\\\n]|\\.)*"|\'[^\'\n]*\'|[\w-]+|\.|[^\s.]')
 _LONE_SURROGATE = re.compile("[\ud800-\udfff]")
@@ -88,13 +88,13 @@ def reading(
 
 
 def check_regular(path: Path) -> None:
-    """Refuse a folder, a device or a pipe, which may never end as it is read."""
+    """Raise a MalformedError of a folder, a device or a pipe, which may never end."""
     if not stat.S_ISREG(path.stat().st_mode):
         what = "it is a folder, " if path.is_dir() else ""
         raise MalformedError(f"{what}not a regular file")
 
 
-def content(path: Path, most: int = LARGEST_BYTES) -> bytes:
+def read_bytes(path: Path, most: int = LARGEST_BYTES) -> bytes:
     """Read a text file of at most so many bytes.
 
     Raises:
@@ -113,7 +113,7 @@ def from_json(text: bytes | str, *, finite: bool = True) -> Any:
     False; the caller must then look at the numbers.
     """
     try:
-        document = (_DECODER if finite else _ANY_NUMBER).decode(_decoded(text))
+        document = (_DECODER if finite else _ANY_NUMBER).decode(_decode(text))
     except RecursionError as error:
         raise MalformedError("nested too deeply") from error
     except ValueError as error:
@@ -126,7 +126,7 @@ def from_toml(text: bytes | str) -> dict[str, Any]:
     """Read a TOML document; anything else is a MalformedError."""
     try:
         _check_size(len(text), LARGEST_TOML_BYTES)
-        decoded = _decoded(text)
+        decoded = _decode(text)
         _check_keys(decoded)
         return tomllib.loads(decoded)
     except RecursionError as error:
@@ -140,13 +140,13 @@ def _check_size(size: int, most: int) -> None:
         raise MalformedError(f"{size:,} bytes are too many: {most:,} may be")
 
 
-def _decoded(text: bytes | str) -> str:
+def _decode(text: bytes | str) -> str:
     # editors of Windows put a byte order mark before it
     return text if isinstance(text, str) else text.decode("utf-8-sig")
 
 
 def _check_strings(value: object) -> None:
-    """Refuse half characters, which JSON's escapes can write and no file can hold."""
+    """Raise a MalformedError of lone surrogates, which no file can hold."""
     waiting = [value]
     while waiting:
         each = waiting.pop()
@@ -159,7 +159,7 @@ def _check_strings(value: object) -> None:
 
 
 def _check_keys(text: str) -> None:
-    """Count the parts of dotted keys."""
+    """Raise a MalformedError of a dotted key with more than `KEY_PARTS` parts."""
     parts, after_dot = 0, True
     for token in _TOKEN.finditer(text):
         word = token.group()

@@ -26,7 +26,7 @@ PRODUCER = "me2e-compress"
 """What ONNX models name as the program that wrote them."""
 _IN_ONNX = b"\x12" + bytes([len(PRODUCER)]) + PRODUCER.encode()
 """ModelProto.producer_name is field 2, and stands before the graph (onnx.proto)."""
-_NEAR = 4096
+_END_BYTES = 4096
 """Bytes that are read at each end of a file, however large it is."""
 
 
@@ -42,9 +42,9 @@ def is_marked(path: Path) -> bool:
     if not path.is_file():
         return False
     with path.open("rb") as stream:
-        head = stream.read(_NEAR)
-        stream.seek(max(0, os.fstat(stream.fileno()).st_size - _NEAR))
-        ends = head, stream.read(_NEAR)
+        head = stream.read(_END_BYTES)
+        stream.seek(max(0, os.fstat(stream.fileno()).st_size - _END_BYTES))
+        ends = head, stream.read(_END_BYTES)
     return _IN_ONNX in head or any(BYTES in each for each in ends)
 
 
@@ -52,13 +52,10 @@ _SETS: list[list[tuple[Path, Path]]] = []
 """Of each open block: the places where something was put, and what was there."""
 
 
-def put(draft: Path, path: Path) -> None:
-    """Put a draft in its place, which is in the same file system.
-
-    Of folders, the earlier one is removed.
-    """
+def put_in_place(draft: Path, path: Path) -> None:
+    """Rename a draft to its path, in the same file system; replace a file or folder."""
     if not draft.is_dir():
-        _keep(path)
+        _back_up(path)
         os.replace(draft, path)
         return
     aside = Path(tempfile.mkdtemp(prefix=f".{path.name}.", dir=path.parent))
@@ -69,14 +66,14 @@ def put(draft: Path, path: Path) -> None:
 
 
 def remove(path: Path) -> None:
-    """Remove a file that a draft took the place of, if it is there."""
-    _keep(path)
+    """Remove a file, if it is there; :func:`all_or_none` may restore it."""
+    _back_up(path)
     path.unlink(missing_ok=True)
 
 
 @contextlib.contextmanager
 def all_or_none() -> Iterator[None]:
-    """Take back the files that are put or removed in this block if an error leaves it.
+    """Restore the files that are replaced or removed in this block if it raises.
 
     What was there before is kept until its end, as a second link to the same file.
     """
@@ -97,8 +94,8 @@ def all_or_none() -> Iterator[None]:
             shutil.rmtree(before.parent, ignore_errors=True)
 
 
-def _keep(path: Path) -> None:
-    """Keep what is in a place, if what happens there may be taken back."""
+def _back_up(path: Path) -> None:
+    """Link what is at a path for :func:`all_or_none`, if such a block is open."""
     if not _SETS:
         return
     before = Path(tempfile.mkdtemp(prefix=f".{path.name}.", dir=path.parent), path.name)
@@ -111,8 +108,8 @@ def _keep(path: Path) -> None:
 
 
 @contextlib.contextmanager
-def naming(path: Path) -> Iterator[None]:
-    """Let errors of the system name a file, not the draft of it, or nothing."""
+def naming_file(path: Path) -> Iterator[None]:
+    """Let OSErrors in this block name a file instead of its draft."""
     try:
         yield
     except OSError as error:
@@ -122,8 +119,8 @@ def naming(path: Path) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def written(path: Path, error: Callable[[str], Exception]) -> Iterator[None]:
-    """Turn the system's refusal to write a file here into one line that names it."""
+def writing_errors(path: Path, error: Callable[[str], Exception]) -> Iterator[None]:
+    """Turn OSErrors in this block into an error whose one line names the file."""
     try:
         yield
     except OSError as cause:

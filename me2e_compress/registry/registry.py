@@ -65,7 +65,7 @@ class Registry(Generic[T]):
 
     def names(self) -> tuple[str, ...]:
         """List the names: ours in their order, then others by the alphabet."""
-        others = {entry.name for entry in _installed(self.group)}
+        others = {entry.name for entry in _entry_points(self.group)}
         return (*self.builtin, *sorted(others - set(self.builtin)))
 
     def get(self, name: str) -> type[T]:
@@ -76,9 +76,9 @@ class Registry(Generic[T]):
                 a frozen dataclass of that name.
             MissingExtraError: what it needs is not installed.
         """
-        claim, *rivals = self._claims(name) or (None,)
+        claim, *rivals = self._entries(name) or (None,)
         if claim is None:
-            raise self._unknown(name)
+            raise self._unknown_name(name)
         if rivals:
             packages = " and ".join(self.sources(name))
             raise self.error(
@@ -147,9 +147,9 @@ class Registry(Generic[T]):
             item = read_one(text)
         except TextError as error:
             if not name_in(text):
-                raise self._unknown(text) from error
+                raise self._unknown_name(text) from error
             raise self.error(f"{self.kind}: {error}") from error
-        return self._built(item, cls or self.get(item.name), more)
+        return self._build(item, cls or self.get(item.name), more)
 
     def parse_all(self, text: str) -> tuple[T, ...]:
         """Make the items that a text lists, parted by commas; see :meth:`parse`."""
@@ -157,7 +157,7 @@ class Registry(Generic[T]):
             items = read_all(text)
         except TextError as error:
             raise self.error(f"{self.kind}: {error}") from error
-        return tuple(self._built(item, self.get(item.name)) for item in items)
+        return tuple(self._build(item, self.get(item.name)) for item in items)
 
     def text(self, item: T, *, defaults: bool = False) -> str:
         """Write an item so that :meth:`parse` makes an equal one.
@@ -172,7 +172,7 @@ class Registry(Generic[T]):
             field.name: values[field.name]
             for field in fields
             if not callable(values[field.name])
-            and (defaults or is_written(field, values[field.name]))
+            and (defaults or is_in_text(field, values[field.name]))
         }
         return write_item(item.name, chosen, short=len(fields) == 1)
 
@@ -189,14 +189,14 @@ class Registry(Generic[T]):
 
     def sources(self, name: str) -> tuple[str, ...]:
         """Name the packages that bring a name, each with its version."""
-        return tuple(_source(entry) for entry in self._claims(name))
+        return tuple(_package_of(entry) for entry in self._entries(name))
 
-    def _unknown(self, name: str) -> Me2eError:
+    def _unknown_name(self, name: str) -> Me2eError:
         there = ", ".join(self.names()) or "none"
         line = f"no {self.kind} {name!r}; there are {there}"
         return self.error(FORMER_NAMES.get(f"{self.kind} {name}", line))
 
-    def _built(
+    def _build(
         self, item: ParsedItem, cls: type[T], more: Mapping[str, object] | None = None
     ) -> T:
         # a version is written as a number, and is a text
@@ -212,15 +212,16 @@ class Registry(Generic[T]):
             raise self.error(f"{item.name}: option {twice[0]} is given twice")
         return self.make(cls, {**options, **more})
 
-    def _claims(self, name: str) -> tuple[EntryPoint, ...]:
+    def _entries(self, name: str) -> tuple[EntryPoint, ...]:
         """List what is to be loaded for a name; more than one is a conflict."""
-        theirs = tuple(each for each in _installed(self.group) if each.name == name)
+        theirs = tuple(each for each in _entry_points(self.group) if each.name == name)
         if name not in self.builtin:
             return theirs
         return (EntryPoint(name, self.builtin[name], self.group), *theirs)
 
     def _load(self, entry: EntryPoint) -> type[T]:
-        what = f"{self.kind} {entry.name!r} of {_source(entry)} ({entry.value})"
+        """Import an entry's class; raises as :meth:`get` does."""
+        what = f"{self.kind} {entry.name!r} of {_package_of(entry)} ({entry.value})"
         try:
             cls = entry.load()
         except Me2eError:
@@ -245,17 +246,17 @@ def fields_of(cls: type) -> tuple["dataclasses.Field[Any]", ...]:
     return tuple(sorted(fields, key=lambda field: field.kw_only is True))
 
 
-WRITTEN: Mapping[str, bool] = {"written": True}
+IN_TEXT: Mapping[str, bool] = {"written": True}
 """Metadata of a field that a text names even at its default."""
 
 
-def is_written(field: "dataclasses.Field[Any]", value: object) -> bool:
-    """Return whether a text names an option: most are left out at their default."""
+def is_in_text(field: "dataclasses.Field[Any]", value: object) -> bool:
+    """Return whether a text includes an option: most are left out at their default."""
     return bool(field.metadata.get("written")) or value != default_of(field)
 
 
 def default_of(field: "dataclasses.Field[Any]") -> object:
-    """Return what an option is where it is left out; MISSING where it may not be."""
+    """Return the default of an option; MISSING where it must be given."""
     if field.default_factory is not dataclasses.MISSING:
         return field.default_factory()
     return field.default
@@ -267,24 +268,24 @@ def _adapter(cls: type) -> "pydantic.TypeAdapter[Any]":
 
 
 def is_frozen_dataclass(cls: object) -> bool:
-    """Look at the class itself: one without decorator inherits that of its base."""
+    """Return whether the class itself, not only a base, is a frozen dataclass."""
     if not isinstance(cls, type):
         return False
     parameters = vars(cls).get("__dataclass_params__")
     return parameters is not None and bool(parameters.frozen)
 
 
-def _source(entry: EntryPoint) -> str:
-    """Name the package that an entry point is of, with its version."""
+def _package_of(entry: EntryPoint) -> str:
+    """Return the name of an entry point's package, with its version unless ours."""
     return _OURS if entry.dist is None else f"{entry.dist.name} {entry.dist.version}"
 
 
-def _installed(group: str) -> tuple[EntryPoint, ...]:
-    return _all_installed(tuple(sys.path)).get(group, ())
+def _entry_points(group: str) -> tuple[EntryPoint, ...]:
+    return _all_entry_points(tuple(sys.path)).get(group, ())
 
 
 @functools.cache
-def _all_installed(path: tuple[str, ...]) -> Mapping[str, tuple[EntryPoint, ...]]:
+def _all_entry_points(path: tuple[str, ...]) -> Mapping[str, tuple[EntryPoint, ...]]:
     """Find the entry points along the path that modules are looked for on, by group."""
     points: Any = importlib.metadata.entry_points()  # a type of its own in Python 3.11
     return {group: tuple(points.select(group=group)) for group in points.groups}
@@ -353,7 +354,7 @@ def describe(registry: Registry[T]) -> tuple[Entry, ...]:
 
 def options_of(cls: type) -> tuple[Option, ...]:
     """Describe the options of a dataclass, in the order of its fields."""
-    docs, options = _docs(cls), list[Option]()
+    docs, options = _option_docs(cls), list[Option]()
     for field in fields_of(cls):
         default, kind = default_of(field), field.type
         if not isinstance(kind, str):  # bounds of pydantic's are left out
@@ -365,7 +366,7 @@ def options_of(cls: type) -> tuple[Option, ...]:
     return tuple(options)
 
 
-def _docs(cls: type) -> Mapping[str, str]:
+def _option_docs(cls: type) -> Mapping[str, str]:
     """Return what the section Attributes (or Args) says, by field; a base's, too."""
     docs = dict[str, str]()
     for each in reversed(cls.__mro__):

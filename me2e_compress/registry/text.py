@@ -26,10 +26,10 @@ _NESTING = re.compile(r'"(?:[^"\\]|\\.)*"|[{}]')
 _INTEGER = re.compile(r"[+-]?[0-9]+(_[0-9]+)*")
 _FLOAT = re.compile(r"[+-]?[0-9]+(_[0-9]+)*(\.[0-9]+)?([eE][+-]?[0-9]+)?")
 _LITERALS = {"true": True, "false": False, "null": None}
-_SHOWN = 40
-_DEEPEST = 32
-"""Lists in lists; the options of ours need one."""
-_DIGITS = 400
+_MOST_QUOTED = 40
+_MOST_NESTING = 32
+"""Most nested lists; our own options need one."""
+_MOST_DIGITS = 400
 """The most characters of a number: the largest float64 has 309 digits."""
 
 
@@ -39,7 +39,7 @@ class TextError(ValueError):
 
 @dataclasses.dataclass(frozen=True)
 class ParsedItem:
-    """A name, the options in braces behind it, and what stands behind a colon.
+    """A name, the options in braces after it, and the value after a colon.
 
     ``numbers`` holds numbers as they are written: version 10.10 is not version 10.1.
     """
@@ -105,7 +105,7 @@ def write_value(value: object) -> str:
     """
     own = type(value).__str__ is not object.__str__
     if dataclasses.is_dataclass(value) and not isinstance(value, type) and not own:
-        return write_value(chosen_fields(value))
+        return write_value(fields_changed(value))
     if isinstance(value, tuple | list):
         return "[" + ", ".join(write_value(item) for item in value) + "]"
     if isinstance(value, Mapping):
@@ -116,7 +116,7 @@ def write_value(value: object) -> str:
     return json.dumps(str(value))
 
 
-def chosen_fields(value: "DataclassInstance") -> dict[str, object]:
+def fields_changed(value: "DataclassInstance") -> dict[str, object]:
     """Return the fields of a dataclass by name, without those at their default."""
     return {
         each.name: own
@@ -176,8 +176,8 @@ class _Reader:
         word = self.expect(_WORD, "a value is expected")
         if self.text.startswith("{", self.at):
             return word + self.braces()
-        if len(word) > _DIGITS and word[:9].strip("+-_").isdecimal():
-            self.fail(f"a number of more than {_DIGITS} digits")
+        if len(word) > _MOST_DIGITS and word[:9].strip("+-_").isdecimal():
+            self.fail(f"a number of more than {_MOST_DIGITS} digits")
         # A truth value, null or a number; else a word
         if word in _LITERALS:
             return _LITERALS[word]
@@ -188,7 +188,7 @@ class _Reader:
     def sequence(self) -> list[object]:
         values: list[object] = []
         self.depth += 1
-        if self.depth > _DEEPEST:
+        if self.depth > _MOST_NESTING:
             self.fail("lists are nested too deeply")
         while not self.take("]"):
             if values and not self.take(","):
@@ -219,14 +219,14 @@ class _Reader:
             self.fail("a comma or the end is expected")
 
     def take(self, mark: str) -> bool:
-        """Pass a mark, and the space before it, if it comes next."""
+        """Consume a mark and the space before it if it comes next; return whether."""
         self.match(_SPACE)
         there = self.text.startswith(mark, self.at)
         self.at += len(mark) * there
         return there
 
     def match(self, pattern: re.Pattern[str]) -> str | None:
-        """Pass what comes next, and the space before it, if it matches."""
+        """Consume and return what matches next, after space; None if nothing does."""
         space = _SPACE.match(self.text, self.at)
         match = pattern.match(self.text, space.end() if space else self.at)
         if match is None:
@@ -235,7 +235,7 @@ class _Reader:
         return match.group()
 
     def expect(self, pattern: re.Pattern[str], otherwise: str) -> str:
-        """Pass what comes next, which must match."""
+        """Consume and return what matches next; a TextError if nothing does."""
         text = self.match(pattern)
         if text is None:
             self.fail(otherwise)
@@ -243,6 +243,6 @@ class _Reader:
 
     def fail(self, expected: str) -> NoReturn:
         rest = self.text[self.at :]
-        where = f"from {rest[:_SHOWN]!r} on" if rest else "to the end"
+        where = f"from {rest[:_MOST_QUOTED]!r} on" if rest else "to the end"
         whole = self.text if len(self.text) <= 200 else f"{self.text[:200]}..."
         raise TextError(f"cannot read {whole!r} {where}: {expected}")

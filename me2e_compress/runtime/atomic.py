@@ -14,7 +14,7 @@ def write_bytes(path: Path, content: bytes) -> None:
 
     An OSError (folder missing, not writable, or full) leaves nothing behind.
     """
-    with drafts.naming(path):
+    with drafts.naming_file(path):
         handle, draft = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
         try:
             with os.fdopen(handle, "wb") as file:
@@ -22,7 +22,7 @@ def write_bytes(path: Path, content: bytes) -> None:
                 file.flush()
                 os.fsync(file.fileno())
             Path(draft).chmod(0o644)
-            drafts.put(Path(draft), path)
+            drafts.put_in_place(Path(draft), path)
         except BaseException:
             Path(draft).unlink(missing_ok=True)
             raise

@@ -42,7 +42,7 @@ def read_latencies(path: Path) -> ImportedLatency:
         EvaluationError: it is missing, or of no such form.
     """
     with documents.reading(path, EvaluationError, FORMATS):
-        document = documents.from_json(documents.content(path))
+        document = documents.from_json(documents.read_bytes(path))
         if isinstance(document, dict):
             trace = LatencyTrace.load(path)
             return ImportedLatency(trace.samples_us, trace.machine or "a trace")

@@ -226,14 +226,14 @@ class LatencyTrace:
 
     def save(self, path: Path) -> None:
         """Write the trace atomically; an EvaluationError if it cannot be written."""
-        with drafts.written(path, EvaluationError):
+        with drafts.writing_errors(path, EvaluationError):
             write_document(path, self.to_json())
 
     @classmethod
     def load(cls, path: Path) -> Self:
         """Read a trace, without its percentiles; an EvaluationError if it is none."""
         with documents.reading(path, EvaluationError, "not a latency trace"):
-            return TypeAdapter(cls).validate_json(documents.content(path))
+            return TypeAdapter(cls).validate_json(documents.read_bytes(path))
 
     @model_validator(mode="before")
     @classmethod

@@ -21,7 +21,7 @@ def write_model_file(path: Path, content: bytes) -> Path:
         raise GraphError(
             f"{path}: its folder cannot be made: {error.strerror}"
         ) from error
-    with drafts.written(path, GraphError):
+    with drafts.writing_errors(path, GraphError):
         write_bytes(path, content)
     return path
 

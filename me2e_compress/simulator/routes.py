@@ -148,7 +148,7 @@ def load_routes(path: Path = SHIPPED) -> tuple[Route, ...]:
             was changed after it was made, or made by another version of the generator.
     """
     with documents.reading(path, EvaluationError, "not routes"):
-        content = documents.content(path)
+        content = documents.read_bytes(path)
         routes = _MANIFEST.validate_json(content, strict=True)
         records = _RECORDS.validate_json(content)
     # a set of this road, as it was admitted
@@ -197,7 +197,7 @@ def save_routes(routes: Sequence[Route], path: Path) -> None:
     mark: dict[str, Any] = IN_JSON | made
     records[:1] = [mark | each for each in records[:1]]  # a list has no other place
     lines = ",\n".join(map(json.dumps, records))
-    with drafts.written(path, EvaluationError):
+    with drafts.writing_errors(path, EvaluationError):
         write_bytes(path, f"[\n{lines}\n]\n".encode())
 
 

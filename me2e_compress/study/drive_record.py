@@ -123,7 +123,7 @@ class DriveRecord:
         head = asdict(_Head(self.variant, self.condition, dict(self.made_by)))
         rows = [_ROUTE.dump_python(each, mode="json") for each in self.routes]
         lines = [json.dumps(row, ensure_ascii=False) for row in (head, *rows)]
-        with drafts.written(path, StudyError):
+        with drafts.writing_errors(path, StudyError):
             path.parent.mkdir(parents=True, exist_ok=True)
             write_bytes(path, ("\n".join(lines) + "\n").encode())
 
@@ -131,7 +131,7 @@ class DriveRecord:
     def load(cls, path: Path) -> Self:
         """Read a file that `save` wrote; a repeated route or a cut-off is an error."""
         with documents.reading(path, StudyError, "not a record of a drive"):
-            content = documents.content(path, documents.LARGEST_LOG_BYTES)
+            content = documents.read_bytes(path, documents.LARGEST_LOG_BYTES)
             text = content.decode("utf-8")
             if not text.endswith("\n"):
                 raise documents.MalformedError("its last line was cut off")

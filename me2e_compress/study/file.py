@@ -95,7 +95,7 @@ def _content(path: Path) -> dict[str, object]:
         gone = FORMER_NAMES.get(f"study {path}")
         raise StudyError(gone or f"no study {path}: no such file")
     with documents.reading(path, StudyError, "not TOML"):
-        content = documents.from_toml(documents.content(path))
+        content = documents.from_toml(documents.read_bytes(path))
     if "set_size" in content:  # Python's own
         raise StudyError(f"{path}: no key set_size")
     return content

@@ -41,6 +41,6 @@ class Workspace:
 
     def _made(self, name: str) -> Path:
         path = self.folder / name
-        with drafts.written(path, StudyError):
+        with drafts.writing_errors(path, StudyError):
             path.mkdir(parents=True, exist_ok=True)
         return path

@@ -31,7 +31,7 @@ import onnxruntime as ort
 import platformdirs
 
 from me2e_compress import graph
-from me2e_compress.calibration.dataset import CalibrationSet, archive_of
+from me2e_compress.calibration.dataset import CalibrationSet, npz_bytes
 from me2e_compress.display import plural
 from me2e_compress.driving.adapter.outputs import adapted, state_and_plan
 from me2e_compress.errors import FORMER_NAMES, GraphError
@@ -382,7 +382,7 @@ def try_first(
             graph.save(ready, file)
         inputs = Path(scratch) / "frame.npz"
         if frame is not None:
-            inputs.write_bytes(archive_of(frame.arrays))
+            inputs.write_bytes(npz_bytes(frame.arrays))
         words = [str(file), str(inputs), kernels, *CPU.left_out]
         done = run_script(_SCRIPT, words)
     # Exit codes that the script does not give itself mean a crash.

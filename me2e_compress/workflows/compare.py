@@ -11,7 +11,7 @@ import onnx_ir as ir
 from me2e_compress import graph
 from me2e_compress.calibration.calibrator import Extremes
 from me2e_compress.calibration.dataset import CalibrationSet
-from me2e_compress.calibration.statistics import first_maker, places_of
+from me2e_compress.calibration.statistics import first_bad_node, index_inputs
 from me2e_compress.display import Table, plural, table
 from me2e_compress.errors import (
     EvaluationError,
@@ -255,13 +255,13 @@ class _BadFrame:
         State is that of a scene's beginning.
         """
         graph.infer_shapes(model)  # untyped values are not looked at
-        places, frame = places_of(model), self._frame
+        places, frame = index_inputs(model), self._frame
         if frame is None or not (places or self._is_bad):
             return ""
         read, probe = {*places, *session.outputs}, Extremes()
         try:
             inputs = {**frame.arrays, **session.first_state(frame.arrays)}
-            return first_maker(model, inputs, read, probe, session.provider)
+            return first_bad_node(model, inputs, read, probe, session.provider)
         except (GraphError, FramesError):  # it runs optimized alone
             return ""
 

@@ -15,8 +15,8 @@ from me2e_compress.graph.files import data_names
 from me2e_compress.graph.provenance import drop_traces
 from me2e_compress.manager import PassManager, Report
 from me2e_compress.manager import recipe as recipes
-from me2e_compress.manager.pass_manager import collector_paused
-from me2e_compress.manager.verification_inputs import first_seeded
+from me2e_compress.manager.pass_manager import pause_collector
+from me2e_compress.manager.verification_inputs import seeded_frame
 from me2e_compress.passes import Context, Pass
 from me2e_compress.passes.fix_shapes import with_sizes
 from me2e_compress.passes.freeze_inputs import advice
@@ -133,7 +133,7 @@ class CompressResult(Result):
             yield from filter(None, [self.int8.slow_here])
         # how far exact passes moved the outputs, and what is not proven
         judged = [
-            (check.errors[name], check.fed)
+            (check.errors[name], check.inputs_text)
             for check in self.report.verifications
             for name in check.judged
         ]
@@ -266,7 +266,7 @@ def compress(
     inputs = (source, named, frames, options.module_map, options.adapter, *read)
     reported = sidecar(output, "plan"), sidecar(output, "report")
     outputs = (output, *data_names(output), *reported)
-    with writing(outputs, inputs, force=options.force), collector_paused():
+    with writing(outputs, inputs, force=options.force), pause_collector():
         loaded = read_graph(source, listener, options.adapter, options.module_map)
         drop_traces(loaded)
         modules = load_map(options.module_map, loaded)
@@ -275,7 +275,7 @@ def compress(
         first = partial(try_first, listener=listener, provider=provider)
         shown: Frames | None = seen.calibration or seen.samples
         if shown is None and options.verify_frames:
-            shown = first_seeded(loaded, options.seed)
+            shown = seeded_frame(loaded, options.seed)
         first(loaded, source.name, shown, file=source)
         # apply the passes, and refuse a result that is unproven or not int8
         context = Context(modules, seen.calibration, options.seed, provider)

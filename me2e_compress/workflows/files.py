@@ -151,7 +151,7 @@ def split(
     named = [each for path in files.values() for each in (path, *data_names(path))]
     inputs = (source, toml, *joined.paths)
     check_folder(output, inputs)
-    with drafts.written(output, GraphError):
+    with drafts.writing_errors(output, GraphError):
         for path in files.values():
             path.parent.mkdir(parents=True, exist_ok=True)
     with writing(named, inputs, force=force), drafts.all_or_none():

@@ -13,7 +13,7 @@ from me2e_compress.calibration.recording import (
     DriveLog,
     LogRequest,
     Source,
-    partial_of,
+    partial_folder,
     write_recording,
 )
 from me2e_compress.display import plural
@@ -94,7 +94,7 @@ def record_frames(
     if not folder.name:
         raise FramesError(f"{folder}: name a folder of its own: it is written anew")
     check_folder(folder, (source, options.adapter))
-    with writing(trees=[folder], folders=[partial_of(folder)], force=options.force):
+    with writing(trees=[folder], folders=[partial_folder(folder)], force=options.force):
         return _record(source, folder, log, options, listener)
 
 

@@ -276,7 +276,7 @@ def make_routes(
     # what an earlier run has done
     if draft.exists():
         with documents.reading(draft, EvaluationError, "not a set that was begun"):
-            content = documents.content(draft)
+            content = documents.read_bytes(draft)
             record = TypeAdapter(dict[str, Any]).validate_json(content)
             for key, wanted in deciding.items():
                 if record.get(key) != wanted:

@@ -6,7 +6,7 @@ import onnx_ir as ir
 import pytest
 
 from me2e_compress.calibration import dataset
-from me2e_compress.calibration.dataset import CalibrationSet, load_arrays, synthetic
+from me2e_compress.calibration.dataset import CalibrationSet, draw_frames, load_arrays
 from me2e_compress.calibration.sample import draw, hold_out
 from me2e_compress.errors import FramesError, PreconditionError
 from tests.fuzz.frames import archive, broken_frames, member
@@ -116,7 +116,7 @@ def test_the_fingerprint_follows_content_and_scenes_not_the_place(
 
 def test_synthetic_frames_fit_and_follow_the_seed(model: ir.Model) -> None:
     first, again, other = (
-        list(synthetic(model, seed=seed, count=2)) for seed in (1, 1, 2)
+        list(draw_frames(model, seed=seed, count=2)) for seed in (1, 1, 2)
     )
 
     assert [each.starts_scene for each in first] == [True, False]
@@ -130,7 +130,7 @@ def test_open_shapes_have_no_synthetic_frames() -> None:
     model = parsed(MODEL.replace("float[1,2] x", "float[n,2] x"))
 
     with pytest.raises(PreconditionError, match=r"input x is .*\[n,2\].*give frames"):
-        synthetic(model, seed=0, count=1)
+        draw_frames(model, seed=0, count=1)
 
 
 # Sizes are looked at before anything is read.

@@ -190,9 +190,9 @@ endless (int64[1] x) => (int64[1] y) <int64 most = {9223372036854775807}> {
 DEAF = """
 import sys, numpy as np, onnxruntime as ort
 from me2e_compress.cli import signals
-signals.DEAF_S = 0.2
+signals.TIMEOUT_S = 0.2
 session = ort.InferenceSession(sys.argv[1])
-with signals.signals_in_order():
+with signals.handle_signals():
     print("runs", flush=True)
     session.run(None, {"x": np.zeros(1, np.int64)})
 """

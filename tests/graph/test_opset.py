@@ -7,7 +7,7 @@ import onnx_ir as ir
 import pytest
 
 from me2e_compress import graph
-from me2e_compress.calibration.dataset import CalibrationSet, synthetic
+from me2e_compress.calibration.dataset import CalibrationSet, draw_frames
 from me2e_compress.errors import FramesError, GraphError
 from me2e_compress.graph.opset import read_as
 from me2e_compress.graph.runtime_operators import newest_ir, newest_opset
@@ -157,7 +157,7 @@ def test_an_input_that_holds_a_value_is_a_constant_and_that_is_said(
     assert [each.name for each in found.graph.inputs] == ["x", "x4", "c", "i"]
     assert "a held a value: no input any more, but a constant; what" in read_as(found)
     # frames that were recorded with it hold that value
-    (frame,) = (dict(each.arrays) for each in synthetic(found, seed=0, count=1))
+    (frame,) = (dict(each.arrays) for each in draw_frames(found, seed=0, count=1))
     CalibrationSet(record(tmp_path / "2", [frame | {"a": held.numpy()}])).check(found)
     other = CalibrationSet(record(tmp_path / "3", [frame | {"a": held.numpy() + 1}]))
     with pytest.raises(FramesError, match="a is not the one that the graph was made"):

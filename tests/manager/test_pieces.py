@@ -12,7 +12,7 @@ from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.errors import VerificationError
 from me2e_compress.graph import infer_shapes
 from me2e_compress.manager import PassManager, Verification, equivalence, recipe
-from me2e_compress.manager.pieces import steps_behind_changes
+from me2e_compress.manager.pieces import steps_after_changes
 from me2e_compress.manager.verification_inputs import VerificationInputs
 from me2e_compress.passes.attach_bodies import AttachBodies
 from me2e_compress.passes.base import Context
@@ -123,7 +123,7 @@ def test_a_breach_is_one_however_far_rounding_moves_what_is_behind_it(
     check = verified(before, after, frame)
 
     inputs = VerificationInputs([frame], "recorded")
-    rounding = equivalence.unsteadiness(before, list(inputs.run(before)), inputs)
+    rounding = equivalence.rounding_effect(before, list(inputs.run(before)), inputs)
     assert check.errors["y"] <= rounding["y"]
     assert not check.passed
 
@@ -162,7 +162,7 @@ IF = """If(c) <then_branch = t () => (float[1,64] p) { p = Neg(x) },
 )
 def test_what_may_compute_something_else_counts_as_changed(was: str, now: str) -> None:
     before, after = (read(BRANCHES.replace("CALL", text)) for text in (was, now))
-    assert [step.outputs for step in steps_behind_changes(before, after)] == [("y",)]
+    assert [step.outputs for step in steps_after_changes(before, after)] == [("y",)]
 
 
 def test_what_changes_behind_a_step_is_found() -> None:
@@ -177,10 +177,10 @@ def test_what_changes_behind_a_step_is_found() -> None:
 
 def test_another_quantizer_is_no_piece() -> None:
     before, after, _ = graphs("QuantizeLinear", SHIFT)
-    assert steps_behind_changes(before, before.clone()) == ()
-    assert [s.outputs for s in steps_behind_changes(before, after)] == [("q",)]
+    assert steps_after_changes(before, before.clone()) == ()
+    assert [s.outputs for s in steps_after_changes(before, after)] == [("q",)]
     _give(after, one=np.array(1.5, np.float32))
-    assert steps_behind_changes(before, after) == ()
+    assert steps_after_changes(before, after) == ()
 
 
 ACCUMULATES = """<ir_version: 9, opset_import: ["" : 19]>

@@ -17,10 +17,10 @@ from me2e_compress.manager import (
     pass_manager,
 )
 from me2e_compress.manager.verification_inputs import (
-    EQUAL,
+    EQUAL_SIZES,
     VerificationInputs,
-    errors,
-    relative,
+    relative_error,
+    relative_errors,
     tolerances,
 )
 from me2e_compress.passes.base import Context, Pass
@@ -47,7 +47,7 @@ MIXED = """m (float[n,4] x, float[1,8] s) => (float[n,4] y, float[1,8] t)
 def test_an_open_dimension_is_run_at_two_sizes(context: Context) -> None:
     (check,) = checks(MIXED, context, passes.ROUNDS)
     assert check.sizes == ({"n": 2}, {"n": 3})
-    assert check.fed == "synthetic, n=2 and n=3"
+    assert check.inputs_text == "synthetic, n=2 and n=3"
     assert set(check.errors) == {"y", "t"}
     with pytest.raises(VerificationError, match=r"scales promises .* changed y by"):
         checks(MIXED, context, passes.scales(1.01))
@@ -93,7 +93,7 @@ def test_sizes_are_drawn_until_the_graph_runs(
     (check,) = checks(text, context, passes.IDLE)
     assert check.sizes == sizes
     assert check.unproven is None
-    assert all(size % 4 == 0 and lead in (1, 2) for lead, size in EQUAL[3:])
+    assert all(size % 4 == 0 and lead in (1, 2) for lead, size in EQUAL_SIZES[3:])
 
 
 @pytest.mark.parametrize(
@@ -253,8 +253,8 @@ FLOATS = hnp.arrays(
 
 @given(FLOATS)
 def test_nothing_differs_from_itself(a: np.ndarray) -> None:
-    assert relative(a, a.copy()) == 0.0
-    assert relative(a[:0], a[:0]) == 0.0
+    assert relative_error(a, a.copy()) == 0.0
+    assert relative_error(a[:0], a[:0]) == 0.0
 
 
 @given(FLOATS, st.floats(0.0009765625, 0.5, width=32))
@@ -264,7 +264,7 @@ def test_the_error_is_relative_to_the_largest(a: np.ndarray, share: float) -> No
         return
     b = a.astype(np.float64)
     b[peak] *= 1 + share
-    assert relative(a.astype(np.float64), b) == pytest.approx(share, rel=1e-9)
+    assert relative_error(a.astype(np.float64), b) == pytest.approx(share, rel=1e-9)
 
 
 @pytest.mark.parametrize(
@@ -280,7 +280,7 @@ def test_the_error_is_relative_to_the_largest(a: np.ndarray, share: float) -> No
     ],
 )
 def test_what_no_number_can_measure_is_infinite(a: np.ndarray, b: np.ndarray) -> None:
-    assert relative(a, b) == float("inf")
+    assert relative_error(a, b) == float("inf")
 
 
 @pytest.mark.parametrize(
@@ -299,7 +299,7 @@ def test_what_counts_as_rounding_depends_on_the_type(
         kind = np.dtype(getattr(ml_dtypes, dtype, dtype))
         a = np.linspace(-0.5, 1.0, 61)
         left, right = {"y": a.astype(kind)}, {"y": (a * (1 + share)).astype(kind)}
-        found = errors([left], [right])
+        found = relative_errors([left], [right])
         return Verification(("p",), "recorded", found, tolerances(left)).passed
 
     assert is_rounding(rounding)

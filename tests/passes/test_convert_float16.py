@@ -14,7 +14,7 @@ from me2e_compress import graph
 from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.errors import PreconditionError, ProviderError
 from me2e_compress.graph.modules.module_map import ModuleMap
-from me2e_compress.manager.verification_inputs import relative
+from me2e_compress.manager.verification_inputs import relative_error
 from me2e_compress.passes import Context
 from me2e_compress.passes.convert_float16 import ConvertFloat16
 from me2e_compress.runtime.providers import CpuProvider
@@ -40,7 +40,7 @@ def test_weights_are_half_and_the_interface_is_as_it_was() -> None:
     assert ConvertFloat16().run(found.model, Context(MODULES)).changes == 0
     drawn = fed(source, 3)
     wide, half = (run_once(each, drawn)["y"] for each in (source, found.model))
-    assert 0 < relative(wide, half) < 3e-3
+    assert 0 < relative_error(wide, half) < 3e-3
 
 
 def test_numbers_that_the_frames_show_to_be_too_large(tmp_path: Path) -> None:

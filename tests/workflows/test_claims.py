@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from me2e_compress.calibration.recording import partial_of, write_recording
+from me2e_compress.calibration.recording import partial_folder, write_recording
 from me2e_compress.errors import GraphError
 from me2e_compress.registry.drafts import MARK
 from me2e_compress.runtime.frames import Frame
@@ -150,7 +150,7 @@ def test_a_folder_that_stayed_empty_goes_unless_it_was_there(tmp_path: Path) -> 
 
 def test_one_run_records_the_frames_of_a_folder(tmp_path: Path) -> None:
     with (
-        writing(folders=[partial_of(tmp_path / "out")]),
+        writing(folders=[partial_folder(tmp_path / "out")]),
         pytest.raises(GraphError, match="partial is in use"),
     ):
         record_frames("highway", tmp_path / "out")
@@ -159,7 +159,7 @@ def test_one_run_records_the_frames_of_a_folder(tmp_path: Path) -> None:
 def test_unfinished_frames_of_another_run_are_cleared_under_the_lock(
     tmp_path: Path,
 ) -> None:
-    partial = partial_of(tmp_path / "out")
+    partial = partial_folder(tmp_path / "out")
     partial.mkdir()
     for name in ("progress.json", "000007.npz"):
         (partial / name).write_text("{}")

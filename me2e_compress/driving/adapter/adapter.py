@@ -188,7 +188,7 @@ class Adapter(BaseModel):
     def load(cls, path: Path) -> Self:
         """Read a TOML file."""
         with documents.reading(path, EvaluationError, "not TOML"):
-            content = documents.from_toml(documents.content(path))
+            content = documents.from_toml(documents.read_bytes(path))
         return cls.parse(content, f"{path}: adapter")
 
     @classmethod

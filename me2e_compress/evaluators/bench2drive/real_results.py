@@ -40,7 +40,7 @@ def _ids(routes: Path) -> frozenset[str]:
     """Read the ids of a leaderboard's routes file."""
     with documents.reading(routes, EvaluationError, "not a routes file"):
         try:
-            root = ElementTree.fromstring(documents.content(routes))
+            root = ElementTree.fromstring(documents.read_bytes(routes))
         except ElementTree.ParseError as error:
             raise documents.MalformedError(str(error)) from error
     ids = frozenset(each.attrib.get("id", "") for each in root.iter("route")) - {""}
@@ -166,7 +166,7 @@ class CollectedResults:
             self.unrecorded.append(route)
         for path in paths:
             try:
-                raw = documents.from_json(documents.content(path), finite=False)
+                raw = documents.from_json(documents.read_bytes(path), finite=False)
                 recording = read_recording(raw)
             except (OSError, documents.MalformedError, BrokenRecordingError) as error:
                 self.broken[str(path)] = str(error)

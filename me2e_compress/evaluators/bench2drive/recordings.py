@@ -160,7 +160,7 @@ class _Line(BaseModel):
 def read_decisions(path: Path) -> tuple[InferenceRecord, ...]:
     """Read a ``decisions.jsonl``."""
     decisions = list[InferenceRecord]()
-    lines = documents.content(path, documents.LARGEST_LOG_BYTES).splitlines()
+    lines = documents.read_bytes(path, documents.LARGEST_LOG_BYTES).splitlines()
     for number, line in enumerate(lines, 1):
         try:
             noted = _Line.model_validate(documents.from_json(line))

@@ -280,7 +280,7 @@ def _is_checkpoint(path: Path) -> bool:
 
 
 def _read(path: Path) -> ResultFile:
-    document = documents.from_json(documents.content(path), finite=False)
+    document = documents.from_json(documents.read_bytes(path), finite=False)
     try:
         checked = _Document.model_validate(document)
     except ValidationError as error:

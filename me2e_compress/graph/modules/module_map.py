@@ -272,7 +272,7 @@ class ModuleMap:
             if not path.is_file():
                 raise ModuleMapError(f"{path}: no such file")
             with documents.reading(path, ModuleMapError, "not TOML"):
-                content = documents.content(path)
+                content = documents.read_bytes(path)
             return cls.parse(content, path.stem, str(path))
         # presets
         if str(source) == WHOLE:

@@ -97,7 +97,7 @@ class StackFile(pydantic.BaseModel):
     def load(cls, path: Path) -> Self:
         """Read a file; GraphError if it cannot be read or has unknown entries."""
         with documents.reading(path, GraphError, "not a stack of several files"):
-            return cls.model_validate(documents.from_toml(documents.content(path)))
+            return cls.model_validate(documents.from_toml(documents.read_bytes(path)))
 
 
 @dataclasses.dataclass(frozen=True)

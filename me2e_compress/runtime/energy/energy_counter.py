@@ -262,7 +262,7 @@ class Recorded(EnergyCounter):
 
 def _read(path: Path) -> Mapping[str, Sequence[str]]:
     """Return a CSV file's columns by name; a ValueError of rows of other lengths."""
-    content = documents.content(path)
+    content = documents.read_bytes(path)
     rows = csv.reader(io.StringIO(content.decode("utf-8-sig")))
     header = [name.strip() for name in next(rows, [])]
     lines = [line for line in rows if line]

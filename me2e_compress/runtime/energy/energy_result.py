@@ -232,14 +232,14 @@ class EnergyResult:
 
     def save(self, path: Path) -> None:
         """Write the result atomically; an EnergyError if it cannot be written."""
-        with drafts.written(path, EnergyError):
+        with drafts.writing_errors(path, EnergyError):
             write_document(path, asdict(self), indent=2)
 
     @classmethod
     def load(cls, path: Path) -> Self:
         """Read what :meth:`save` wrote, without unknown keys; else an EnergyError."""
         with documents.reading(path, EnergyError, "not an energy file"):
-            record = documents.from_json(documents.content(path))
+            record = documents.from_json(documents.read_bytes(path))
             return TypeAdapter(cls).validate_python(record)
 
 

@@ -269,7 +269,7 @@ def write_study(
     text = heading + "\n".join(table.markdown() for table in outcome.tables())
     page = study_page(outcome, command, sections)
     # all files are written, or none
-    with drafts.written(folder, StudyError):
+    with drafts.writing_errors(folder, StudyError):
         folder.mkdir(parents=True, exist_ok=True)
         with (
             writing([written.record, written.tables, written.report], force=force),
