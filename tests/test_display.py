@@ -38,9 +38,7 @@ def test_a_plan_has_a_row_a_module_with_the_rules_that_kept_float() -> None:
         (None, ".2f", "-"),
     ],
 )
-def test_no_number_is_a_negative_zero(
-    value: float | None, form: str, text: str
-) -> None:
+def test_no_number_is_negative_zero(value: float | None, form: str, text: str) -> None:
     assert format_number(value, form) == text
 
 

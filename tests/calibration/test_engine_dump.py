@@ -44,9 +44,7 @@ def refused(path: Path, frames: CalibrationSet | None = None) -> str:
     return str(caught.value)
 
 
-def test_answers_are_read_frame_by_frame(
-    tmp_path: Path, frames: CalibrationSet
-) -> None:
+def test_answers_are_read_by_frame(tmp_path: Path, frames: CalibrationSet) -> None:
     dump = EngineDump(as_npz(tmp_path / "dump"))
     dump.check(frames)
 

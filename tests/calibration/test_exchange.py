@@ -110,9 +110,7 @@ def test_tensors_are_taken_from_a_cache_by_their_names() -> None:
 
 
 @pytest.mark.parametrize("names", [("n1",), ("c", "n1", "n2")])
-def test_a_cache_with_less_than_half_is_of_another_graph(
-    names: tuple[str, ...],
-) -> None:
+def test_a_cache_with_under_half_is_of_another_graph(names: tuple[str, ...]) -> None:
     message = rf"another graph: of 3 .* it lacks \w and . more; it has {names[0]}"
     with pytest.raises(FramesError, match=message):
         pick_ranges(cache(*names), Path("c"), model("/c"), "xcr")

@@ -291,9 +291,7 @@ def reach(method: object, x: Values) -> float:
     ("low", "high", "scale"),
     [(-1.27, 0.5, 0.01), (0.0, 12.7, 0.1), (-254.0, 254.0, 2.0), (0.0, 0.0, 1.0)],
 )
-def test_the_scale_covers_the_larger_side(
-    low: float, high: float, scale: float
-) -> None:
+def test_a_scale_covers_the_larger_side(low: float, high: float, scale: float) -> None:
     assert scale_of(low, high) == np.float32(scale)
 
 

@@ -99,9 +99,7 @@ OPEN = """m (float[n,4] camera, float[1,4] other) => (float[n,4] plan) {
 }"""
 
 
-def test_what_cannot_be_run_is_written_on_demand_alone(
-    cli: Cli, tmp_path: Path
-) -> None:
+def test_what_cannot_run_is_written_on_demand_alone(cli: Cli, tmp_path: Path) -> None:
     graph.save(parsed(HEAD + PLUGIN), tmp_path / "in.onnx")
     line = "compress in.onnx -r exact -o out.onnx"
 
@@ -129,9 +127,7 @@ def test_an_open_dimension_is_proven_at_drawn_sizes_unless_nobody_asks(
     assert "every output is the same" not in shown
 
 
-def test_an_open_batch_gets_one_size_for_every_command(
-    cli: Cli, tmp_path: Path
-) -> None:
+def test_an_open_batch_gets_one_size_in_every_command(cli: Cli, tmp_path: Path) -> None:
     draws = np.random.default_rng(0)
     weights = {"w": draws.normal(size=(32, 16, 3, 3)), "l": draws.normal(size=(64, 32))}
     model = stored(

@@ -106,9 +106,7 @@ ONE = Frame(0, True, {"camera": np.zeros((1, 4), np.float32)})
 
 
 @pytest.mark.parametrize("name", [".out.partial", ".out.partial.before"])
-def test_recording_leaves_folders_that_it_did_not_make(
-    tmp_path: Path, name: str
-) -> None:
+def test_recording_leaves_folders_it_did_not_make(tmp_path: Path, name: str) -> None:
     mine = tmp_path / name
     mine.mkdir()
     (mine / "notes.txt").write_text("mine")

@@ -55,9 +55,7 @@ def test_overrides_reach_the_plan_and_the_pass(cli: Cli, dense: Path) -> None:
 @pytest.mark.parametrize(
     "words", ["--scheme full", "--rules paper", "--overrides none.toml"]
 )
-def test_options_are_not_for_a_plan_that_is_made(
-    cli: Cli, file: str, words: str
-) -> None:
+def test_options_are_not_for_a_made_plan(cli: Cli, file: str, words: str) -> None:
     cli.done(MADE)
 
     said = cli.refused(f"plan {file} {words}")

@@ -53,9 +53,7 @@ def grids(path: Path) -> set[ir.DataType]:
     return {zero.dtype for zero in zeros if zero is not None and zero.dtype is not None}
 
 
-def test_int8_is_for_onnxruntime_unless_somebody_is_named(
-    cli: Cli, model: Path
-) -> None:
+def test_int8_is_for_onnxruntime_unless_another_is_named(cli: Cli, model: Path) -> None:
     def report() -> Any:
         return json.loads((model / "out.report.json").read_text())
 

@@ -371,9 +371,7 @@ def test_metadata_that_is_no_set_is_named(named: dict[str, str], message: str) -
 
 
 @pytest.mark.parametrize("has_scores", [True, False])
-def test_compare_matches_what_both_graphs_have(
-    tmp_path: Path, has_scores: bool
-) -> None:
+def test_compare_takes_what_both_graphs_have(tmp_path: Path, has_scores: bool) -> None:
     sets = json.dumps({"boxes": "boxes", "scores": "scores"})
     save_text(tmp_path / "one.onnx", SWAPPED % "0, 1", **{"me2e.sets": sets})
     text = SWAPPED if has_scores else SWAPPED.replace("scores", "votes")

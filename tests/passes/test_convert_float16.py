@@ -55,6 +55,18 @@ def test_numbers_that_the_frames_show_to_be_too_large(tmp_path: Path) -> None:
     assert "numbers up to 9e+04 1" in found.notes[1]
 
 
+@pytest.mark.parametrize(
+    ("opset", "shape", "reason"),
+    [(17, "n,8", "of unknown length"), (11, "4,64,32", "over more than 1024 elements")],
+)
+def test_a_softmax_that_stays_says_why(opset: int, shape: str, reason: str) -> None:
+    text = f'<ir_version: 9, opset_import: ["" : {opset}]> g (float[{shape}] x)'
+    model = parsed(text + f" => (float[{shape}] y) {{ y = Softmax(x) }}")
+    graph.infer_shapes(model)
+    found = ConvertFloat16().run(model, Context(ModuleMap.whole()))
+    assert f"a softmax {reason} 1" in found.notes[1]
+
+
 def test_the_frames_run_on_the_provider(tmp_path: Path) -> None:
     model = bare(OPSET + "b (float[4] x) => (float[4] y) { y = Relu(x) }", {})
     frames = CalibrationSet(record(tmp_path / "f", [{"x": np.ones(4, np.float32)}]))

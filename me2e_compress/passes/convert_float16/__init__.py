@@ -3,6 +3,7 @@
 import dataclasses
 import fnmatch
 import itertools
+import math
 from collections import Counter
 from collections.abc import Collection, Mapping
 from typing import ClassVar
@@ -188,14 +189,11 @@ def _matches(model: ir.Model, pattern: str) -> list[ir.Node]:
 
 LARGEST = float(np.finfo(np.float16).max)
 """65504."""
-
 HEADROOM = 2.0
 """Factor by which other frames may exceed the measured range."""
-
 LONGEST_SUM = 1024
 """A half has 11 bits: a sum of more than 2,048 equal numbers stops growing. A kernel
 that adds up a softmax in half is right to 1e-3 up to half of that."""
-
 _RESOLUTION = 2.0**-10
 """Relative error of a constant that still is the same constant."""
 
@@ -207,7 +205,6 @@ _SUMS = frozenset(
     }
 )  # fmt: skip
 """Sums of many elements, squares and exponentials: they leave float16 on their way."""
-
 _CHOICES = frozenset(
     {
         "ArgMax", "ArgMin", "Equal", "Greater", "GreaterOrEqual", "Less", "LessOrEqual",
@@ -215,10 +212,8 @@ _CHOICES = frozenset(
     }
 )  # fmt: skip
 """Operators that choose between numbers: nearly equal ones would become equal."""
-
 _PLACES = frozenset({"DeformConv", "Det", "GridSample", "Range", "RoiAlign"})
 """Operators that take coordinates beside their data."""
-
 _MOVES = LAYOUT_OPERATORS | {
     "Concat", "Expand", "Gather", "GatherElements", "GatherND", "Pad",
     "ScatterElements", "ScatterND", "Slice", "Split", "Tile",
@@ -238,9 +233,9 @@ def wide_nodes(
     """
     # Operators, constants and positions decide without running the graph
     places = position_arithmetic(model, constant_values(model))
-    reasons: dict[ir.Node, str] = {}
+    reasons, opset = dict[ir.Node, str](), opset_of(model)
     for node in model.graph:
-        reason = _by_operator(node) or _by_constants(node, types)
+        reason = _by_operator(node, opset) or _by_constants(node, types)
         if reason is None and node in places:
             reason = "positions: a half is right to 1/2048"
         if reason is not None:
@@ -251,7 +246,8 @@ def wide_nodes(
     return reasons | _between(model, reasons)
 
 
-def _by_operator(node: ir.Node) -> str | None:
+def _by_operator(node: ir.Node, opset: int) -> str | None:
+    """Return why an operator stays in float32 whatever it reads, else None."""
     if not is_standard(node):
         return "not an operator of ONNX"
     if has_subgraph(node):
@@ -264,8 +260,11 @@ def _by_operator(node: ir.Node) -> str | None:
         return "positions: a half is right to 1/2048"
     if node.op_type in ("LogSoftmax", "Softmax"):
         shape = static_shape(node.inputs[0])
-        axis = node.attributes.get_int("axis", -1)
-        if shape is None or shape[axis] > LONGEST_SUM:
+        if shape is None:
+            return "a softmax of unknown length"
+        # Before opset 13 it takes all axes from the given one on together
+        axis = node.attributes.get_int("axis", 1 if opset < 13 else -1)
+        if math.prod(shape[axis:] if opset < 13 else shape[axis:][:1]) > LONGEST_SUM:
             return f"a softmax over more than {LONGEST_SUM} elements"
     return None
 
