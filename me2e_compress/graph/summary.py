@@ -256,13 +256,13 @@ def weight_bytes(model: ir.Model) -> int:
 
 
 def value_bytes(value: ir.Value) -> int | None:
-    """Return the bytes of a value; None where its shape or type is open, or of text."""
+    """Return the bytes of a value; None of open shapes or types, and computed text."""
     if value.const_value is not None:
         return int(value.const_value.nbytes)
     shape = static_shape(value)
     if shape is None or value.dtype in (None, ir.DataType.STRING):
         return None
-    return math.ceil(math.prod(shape) * value.dtype.itemsize)
+    return math.ceil(math.prod(shape) * value.dtype.itemsize)  # int4: two to a byte
 
 
 def total_bytes(values: Iterable[ir.Value]) -> int | None:

@@ -75,7 +75,7 @@ class Estimate:
     """A mean over routes with its 95 % interval.
 
     ``low`` and ``high`` bound the interval over these scenario types, ``anew_low`` and
-    ``anew_high`` the wider one over types drawn anew (`metrics.intervals`); they are
+    ``anew_high`` the wider one over types drawn anew (`metrics.measure`); they are
     None if n is too small or they were not computed.
     """
 

@@ -263,7 +263,7 @@ class PairedDifference:
 
     What makes a route hard for both cancels out, so the intervals are narrower than
     those of the two means suggest. The interval over these scenario types is never
-    narrower than what so few routes can exclude (`metrics.intervals.unseen_share`).
+    narrower than what so few routes can exclude (`metrics.measure.unseen_share`).
     ``better`` and ``worse`` count routes by driving score; ``gained`` and ``lost``
     count routes on which only this variant, or only the reference, succeeds.
     """
