@@ -264,8 +264,8 @@ class Calibrator:
         )
         # Without tensors to measure, nothing is run.
         if not tensors:
-            nothing = np.empty((len(frames), 0, Extremes().width), np.float32)
-            return dataclasses.replace(empty, measured=nothing, inputs=(), outputs=())
+            unread = np.empty((len(frames), 0, Extremes().width), np.float32)
+            return dataclasses.replace(empty, measured=unread, inputs=(), outputs=())
         if reason := why_unsupported(model, self.provider):
             raise GraphError(
                 f"{reason}; ranges that TensorRT measured are taken by `calibrate"

@@ -399,13 +399,13 @@ def _check_frame(frame: Mapping[str, Header], model: ir.Model, source: str) -> N
         )
 
 
-def check_array(array: Header | Array, value: ir.Value, where: str) -> None:
+def check_array(array: Header | Array, value: ir.Value, label: str) -> None:
     """Raise a FramesError where an array has not an input's dtype and shape."""
     if value.dtype is not None and array.dtype != value.dtype.numpy():
-        raise FramesError(f"{where} is {array.dtype}, expected {value.dtype.numpy()}")
+        raise FramesError(f"{label} is {array.dtype}, expected {value.dtype.numpy()}")
     if value.shape is not None and not _matches(array.shape, value.shape):
         raise FramesError(
-            f"{where} has shape {list(array.shape)}, expected {value.shape}"
+            f"{label} has shape {list(array.shape)}, expected {value.shape}"
         )
 
 

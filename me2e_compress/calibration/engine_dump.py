@@ -49,7 +49,7 @@ class EngineDump:
         """Read the answers in order, one frame in memory at a time."""
         return (self[index] for index in range(len(self)))
 
-    def where(self, index: int) -> str:
+    def label(self, index: int) -> str:
         """Return how a message names a frame's answers."""
         return str(self.path / self.stems[index])
 
@@ -83,17 +83,17 @@ class EngineDump:
         for index in range(len(self)):
             tensors = read_headers(self._file(index))
             if missing := [each for each in self.names if each not in tensors]:
-                where = self.where(index)
+                label = self.label(index)
                 raise FramesError(
-                    f"{where}: {missing[0]} is missing; other frames have it"
+                    f"{label}: {missing[0]} is missing; other frames have it"
                 )
             if more := [each for each in tensors if each not in self.names]:
                 raise FramesError(
-                    f"{self.where(0)}: {more[0]} is missing; other frames have it"
+                    f"{self.label(0)}: {more[0]} is missing; other frames have it"
                 )
             for name, each in tensors.items():
                 if each.dtype.kind not in "fiub":
                     raise FramesError(
-                        f"{self.where(index)}: {name} is {each.dtype}, which is no"
+                        f"{self.label(index)}: {name} is {each.dtype}, which is no"
                         " number; write bfloat16 as float32"
                     )

@@ -81,6 +81,7 @@ def pick_ranges(
 def _parse_lines(
     path: Path, lines: list[str], first: int, mark: str, read: Callable[[str], float]
 ) -> dict[str, float]:
+    """Read a number a line by name; a FramesError names a line that has none."""
     values = {}
     for number, line in enumerate(lines[first:], first + 1):
         name, separator, text = line.rpartition(mark)

@@ -57,13 +57,13 @@ def token_means(
 class _Average:
     """Running average of one value.
 
-    Floats and booleans are summed in float64; integers are few (indices) and are kept.
+    Floats and booleans are summed in float64; integers, few indices, are stored.
     """
 
     name: str
     count: int = 0
     total: npt.NDArray[np.float64] | None = None
-    kept: list[Array] = dataclasses.field(default_factory=list)
+    values: list[Array] = dataclasses.field(default_factory=list)
     like: Array | None = None
 
     def take(self, index: int, value: Array) -> None:
@@ -78,7 +78,7 @@ class _Average:
         # Integers need all values for their mode.
         self.like, self.count = value, self.count + 1
         if value.dtype.kind in "iu":
-            self.kept.append(value)
+            self.values.append(value)
         else:
             wide = value.astype(np.float64)
             self.total = wide if self.total is None else self.total + wide
@@ -90,7 +90,7 @@ class _Average:
             from scipy import stats  # takes a second to import
 
             # the smallest of the most frequent values
-            stack = cast("npt.NDArray[np.int64]", np.stack(self.kept))  # any integers
+            stack = cast("npt.NDArray[np.int64]", np.stack(self.values))  # any integers
             return np.asarray(stats.mode(stack).mode, self.like.dtype)
         mean = np.asarray(self.total / self.count)
         if self.like.dtype == np.bool_:

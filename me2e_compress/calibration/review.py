@@ -64,15 +64,15 @@ class RangeFinding:
 def review(ranges: Ranges) -> tuple[RangeFinding, ...]:
     """Return findings on ranges, of their own values alone; warnings first."""
     findings = [*_range_findings(ranges), *_port_findings(ranges)]
-    if said := ranges.not_finite:
-        findings.append(RangeFinding("not finite", "warning", said, advice=NOT_FINITE))
+    if text := ranges.not_finite:
+        findings.append(RangeFinding("not finite", "warning", text, advice=NOT_FINITE))
     if ranges.scenes is not None and ranges.scenes < FEW_SCENES:
-        said = f"{plural(ranges.frames, 'frame')} in {plural(ranges.scenes, 'scene')}"
+        text = f"{plural(ranges.frames, 'frame')} in {plural(ranges.scenes, 'scene')}"
         advice = (
             f"Frames of one scene look alike: record {FEW_SCENES} scenes or more, on"
             " other routes, in other traffic and light"
         )
-        findings.append(RangeFinding("few scenes", "note", said, advice=advice))
+        findings.append(RangeFinding("few scenes", "note", text, advice=advice))
     return tuple(sorted(findings, key=lambda each: each.severity, reverse=True))
 
 
@@ -80,10 +80,10 @@ def missing_ranges(cache: Path, missing: Sequence[str]) -> tuple[RangeFinding, .
     """Return a finding on the tensors that an imported cache lacks, if any."""
     if not missing:
         return ()
-    said = f"{plural(len(missing), 'tensor')} not in {cache}"
+    text = f"{plural(len(missing), 'tensor')} not in {cache}"
     advice = "What reads them stays float, as in TensorRT 10"
     return (
-        RangeFinding("not in cache", "warning", said, tuple(missing), advice=advice),
+        RangeFinding("not in cache", "warning", text, tuple(missing), advice=advice),
     )
 
 
@@ -174,13 +174,13 @@ def _of_kind(activities: Mapping[str, Activity], kind: Activity) -> dict[str, No
 def _name_finding(
     kind: Kind,
     severity: Literal["warning", "note"],
-    said: str,
+    text: str,
     ratio_of: Mapping[str, float | None],
     advice: str = "",
 ) -> Iterable[RangeFinding]:
-    """Yield a finding on the names, if any; ``said`` begins with the noun to count."""
+    """Yield a finding on the names, if any; ``text`` begins with the noun to count."""
     if ratio_of:
-        noun, rest = said.split(" ", 1)
+        noun, rest = text.split(" ", 1)
         ratios = tuple(each for each in ratio_of.values() if each is not None)
         line = f"{plural(len(ratio_of), noun)} {rest}"
         yield RangeFinding(kind, severity, line, tuple(ratio_of), ratios, advice)

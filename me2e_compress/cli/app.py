@@ -71,6 +71,7 @@ COMMANDS = {name: panel for panel, names in _PANELS.items() for name in names.sp
 
 
 def _main_app() -> App:
+    """Build the application with every command, its help from its docstring."""
     about = "Make modular end-to-end driving models small, and prove that they drive."
     root = build_app("me2e-compress", about)
     root.register_install_completion_command()

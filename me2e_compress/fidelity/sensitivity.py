@@ -286,9 +286,9 @@ def advise(trials: Trials, sensitivity: Sensitivity, limit: float) -> Int8Choice
         sacrifices.append(order[len(sacrifices)])
     # take back what turns out not to matter
     for last in reversed(sacrifices):
-        kept = [other for other in sacrifices if other is not last]
-        if last.loss <= limit and fits(kept):
-            sacrifices = kept
+        rest = [other for other in sacrifices if other is not last]
+        if last.loss <= limit and fits(rest):
+            sacrifices = rest
     return _choice_without(trials, sensitivity, sacrifices)
 
 

@@ -102,6 +102,7 @@ def blame_file(name: str, before: ir.Model, error: Me2eError) -> None:
 
 
 def _check_provenance(current: Pass, before: ir.Model, after: ir.Model) -> None:
+    """Raise a VerificationError if nodes have no, wrong or unstamped provenance."""
     if lost := provenance.missing(after):
         raise VerificationError(
             f"{current.name} lost where {len(lost)} nodes come from, {lost[0]} first"
@@ -119,17 +120,18 @@ def _check_provenance(current: Pass, before: ir.Model, after: ir.Model) -> None:
 
 
 def _check_interface(current: Pass, before: ir.Model, result: PassResult) -> None:
+    """Raise a VerificationError if inputs or outputs changed, but for known sizes."""
     inputs, outputs = graph.interface(before)
     # Open dimensions of outputs may have become numbers
     shapes = {value.name: value.shape for value in result.model.graph.outputs}
-    kept = tuple(
+    expected = tuple(
         dataclasses.replace(
             port, shape=str(refined(value.shape, shapes.get(value.name)))
         )
         for port, value in zip(outputs, before.graph.outputs, strict=True)
         if port.name not in result.removed_outputs
     )
-    for old, new in zip((inputs, kept), graph.interface(result.model), strict=True):
+    for old, new in zip((inputs, expected), graph.interface(result.model), strict=True):
         if old != new:
             removed = [port for port in old if port not in new]
             added = [port for port in new if port not in old]

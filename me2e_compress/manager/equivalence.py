@@ -29,7 +29,6 @@ from me2e_compress.runtime.session import Session, replay, run_once
 
 NUDGES = 3
 """How often inputs are nudged to see what rounding alone does to an output."""
-
 _BODY = "body"
 """Domain in which a body is run: no kernel is registered for it."""
 
@@ -73,7 +72,8 @@ def _verify_outputs(
     after: ir.Model,
     inputs: VerificationInputs,
 ) -> Verification:
-    # At the runtime's full level; a session is gone before the next one opens
+    """Compare the outputs alone, by the steps of :func:`verify`."""
+    # At the runtime's full level; a session is freed before the next one opens
     left = list(inputs.run(before))
     allowed = tolerances(left[0])
     try:

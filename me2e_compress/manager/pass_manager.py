@@ -81,6 +81,7 @@ class PassManager:
             return dataclasses.replace(report, read_as=read_as(model))
 
     def _run(self, model: ir.Model, context: Context, progress: Progress) -> Report:
+        """Run the passes on this very model; see :meth:`run`."""
         graph.infer_shapes(model)
         passes = self.passes
         first = passes[0].name if passes else ""
@@ -255,10 +256,10 @@ class _Run:
         piece = reproducer.shrink(
             model, lambda part: _fails_same(current, part, self.context, error)
         )
-        where = reproducer.write(
+        written = reproducer.write(
             folder, piece, to_text((current,)), self.context.seed, str(error)
         )
-        return type(error)(f"{error}; reproducer ({len(piece.graph)} nodes): {where}")
+        return type(error)(f"{error}; reproducer ({len(piece.graph)} nodes): {written}")
 
 
 def _bisect(

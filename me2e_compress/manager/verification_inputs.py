@@ -30,10 +30,8 @@ NUDGE_ULPS = 4
 """Units in the last place by which inputs are nudged."""
 SIZE_TRIALS = 2
 """Number of sizes at which a graph with open dimensions is run."""
-
 DISTINCT_SIZES = (2, 3, 5, 7, 11, 13)
 """Sizes that are all different: what mixes up two open dimensions shows."""
-
 EQUAL_SIZES = (
     *((2, 2), (3, 3), (1, 1)),
     *(
@@ -44,7 +42,6 @@ EQUAL_SIZES = (
 )
 """Sizes of leading dimensions (batches), and of all others: where the graph wants some
 of them to be equal, or pictures that can be halved again and again."""
-
 MOST_ELEMENTS = 1 << 25
 """Most numbers of drawn inputs: 128 MB of float32."""
 

@@ -83,8 +83,8 @@ def reading(
         raise error(f"{path}: {otherwise}: {cause}") from cause
     except ValidationError as cause:
         first = cause.errors(include_url=False)[0]
-        where = ".".join(map(str, first["loc"])) or "the file"
-        raise error(f"{path}: {otherwise}: {where}: {first['msg']}") from cause
+        location = ".".join(map(str, first["loc"])) or "the file"
+        raise error(f"{path}: {otherwise}: {location}: {first['msg']}") from cause
 
 
 def check_regular(path: Path) -> None:

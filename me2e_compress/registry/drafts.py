@@ -77,12 +77,12 @@ def all_or_none() -> Iterator[None]:
 
     What was there before is kept until its end, as a second link to the same file.
     """
-    kept: list[tuple[Path, Path]] = []
-    _SETS.append(kept)
+    saved: list[tuple[Path, Path]] = []
+    _SETS.append(saved)
     try:
         yield
     except BaseException:
-        for path, before in reversed(kept):
+        for path, before in reversed(saved):
             if os.path.lexists(before):
                 os.replace(before, path)
             else:
@@ -90,7 +90,7 @@ def all_or_none() -> Iterator[None]:
         raise
     finally:
         _SETS.pop()
-        for _, before in kept:
+        for _, before in saved:
             shutil.rmtree(before.parent, ignore_errors=True)
 
 

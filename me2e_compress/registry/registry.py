@@ -114,9 +114,9 @@ class Registry(Generic[T]):
             made: T = _adapter(cls).validate_python(dict(options))
         except pydantic.ValidationError as error:
             first = error.errors(include_url=False)[0]
-            where = ".".join(str(part) for part in first["loc"]) or "options"
+            location = ".".join(str(part) for part in first["loc"]) or "options"
             if first["type"] == "missing":
-                raise self.error(f"{name} needs the option {where}") from error
+                raise self.error(f"{name} needs the option {location}") from error
             if own := first.get("ctx", {}).get("error"):  # the item's own words
                 raise self.error(prefixed(name, str(own))) from error
             text = first["msg"].replace("a valid tuple", "a list, as [a, b]")
@@ -199,6 +199,7 @@ class Registry(Generic[T]):
     def _build(
         self, item: ParsedItem, cls: type[T], more: Mapping[str, object] | None = None
     ) -> T:
+        """Make an item of what was parsed; options in ``more`` must not be in it."""
         # a version is written as a number, and is a text
         texts = [field.name for field in fields_of(cls) if field.type is str]
         written = {name: text for name, text in item.numbers.items() if name in texts}

@@ -243,6 +243,6 @@ class _Reader:
 
     def fail(self, expected: str) -> NoReturn:
         rest = self.text[self.at :]
-        where = f"from {rest[:_MOST_QUOTED]!r} on" if rest else "to the end"
+        position = f"from {rest[:_MOST_QUOTED]!r} on" if rest else "to the end"
         whole = self.text if len(self.text) <= 200 else f"{self.text[:200]}..."
-        raise TextError(f"cannot read {whole!r} {where}: {expected}")
+        raise TextError(f"cannot read {whole!r} {position}: {expected}")

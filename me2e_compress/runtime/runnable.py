@@ -81,8 +81,8 @@ def unknown_nodes(model: ir.Model) -> Iterator[ir.Node]:
     Nodes in the toolkit's own domain are included although they may have a body.
     """
     known = known_operators()
-    for where in (*model.graphs(), *model.functions.values()):
-        for node in where:
+    for graph_or_function in (*model.graphs(), *model.functions.values()):
+        for node in graph_or_function:
             domain = "" if is_standard(node) else node.domain
             if (domain, node.op_type) in known:
                 continue
@@ -219,10 +219,10 @@ def _opset_and_names(
     node: ir.Node, model: ir.Model, names_in_use: set[str]
 ) -> tuple[int, set[str] | None]:
     """Return the opset of a node, and the names that its graph must not use again."""
-    where = node.graph
-    assert where is not None
-    opset = where.opset_imports.get("", model.opset_imports.get("", 1))
-    return opset, names_in_use if isinstance(where, ir.Graph) else None
+    owner = node.graph
+    assert owner is not None
+    opset = owner.opset_imports.get("", model.opset_imports.get("", 1))
+    return opset, names_in_use if isinstance(owner, ir.Graph) else None
 
 
 def is_fused(node: ir.Node) -> bool:

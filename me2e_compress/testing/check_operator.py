@@ -150,7 +150,6 @@ def _evaluate(
 OPSETS = (13, 17, 20)
 TOLERANCE = 1e-4
 """Allowed max|a-b| / max(1, max|b|) of float32 against float64."""
-
 _PASS = "check-operator"
 
 
@@ -267,8 +266,8 @@ class _Case:
         self._require(error <= TOLERANCE, text)  # NaN is not
 
     def _require(self, holds: bool, why: str) -> None:
-        where = f"{self.operator.name} in the dialect {self.dialect.name}, opset"
-        require(holds, f"{where} {self.opset}: {why}")
+        call = f"{self.operator.name} in the dialect {self.dialect.name}, opset"
+        require(holds, f"{call} {self.opset}: {why}")
 
 
 def _has_shape(declared: tuple[object, ...], shape: tuple[int, ...]) -> bool:

@@ -70,6 +70,7 @@ def _run(current: Pass, ready: ir.Model, context: Context) -> PassResult:
 def _check_exact(
     current: Pass, before: ir.Model, after: ir.Model, context: Context
 ) -> None:
+    """Check that a second run changes nothing and both outputs are the same."""
     try:
         second = _run(current, after, context)
     except VerificationError as error:

@@ -176,6 +176,7 @@ def _measure(
     options: CalibrateOptions,
     listener: Listener,
 ) -> Ranges:
+    """Measure the ranges on the frames, going on from a checkpoint if there is one."""
     tensors = prepared.tensors()
     # a checkpoint lets a run that was killed go on
     method, provider = options.method or prepared.method, options.runs_on

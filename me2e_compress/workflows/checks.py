@@ -79,10 +79,10 @@ def load_graph(path: Path) -> ir.Model:
     model = graph.load(path)
     if 0 < (opset := opset_of(model)) < 7:
         used = {node.op_type for node in nodes_of(model) if is_standard(node)}
-        if gone := sorted(each for each in used if not has_operator(each, opset)):
+        if missing := sorted(each for each in used if not has_operator(each, opset)):
             raise GraphError(
-                f"{path}: opset {opset}: onnxruntime has no {', '.join(gone)} of before"
-                " opset 7: export it again, in 13 or newer"
+                f"{path}: opset {opset}: onnxruntime has no {', '.join(missing)} of"
+                " before opset 7: export it again, in 13 or newer"
             )
     return model
 

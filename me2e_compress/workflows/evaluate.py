@@ -151,6 +151,7 @@ def _drive(
     options: EvaluateOptions,
     listener: Listener,
 ) -> EvaluateResult:
+    """Drive the routes that are left, score all, and draw the one that is asked for."""
     drive = drive_of(options, evaluator)
     pictured: Sequence[RouteInfo] = ()
     if options.render is not None:  # of those that are driven; it reads their ids alone

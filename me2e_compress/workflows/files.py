@@ -101,8 +101,8 @@ def join(stack: str | Path, output: str | Path, *, force: bool = False) -> JoinR
     outputs = (output, *data_names(output))
     with writing(outputs, (source, *joined.paths), force=force):
         graph.save(joined.model, output)
-    fed = tuple(FedInput(*each) for each in joined.feeds())
-    return JoinResult(output, graph.file_bytes(output), joined.order, fed)
+    inputs = tuple(FedInput(*each) for each in joined.feeds())
+    return JoinResult(output, graph.file_bytes(output), joined.order, inputs)
 
 
 @dataclasses.dataclass(frozen=True, repr=False)

@@ -105,6 +105,7 @@ def _record(
     options: FramesOptions,
     listener: Listener,
 ) -> Path:
+    """Write the frames of a log or of a drive; return the folder."""
     model, digests = model_path(source), sha256_of(model_path(source))
     adapter = None
     pixels: Mapping[str, PixelInput] = {}
@@ -142,6 +143,7 @@ def _drive_source(
     metadata: Mapping[str, str],
     options: FramesOptions,
 ) -> Source:
+    """Return what drives the shipped driver and yields the model's inputs."""
     require_extra("highway", "recording frames of a driver")
     from me2e_compress.evaluators.highway.driven_frames import driven_frames
 

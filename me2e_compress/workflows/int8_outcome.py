@@ -28,14 +28,14 @@ def float_bytes(model: ir.Model, plan: QuantPlan) -> dict[str, int]:
     constants below a kilobyte. What the plan's target leaves in float is by ``target``.
     """
     decided = {each.output: each for each in plan.decisions}
-    kept = {each.output for each in plan.kept_float}
+    left_float = {each.output for each in plan.kept_float}
     # float weights, and those that some other node stores as int8
     left, stored = dict[str, tuple[str, int]](), set[str]()
     for node in model.graph:
         decision = decided.get(str(node.outputs[0].name)) if node.outputs else None
         if decision is None:
             continue
-        is_int8 = decision.dtype != FLOAT and decision.output not in kept
+        is_int8 = decision.dtype != FLOAT and decision.output not in left_float
         for at, value in enumerate(node.inputs):
             if value is None or (tensor := value.const_value) is None:
                 continue
@@ -44,7 +44,7 @@ def float_bytes(model: ir.Model, plan: QuantPlan) -> dict[str, int]:
             if is_int8 and at == decision.weight:
                 stored.add(str(value.name))
             elif not is_int8:
-                rule = "target" if decision.output in kept else decision.rule
+                rule = "target" if decision.output in left_float else decision.rule
                 left.setdefault(str(value.name), (rule, tensor.nbytes))
     by_rule = Counter[str]()
     for name, (rule, size) in left.items():

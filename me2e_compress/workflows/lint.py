@@ -102,10 +102,10 @@ class LintResult(Result):
         answer = list[str]()
         if (build := self.build) is not None:
             built = "built" if build.built else "not built"
-            where = "" if build.built is None else f", {built} for SM{self.options.sm}"
+            board = "" if build.built is None else f", {built} for SM{self.options.sm}"
             parsed = "parsed" if build.parsed else "not parsed"
             version = f"TensorRT-RTX {build.version}, on this CPU"
-            answer.append(f"{version}: {parsed}{where}")
+            answer.append(f"{version}: {parsed}{board}")
             if cut := build.cut:
                 answer.append(f"cut at {len(cut)} plugins: {', '.join(cut[:5])}")
         reason = self.refusal or self.miscomputed

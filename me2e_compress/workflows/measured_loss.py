@@ -96,8 +96,8 @@ class MeasuredLoss:
                 every = fidelity.seen and f" of {fidelity.frames + fidelity.seen}"
                 reach = f" ({reach} by frame{every or ''})" if reach else ""
                 parts.append(f"the noisiest output is {worst.name}, {noise}{reach}")
-            where = f"on {plural(fidelity.frames, 'frame')} {self.on}"
-            yield f"{'; '.join(parts) or 'no output could be judged'} ({where})"
+            frames_text = f"on {plural(fidelity.frames, 'frame')} {self.on}"
+            yield f"{'; '.join(parts) or 'no output could be judged'} ({frames_text})"
         elif self.on != NOT_ASKED:
             yield f"fidelity: not measured ({self.on})"
         if self.liveness is not None:
@@ -148,7 +148,6 @@ class MeasuredLoss:
 
 RUN_FRAMES = 4
 """Frames measured in a row of a model that has a state."""
-
 KEPT_OUT = "kept out of calibration"
 SHARED = "calibrated on as well: there is no other"
 PERHAPS_SHARED = "that the saved ranges may have been measured on"

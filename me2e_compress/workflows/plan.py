@@ -151,9 +151,9 @@ class PlanResult(Result):
         rows = list[tuple[str, str]]()
         for each in self.plan.decisions:
             if each.could_be_int8:
-                where = f" of {each.module}" if each.module else ""
+                of_module = f" of {each.module}" if each.module else ""
                 why = f"{each.dtype} by {each.rule}, {each.reason}"
-                rows.append((each.node or each.output, f"{each.op}{where}: {why}"))
+                rows.append((each.node or each.output, f"{each.op}{of_module}: {why}"))
         what = ("node", "what, by which rule, why")
         tables.append(table("Decisions", what, rows, words=2))
         groups = [

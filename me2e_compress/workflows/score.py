@@ -256,9 +256,9 @@ def score(
         raise EvaluationError(f"{named[0]}: it names the set of real runs: give one")
     # folders whose decisions cost nothing have no deadlines
     late = {
-        name: found
+        name: deadlines
         for name, episodes in driven.items()
-        if (found := charged(episodes, budget_ms, measured.get(name))) is not None
+        if (deadlines := charged(episodes, budget_ms, measured.get(name))) is not None
     }
     return ScoreResult(scores, runs, score_eer(driven, joules or {}), late)
 
@@ -278,8 +278,8 @@ def driving_score(scores: Scores) -> str:
     if score.value is None:
         return f"driving score not measured ({score.measure.reason}); {routes}"
     room = scores.safety.room_kept
-    kept = "" if room.value is None else f", room kept {_interval(room)} %"
-    return f"driving score {_interval(score)}{kept}; {routes}"
+    room_text = "" if room.value is None else f", room kept {_interval(room)} %"
+    return f"driving score {_interval(score)}{room_text}; {routes}"
 
 
 def _interval(estimate: Estimate) -> str:
