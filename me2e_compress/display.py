@@ -106,7 +106,7 @@ def format_number(value: float | None, form: str = ",.0f") -> str:
 def format_significant(value: float | None, digits: int = 4) -> str:
     """Write a number in so many digits, without an exponent: 4,778,000 and 0.00012.
 
-    All digits before the point are written, and no zeros at the end behind it.
+    All digits before the point are written, and none of the zeros at the end after it.
     """
     if value is None or not math.isfinite(value):
         return format_number(value)

@@ -58,7 +58,7 @@ def _run(run: Callable[[], None]) -> int:
     from me2e_compress.extras import with_install_hint
 
     try:
-        # file names that are not UTF-8, and a current folder that is gone
+        # file names that are not UTF-8, and a current folder that was removed
         try:
             Path.cwd()
         except OSError as error:

@@ -1,4 +1,4 @@
-"""The application: all commands, and the options that stand before or behind them."""
+"""The application: all commands, and the options before or after their names."""
 
 import inspect
 from collections.abc import Sequence

@@ -268,7 +268,7 @@ def advise(trials: Trials, sensitivity: Sensitivity, limit: float) -> Int8Choice
     It starts with all modules in int8. Until the measured loss is within the limit, the
     costliest module first gives up the blamed nodes, the worst first, then all of its
     nodes. Then each that was given up, the last first, returns to int8 if the loss
-    stays within the limit: errors may cancel, or one costly node hide behind another.
+    stays within the limit: errors may cancel, or one costly node hide another.
     The choice has no module if nothing keeps the limit.
     """
 

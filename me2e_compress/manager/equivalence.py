@@ -1,6 +1,6 @@
 """Do two graphs give the same outputs?
 
-On outputs that a graph draws anew at every run nothing can be compared.
+Outputs that a graph draws at random at every run cannot be compared.
 """
 
 import dataclasses

@@ -1,11 +1,11 @@
 """Compare two graphs piece by piece, between the operators whose answer jumps.
 
-Behind a quantizer a difference of 1e-7 is a whole step of int8, and behind a TopK
-another candidate: two graphs that are equal but for rounding part there, on one machine
-and not on another, although no node is wrong. They are equal if every piece between
-such operators is. So the second graph gets what those gave in the first one, and what
-it computes in front of each is compared, with its outputs, at the tolerances that
-outputs have.
+After a quantizer a difference of 1e-7 is a whole step of int8, and after a TopK another
+candidate: two graphs that are equal but for rounding differ there, on one machine and
+not on another, although no node is wrong. They are equal if every piece between such
+operators is. So the second graph reads what those answer in the first one, and the
+operands that it computes for each are compared, with its outputs, within the
+tolerances of outputs.
 """
 
 import dataclasses

@@ -17,7 +17,7 @@ from pathlib import Path
 MARK = "me2e-compress wrote this file"
 """What a file says, in a comment or as metadata of its format."""
 BYTES = MARK.encode()
-"""The mark as the comment of a zip archive, or behind the end of raw data."""
+"""The mark as the comment of a zip archive, or after the end of raw data."""
 IN_JSON = {"generator": MARK}
 IN_TOML = f"# {MARK}\n\n"
 IN_MARKDOWN = f"<!-- {MARK} -->\n\n"

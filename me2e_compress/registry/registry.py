@@ -1,4 +1,4 @@
-"""Names and the classes behind them; the fields of a class are its options."""
+"""Classes by name; the fields of a class are its options."""
 
 import contextlib
 import dataclasses
@@ -69,7 +69,7 @@ class Registry(Generic[T]):
         return (*self.builtin, *sorted(others - set(self.builtin)))
 
     def get(self, name: str) -> type[T]:
-        """Import the class behind a name.
+        """Import the class of a name.
 
         Raises:
             error: no such name, two packages claim it, it does not load, or it is not
@@ -162,7 +162,7 @@ class Registry(Generic[T]):
     def text(self, item: T, *, defaults: bool = False) -> str:
         """Write an item so that :meth:`parse` makes an equal one.
 
-        The single number of an item that has no other option stands behind a colon.
+        The single number of an item that has no other option is written after a colon.
         Options at their default are left out unless ``defaults``, and fields that hold
         functions always: they have no text.
         """

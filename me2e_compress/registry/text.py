@@ -86,7 +86,7 @@ def read_all(text: str) -> tuple[ParsedItem, ...]:
 def write_item(name: str, options: Mapping[str, object], *, short: bool = False) -> str:
     """Write an item so that it is read back.
 
-    ``short`` writes a single number behind a colon instead of in braces.
+    ``short`` writes a single number after a colon instead of in braces.
     """
     if not options:
         return name

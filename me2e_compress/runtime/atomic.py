@@ -12,7 +12,7 @@ from me2e_compress.registry import drafts
 def write_bytes(path: Path, content: bytes) -> None:
     """Write a file atomically: a draft in the same folder is renamed to it.
 
-    An OSError (folder missing, not writable, or full) leaves nothing behind.
+    An OSError (folder missing, not writable, or full) leaves no draft.
     """
     with drafts.naming_file(path):
         handle, draft = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")

@@ -118,7 +118,7 @@ class SplitResult(Result):
     missing: tuple[str, ...]
 
     def view(self) -> View:
-        """Return the folder, its files and the parts that are gone."""
+        """Return the folder, its files and the parts without outputs."""
         names = ", ".join(path.name for path in self.files.values())
         return View(
             f"{self.output}: {plural(len(self.files), 'file')}: {names}",

@@ -3,7 +3,7 @@
 INPUTS is an ``.npz``; where there is no such file, the graph is only opened. KERNELS
 are separated by commas; only for them does it import something of this package. It
 prints each step before taking it, so that the last one is known if it dies. A graph
-that only onnxruntime's optimizer refuses is opened as it stands, behind the reason.
+that only onnxruntime's optimizer refuses is opened unoptimized, after the reason.
 """
 
 import ctypes
@@ -46,7 +46,7 @@ def main(model: str, inputs: str, kernels: str, *disabled: str) -> None:
     if not Path(inputs).exists():
         return
     if trim := getattr(ctypes.CDLL(None), "malloc_trim", None):  # glibc's
-        trim(0)  # what opening left behind is a tenth of the memory of a run
+        trim(0)  # what opening has freed is a tenth of the memory of a run
     with np.load(inputs, allow_pickle=False) as file:
         feeds = dict(file)
     for port in session.get_inputs():

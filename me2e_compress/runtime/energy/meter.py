@@ -149,7 +149,7 @@ class EnergyMeter:
             self._on_window(len(turns), len(turns), turns[-1])
             self._sleep(schedule.lead_in_s)
             idle.append(self._window(0, rest))
-            self._sleep(2 * SAMPLED_S)  # the last sample of power lies behind it
+            self._sleep(2 * SAMPLED_S)  # the last sample of power comes after it
         # Idle power is the mean of before and after.
         idle_w = fmean(self._integrated(each).watts for each in idle)
         return {
