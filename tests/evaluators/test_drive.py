@@ -99,7 +99,7 @@ def test_who_declares_what_it_does_not_have_is_refused(
     entry = EntryPoint("declared", "anywhere:Class", EVALUATORS.group)
     monkeypatch.setattr(EntryPoint, "load", lambda entry: cls)
     monkeypatch.setattr(
-        registry, "_all_installed", lambda path: {EVALUATORS.group: (entry,)}
+        registry, "_all_entry_points", lambda path: {EVALUATORS.group: (entry,)}
     )
 
     with pytest.raises(EvaluationError, match=message):
