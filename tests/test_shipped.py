@@ -7,7 +7,7 @@ import pytest
 from me2e_compress import graph
 from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.errors import GraphError
-from me2e_compress.shipped.drivers import SHIPPED, card, copy, sample_frames, shipped
+from me2e_compress.shipped.drivers import SHIPPED, card, copy, frames_of, shipped_model
 
 
 def test_an_altered_file_names_both_digests(weights: Path) -> None:

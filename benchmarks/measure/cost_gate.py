@@ -43,7 +43,7 @@ from me2e_compress.passes import Context
 from me2e_compress.passes.quantize_int8 import QuantizeInt8
 from me2e_compress.quantization.costs import Costs
 from me2e_compress.runtime.profile import processor
-from me2e_compress.shipped.drivers import shipped
+from me2e_compress.shipped.drivers import shipped_model
 from me2e_compress.targets import Target
 from me2e_compress.targets.onnxruntime import OnnxRuntime
 from me2e_compress.targets.onnxruntime.costs import costs_of

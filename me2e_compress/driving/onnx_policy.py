@@ -24,7 +24,7 @@ from me2e_compress.errors import EvaluationError, FramesError, GraphError
 from me2e_compress.runtime.frames import Array
 from me2e_compress.runtime.plan_adapter import PlanAdapter
 from me2e_compress.runtime.providers import CPU, Provider
-from me2e_compress.runtime.session import Session, zeros
+from me2e_compress.runtime.session import Session, zero_state
 
 Entries = Mapping[str, RecurrentEntry] | None
 

@@ -115,6 +115,6 @@ def deadlines_table(title: str, deadlines: Deadlines) -> Table:
     return table(
         f"{title}: {plural(deadlines.count, 'decision')}",
         ("latency", "", "unit"),
-        [(words, number(e.value, ".2f"), e.unit) for words, e in shown.items()],
-        not_measured(why),
+        [(words, format_number(e.value, ".2f"), e.unit) for words, e in shown.items()],
+        missing_note(why),
     )

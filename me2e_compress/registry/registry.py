@@ -118,9 +118,9 @@ class Registry(Generic[T]):
             if first["type"] == "missing":
                 raise self.error(f"{name} needs the option {location}") from error
             if own := first.get("ctx", {}).get("error"):  # the item's own words
-                raise self.error(prefixed(name, str(own))) from error
+                raise self.error(with_prefix(name, str(own))) from error
             text = first["msg"].replace("a valid tuple", "a list, as [a, b]")
-            raise self.error(f"{name}: {where}: {text}") from error
+            raise self.error(f"{name}: {location}: {text}") from error
         return made
 
     def with_options(self, item: T, options: Mapping[str, object]) -> T:

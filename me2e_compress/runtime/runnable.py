@@ -178,7 +178,7 @@ def replace_fused(
     if not fused_types:
         return model, ()
     copy = model.clone()
-    known = [node for node in unknown_nodes(copy) if node.op_type in ours]
+    known = [node for node in unknown_nodes(copy) if node.op_type in fused_types]
     # Bodies depend on the types and ranks of their inputs, which a file may leave out.
     if any(
         value is not None and (value.type is None or value.shape is None)
@@ -205,7 +205,7 @@ def replace_fused(
     calls = [node for node in unknown_nodes(copy) if node.domain == kernels.DOMAIN]
     for node in calls:
         if compiled and node.op_type in _FLOAT_KERNELS:
-            read_int8(node, *_surroundings(node, copy, taken))
+            use_int8_kernel(node, *_opset_and_names(node, copy, names_in_use))
     # List the kernels, and import their domain.
     needed: dict[str, kernels.CompiledKernel] = {}
     for node in calls:

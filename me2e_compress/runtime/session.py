@@ -161,18 +161,18 @@ def _open_lent(
     }
     # The arrays stand in for an external file: of them the graph has name and type.
     options.add_external_initializers(list(weights), list(weights.values()))
-    held = {name: model.graph.initializers[name] for name in lent}
+    lent_values = {name: model.graph.initializers[name] for name in lent}
     try:
         for name, tensor in lent.items():
             shape = ir.Shape(tensor.shape.numpy())
-            held[name].const_value = ir.ExternalTensor(
+            lent_values[name].const_value = ir.ExternalTensor(
                 "lent", 0, tensor.nbytes, tensor.dtype, shape=shape, name=name
             )
         content = ir.to_proto(model).SerializeToString()
     finally:
         for name, tensor in lent.items():
-            held[name].const_value = tensor
-    return _build(content, options, provider, without), weights
+            lent_values[name].const_value = tensor
+    return _open_with_retry(content, options, provider, without), weights
 
 
 def _is_external(tensor: ir.TensorProtocol) -> bool:

@@ -16,7 +16,7 @@ from me2e_compress.study.condition import Condition
 from me2e_compress.study.definition import Study
 from me2e_compress.study.drive_record import Comparison, DriveRecord, compared
 from me2e_compress.study.prepared import PreparedVariant
-from me2e_compress.workflows.result import Result, Shown, plain
+from me2e_compress.workflows.result import Result, View, plain
 
 SCORES = tuple(each.name for each in COLUMNS)
 MOST_ROUTES = 40

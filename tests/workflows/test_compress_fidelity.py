@@ -16,7 +16,7 @@ from me2e_compress.calibration.calibrator import Calibrator
 from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.runtime.providers import CPU
 from me2e_compress.workflows.measured_loss import ADVICE
-from me2e_compress.workflows.written import larger, slower
+from me2e_compress.workflows.written import size_note, speed_note
 from tests.support.command import Command
 from tests.support.frames import record
 from tests.support.nets import MAP_TEXT, conv_attention, map_text, net

@@ -22,7 +22,7 @@ from me2e_compress.driving.input_sources import (
     InputSource,
     Observed,
 )
-from me2e_compress.errors import FORMER, EvaluationError
+from me2e_compress.errors import FORMER_NAMES, EvaluationError
 from me2e_compress.graph.recurrence import RECURRENT, declared_pairs
 from me2e_compress.registry import documents
 from me2e_compress.runtime.frames import Array

@@ -274,7 +274,7 @@ def _files(folder: Path) -> Iterable[Path]:
 def _is_checkpoint(path: Path) -> bool:
     """Return whether a file holds results, whole or not."""
     try:
-        return path.suffix == ".json" and _CHECKPOINT in documents.content(path)
+        return path.suffix == ".json" and _CHECKPOINT in documents.read_bytes(path)
     except (OSError, documents.MalformedError):
         return False  # it cannot be read, or is too large
 

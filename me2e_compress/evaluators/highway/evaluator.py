@@ -71,7 +71,7 @@ class Highway(Evaluator):
         """
         if policy is None:
             raise EvaluationError(f"{self.name} drives a policy: name one")
-        need_extra("highway", "driving")
+        require_extra("highway", "driving")
         image_size = image_size_of(opened(policy))  # before its file is read
         made = drive.conditions()
         weather = made.pop("weather")

@@ -75,7 +75,7 @@ class Mark:
     @classmethod
     def of(cls, place: float, colour: str, estimate: Estimate, name: str = "") -> Self:
         """Mark a mean with its interval; ``name`` stands before the number."""
-        words = f"{name}: " * bool(name) + in_words(estimate_cell(estimate))
+        words = f"{name}: " * bool(name) + cell_text(estimate_cell(estimate))
         ends = estimate.low, estimate.high
         return cls(place, colour, words, estimate.value, *ends)
 

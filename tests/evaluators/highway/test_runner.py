@@ -17,7 +17,7 @@ from me2e_compress.evaluators.highway.observe import can_bus_of, road_users
 from me2e_compress.evaluators.highway.runner import EndingRules, Listeners, drive
 from me2e_compress.metrics.episode import Ending, InfractionKind
 from me2e_compress.metrics.route_scores import route_score
-from me2e_compress.shipped.drivers import shipped
+from me2e_compress.shipped.drivers import shipped_model
 from me2e_compress.simulator.pictures import Moment
 from me2e_compress.simulator.routes import load_routes, pick_routes
 from me2e_compress.simulator.scene import ActorKind, Ego
