@@ -12,7 +12,6 @@ import onnxruntime as ort
 import pytest
 import torch
 
-from benchmarks.measure import gpu
 from benchmarks.measure.energy import COUNTER, FRAMES_MS, conditions, held
 from benchmarks.measure.gpu import ROWS, Bench, provider_or_reason
 from benchmarks.measure.int8_shapes import FORMS as INT8_FORMS
@@ -31,7 +30,7 @@ from benchmarks.subjects.subject import Subject
 from benchmarks.tools.gpu_table import Found
 from benchmarks.tools.gpu_table import table as gpu_table
 from me2e_compress.runtime.energy.energy_counter import EnergySchedule
-from me2e_compress.runtime.providers import CPU, CpuProvider, Provider, TensorRtProvider
+from me2e_compress.runtime.providers import CPU, CpuProvider
 from models.tests.vad.sizes import SIZES
 from models.vad.stack import VadTiny
 from tests.support.frames import record
@@ -84,28 +83,6 @@ def test_a_provider_that_is_missing_is_a_row_that_says_what_to_install(
     assert isinstance(reason, str)
     shown = gpu_table([Found("highway", "tensorrt", "every file", reason)])
     assert "pip install onnxruntime-gpu, and TensorRT 10" in shown
-
-
-@pytest.mark.parametrize(
-    ("provider", "name", "reason"),
-    [
-        (TensorRtProvider(), "fused, as plugins", "needs --plugins LIB"),
-        (CPU, "exact", "not made: a pass refused it"),
-    ],
-)
-def test_a_file_that_cannot_be_made_is_a_row(
-    subject: Subject,
-    given: argparse.Namespace,
-    monkeypatch: pytest.MonkeyPatch,
-    provider: Provider,
-    name: str,
-    reason: str,
-) -> None:
-    monkeypatch.setattr(gpu, "made", lambda *words: "a pass refused it")
-
-    found = Bench(subject, 1, given).found(provider, name, ROWS[name])
-
-    assert found.reason.startswith(reason)
 
 
 @pytest.mark.slow

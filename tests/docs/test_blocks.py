@@ -113,16 +113,22 @@ def test_the_readme_proves_the_driver_that_ships_on_its_own_frames(
     assert check["errors"]["occupancy"] < 1e-5
 
 
+OPERATORS = "me2e_compress.operators"
+"""What a process looks for once: one of its own shows an example's."""
+OTHER_PAGES = [page for page in WRITING if page.stem != "writing-operators"]
+
+
 @pytest.fixture
 def example(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """The example package, installed as far as this process sees."""
     monkeypatch.syspath_prepend(EXAMPLE)
-    for group, names in ADDED.items():
-        install(monkeypatch, tmp_path / "site", f"example-{group}", group, names)
+    for group in ADDED.keys() - {OPERATORS}:
+        folder = tmp_path / "site"
+        install(monkeypatch, folder, f"example-{group}", group, ADDED[group])
 
 
-@writing
 @pytest.mark.usefixtures("example", "short")
+@pytest.mark.parametrize("page", OTHER_PAGES, ids=lambda page: page.stem)
 def test_the_commands_of_a_page_run(page: Path, cli: Cli) -> None:
     write_model(cli.folder / "model.onnx")
     lines = [line for block in blocks(page, "sh") for line in block.text.splitlines()]
@@ -130,6 +136,12 @@ def test_the_commands_of_a_page_run(page: Path, cli: Cli) -> None:
         program, *words = shlex.split(line)
         assert program == "me2e-compress"
         assert cli.done(words[0], *words[1:]).out
+
+
+def test_the_command_of_an_operator_runs(tmp_path: Path, site: Path) -> None:
+    write_model(tmp_path / "model.onnx")
+    (block,) = blocks(ROOT / "docs" / "writing-operators.md", "sh")
+    assert run(["bash", "-e", "-c", block.text], tmp_path, site)
 
 
 @pytest.mark.parametrize(
