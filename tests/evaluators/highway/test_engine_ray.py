@@ -6,7 +6,6 @@ from me2e_compress.errors import EvaluationError
 from me2e_compress.evaluators.highway.engine import RayEngine
 from tests.evaluators.highway.drivers import CROSSING, PARKED
 from tests.evaluators.highway.evaluations import driven
-from tests.support.in_process import Here
 
 pytest.importorskip("ray", reason="the extra 'ray' is not installed")
 
@@ -15,10 +14,9 @@ pytest.importorskip("ray", reason="the extra 'ray' is not installed")
 def test_a_local_ray_writes_the_same_bytes(tmp_path: Path) -> None:
     routes = (CROSSING, PARKED)
 
-    # an actor takes seconds to start, and drives one behind the other
-    cluster = driven(tmp_path / "ray", routes, engine=RayEngine(1))
+    cluster = driven(tmp_path / "ray", routes, engine=RayEngine(2))
 
-    assert cluster == driven(tmp_path / "local", routes, engine=Here())
+    assert cluster == driven(tmp_path / "local", routes)
     for path in (tmp_path / "local").rglob("*.json"):
         twin = tmp_path / "ray" / path.relative_to(tmp_path / "local")
         assert twin.read_bytes() == path.read_bytes()
