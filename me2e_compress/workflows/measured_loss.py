@@ -1,7 +1,7 @@
 """What lossy passes, and onnxruntime's own int8, did to a model's outputs."""
 
 import dataclasses
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from functools import partial
 from pathlib import Path
 
@@ -70,10 +70,6 @@ class MeasuredLoss:
     seconds: float = 0.0
     incomparable: bool = False
 
-    @property
-    def _matched(self) -> Mapping[str, float]:
-        return {} if self.agents is None else self.agents.sqnr_db
-
     def lines(self) -> Iterator[str]:
         """Yield how far the outputs moved, and which are alive or not judged."""
         fidelity = self.fidelity
@@ -84,10 +80,11 @@ class MeasuredLoss:
                     f"the plan moves {fidelity.plan.mean_m:.3f} m on average,"
                     f" {fidelity.plan.max_m:.2f} m at most"
                 )
+            matched = {} if self.agents is None else self.agents.sqnr_db
             judged = [
                 each
                 for each in fidelity.outputs
-                if each.name not in (fidelity.plan_output, *self._matched)
+                if each.name not in (fidelity.plan_output, *matched)
                 and not each.discrete
             ]
             if judged:
