@@ -199,10 +199,7 @@ def compare(
 
 
 def common_adapter(a: Session, b: Session) -> tuple[PlanAdapter | None, str]:
-    """Return how to read the plan of both models, or None and why not.
-
-    Raises GraphErrors: of malformed metadata, and of modes that nothing picks from.
-    """
+    """Return how to read both plans, or None and why not; may raise GraphErrors."""
     adapter = PlanAdapter.of(a.metadata, list(a.outputs))
     if adapter is None:
         return None, "the model does not say which output is its plan"
@@ -222,7 +219,6 @@ def common_adapter(a: Session, b: Session) -> tuple[PlanAdapter | None, str]:
 
 MODES_RANK = 4
 """Rank of a plan with modes: [1, modes, n, 2]."""
-
 SMALL_RATIO, GAP_RATIO = 30.0, 4.0
 """Channels so many times smaller than the largest, and than the next larger ones, have
 an SQNR of their own: of the 127 steps of a scale that all share, four are theirs."""

@@ -3,7 +3,7 @@
 import dataclasses
 
 from me2e_compress.fidelity import SQNR_FLOOR_DB
-from me2e_compress.fidelity.compare import Fidelity, OutputFidelity, SetFidelity
+from me2e_compress.fidelity.compare import Fidelity, SetFidelity
 
 PLAN_FLOOR_M = 0.5
 """Metres by which a car 1.9 m wide may leave the middle of a lane of 3.5 m and still
@@ -56,28 +56,23 @@ class Floor:
         below = list[Shortfall]()
         matched = {} if agents is None else agents.sqnr_db
         for each in fidelity.outputs:
+            # The noise over what is allowed: above 1 is too much
+            part = ""
             if fidelity.plan is not None and each.name == fidelity.plan_output:
-                value, unit, part = fidelity.plan.mean_m, "m", ""
+                value, unit = fidelity.plan.mean_m, "m"
                 excess = value / self.plan_m
             else:
-                value, part = self._worst_sqnr(each, matched.get(each.name))
-                unit, amplitude = "dB", float(10 ** ((self.sqnr_db - value) / 20))
-                excess = min(amplitude, LARGEST_EXCESS)
+                value, unit = matched.get(each.name, each.sqnr_db), "dB"
+                if each.name in matched:
+                    part = " of matched agents"
+                elif each.small_db is not None and each.small_db < value:
+                    value, part = each.small_db, each.small
+                elif each.least_db < self.sqnr_db <= value:
+                    value, part = each.least_db, " in its noisiest frame"
+                excess = min(float(10 ** ((self.sqnr_db - value) / 20)), LARGEST_EXCESS)
             if excess > 1 and not each.discrete:
                 below.append(Shortfall(each.name, value, unit, excess, part))
         return tuple(sorted(below, key=lambda each: -each.excess))
-
-    def _worst_sqnr(
-        self, output: OutputFidelity, matched_db: float | None
-    ) -> tuple[float, str]:
-        """Return the SQNR by which an output is judged, dB, and which part it is of."""
-        if matched_db is not None:
-            return matched_db, " of matched agents"
-        if output.small_db is not None and output.small_db < output.sqnr_db:
-            return output.small_db, output.small
-        if output.least_db < self.sqnr_db <= output.sqnr_db:
-            return output.least_db, " in its noisiest frame"
-        return output.sqnr_db, ""
 
     def __str__(self) -> str:
         return f"{self.sqnr_db:g} dB, {self.plan_m:g} m of plan"

@@ -38,7 +38,19 @@ from me2e_compress.runtime.providers import CPU, Provider
 from me2e_compress.runtime.session import Session
 from me2e_compress.targets import Target
 
-# Judge many int8 variants of one float model that is calibrated once.
+__all__ = [
+    "Budget",
+    "Candidate",
+    "Int8Choice",
+    "ModuleSensitivity",
+    "Score",
+    "Sensitivity",
+    "Trials",
+    "advise",
+    "analyse",
+    "search",
+    "write_recipe",
+]
 
 
 @dataclasses.dataclass(frozen=True)
