@@ -98,7 +98,7 @@ def random_model(text: str) -> ir.Model:
         made.graph.inputs.remove(value)
         shape = graph.static_shape(value) or ()
         array = generator.standard_normal(shape).astype(np.float32)
-        columns = shape[1] if len(shape) == 2 else shape[0]
+        columns = array.shape[-1 if array.ndim == 2 else 0]
         fan = max(1.0, float(np.sqrt(array.size / columns)))
         value.const_value = ir.tensor(array / np.float32(fan), name=value.name)
         made.graph.register_initializer(value)
