@@ -57,6 +57,19 @@ def opset_of(imports: ir.Model | ir.Graph | ir.Function) -> int:
     return next((versions[domain] for domain in STANDARD if domain in versions), 0)
 
 
+def bodies(model: ir.Model) -> Iterator[tuple[ir.Graph | ir.Function, int]]:
+    """List the graph and the functions, each with its opset."""
+    main = opset_of(model)
+    yield model.graph, main
+    for function in model.functions.values():
+        yield function, opset_of(function) or main
+
+
+def written(own: int, before: int, wanted: int) -> int:
+    """Return the opset of a body once the newest of its graph is another."""
+    return min(own, wanted) if wanted < before else max(own, wanted)
+
+
 def nodes_of(model: ir.Model) -> Iterator[ir.Node]:
     """Walk the nodes of the graph, of its bodies and of its functions."""
     yield from nodes_in(model.graph)

@@ -6,13 +6,8 @@ import onnx
 import onnx_ir as ir
 
 from me2e_compress.errors import GraphError
-from me2e_compress.graph.nodes import is_standard, opset_of
-from me2e_compress.graph.rewrite.raise_opset import (
-    OLDEST_OPSET,
-    bodies,
-    write_in,
-    written,
-)
+from me2e_compress.graph.nodes import bodies, is_standard, opset_of, written
+from me2e_compress.graph.rewrite.raise_opset import OLDEST_OPSET, write_in
 from me2e_compress.graph.runtime_operators import (
     ADDED,
     has_operator,
@@ -89,7 +84,7 @@ def _fit_opset(model: ir.Model, path: Path) -> str:
     able = [each for each in nearest if not _lacking(model, opset, each)]
     refusals = []
     for wanted in able or ([newest] if opset > newest else []):
-        _, refusal = write_in(model, opset, wanted, "load")
+        _, refusal = write_in(model, opset, wanted, "load", one_by_one=True)
         if not refusal:
             return f"opset {opset} became {wanted}: {why}"
         refusals.append(refusal)

@@ -1,6 +1,6 @@
 """Graphs of an older opset, written in a newer one node by node."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 
 import onnx
 import onnx.version_converter
@@ -10,9 +10,11 @@ from me2e_compress.graph import provenance
 from me2e_compress.graph.nodes import (
     STANDARD,
     array_of,
+    bodies,
     has_subgraph,
     is_standard,
     opset_of,
+    written,
 )
 from me2e_compress.graph.rewrite.edits import (
     add_constant,
@@ -48,13 +50,16 @@ def raise_opset(model: ir.Model, opset: int, by: str) -> tuple[int, str]:
     return write_in(model, before, opset, by)
 
 
-def write_in(model: ir.Model, before: int, opset: int, by: str) -> tuple[int, str]:
+def write_in(
+    model: ir.Model, before: int, opset: int, by: str, *, one_by_one: bool = False
+) -> tuple[int, str]:
     """Write a graph in another opset; return the changes, and why it stays if it does.
 
     Operators that did not change in between stay, others are converted by ONNX's
     version converter, one by one, so that names, metadata and plugins stay. Functions
     are taken along, as they are. Nothing changes unless every node can be written, and
-    those of functions stay the same. ``before`` is the newest opset that is imported.
+    those of functions stay the same. ``before`` is the newest opset that is imported;
+    ``one_by_one`` takes no other operator or inputs: the result cannot be proven.
     """
     changed = [
         (node, own, after, body is not model.graph)
@@ -77,6 +82,8 @@ def write_in(model: ir.Model, before: int, opset: int, by: str) -> tuple[int, st
         except (onnx.version_converter.ConvertError, RuntimeError) as error:
             reason = " ".join(str(error).split()).rpartition("failed: ")[2]
             return 0, f"{called} cannot be written in {after}: {reason}"
+        if one_by_one and not _is_same(known[key].graph, old.graph, attributes=False):
+            return 0, f"{called} cannot be written in {after}: it becomes another"
         if not in_function:
             made[node] = ir.serde.deserialize_model(known[key]).graph
         elif not _is_same(known[key].graph, old.graph):
@@ -89,19 +96,6 @@ def write_in(model: ir.Model, before: int, opset: int, by: str) -> tuple[int, st
             if imported := body.opset_imports.get(domain, 0):
                 body.opset_imports[domain] = written(imported, before, opset)
     return len(made) + 1, ""
-
-
-def bodies(model: ir.Model) -> Iterator[tuple[ir.Graph | ir.Function, int]]:
-    """List the graph and the functions, each with its opset."""
-    main = opset_of(model)
-    yield model.graph, main
-    for function in model.functions.values():
-        yield function, opset_of(function) or main
-
-
-def written(own: int, before: int, wanted: int) -> int:
-    """Return the opset of a body once the newest of its graph is another."""
-    return min(own, wanted) if wanted < before else max(own, wanted)
 
 
 def _changes(node: ir.Node, own: int, after: int) -> bool:
@@ -143,11 +137,17 @@ def alone(node: ir.Node, opset: int) -> onnx.ModelProto:
     )
 
 
-def _is_same(new: onnx.GraphProto, old: onnx.GraphProto) -> bool:
+def _is_same(
+    new: onnx.GraphProto, old: onnx.GraphProto, *, attributes: bool = True
+) -> bool:
     """Return whether a graph of one node was converted without a change."""
     one, other = (
         [
-            (node.op_type, [*node.input], sorted(map(str, node.attribute)))
+            (
+                node.op_type,
+                [*node.input],
+                sorted(map(str, node.attribute)) if attributes else (),
+            )
             for node in graph.node
         ]
         for graph in (new, old)

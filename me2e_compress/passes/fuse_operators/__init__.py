@@ -9,10 +9,11 @@ from typing import ClassVar
 import onnx_ir as ir
 
 from me2e_compress.errors import GraphError, PreconditionError
-from me2e_compress.graph import graphs_of, is_standard, opset_of
+from me2e_compress.graph import array_of, graphs_of, is_standard, opset_of
 from me2e_compress.graph.nodes import is_read, nodes_in
 from me2e_compress.graph.provenance import inherit
 from me2e_compress.graph.rewrite import (
+    add_constant,
     remove_dead,
     replace_value,
     value_names,
@@ -25,6 +26,8 @@ from me2e_compress.passes.fuse_operators.numeric_check import (
     Proofs,
     draw_views,
     nodes_between,
+    piece_of,
+    run_piece,
     take_back,
 )
 
@@ -131,8 +134,9 @@ class _Run:
         inputs = [view.value for view in plan.inputs]
         write = functools.partial(fused_form.write, plan)
         draw = functools.partial(draw_views, plan.inputs)
-        error = self._replace(body, plan.result.value, inputs, write, draw)
+        new, error = self._replace(body, plan.result.value, inputs, write, draw)
         self.worst = max(self.worst, error)
+        self._fold(body, new, plan)
         self.fused += 1
         self.samplers += len(match.levels)
 
@@ -164,10 +168,10 @@ class _Run:
         write: Callable[[FusedCall], ir.Value],
         draw: Draw,
         least: int = 1,
-    ) -> float:
+    ) -> tuple[ir.Value, float]:
         """Write what may stand for a value, and put it there if that is proven.
 
-        Returns how far it is apart.
+        Returns the new value, and how far it is apart.
         """
         root, known = old.producer(), set(body.initializers)
         if root is None:
@@ -194,4 +198,22 @@ class _Run:
         for each in reversed(matched):
             if each.graph is not None and not any(map(is_read, each.outputs)):
                 each.graph.remove(each, safe=True)
-        return error
+        return new, error
+
+    def _fold(self, body: ir.Graph, new: ir.Value, plan: fused_form.Plan) -> None:
+        """Store operands that are computed of constants alone."""
+        between = nodes_between(new, [view.value for view in plan.inputs])
+        node = next(each for each in between if each.domain == OWN_DOMAIN)
+        mask = () if plan.mask is None else (plan.mask,)
+        for index, read in (
+            (0, plan.value.views),
+            (3, plan.locations.views),
+            (4, (*plan.weights.views, *mask)),
+        ):
+            value = node.inputs[index]
+            constant = all(array_of(view.value) is not None for view in read)
+            if value is None or value.producer() is None or not constant:
+                continue
+            array = run_piece(piece_of(value, (), self.opset), ())
+            name = f"{value.name}_constant"
+            node.replace_input_with(index, add_constant(body, array, name, self.names))

@@ -75,7 +75,7 @@ def test_the_goal_ends_a_route() -> None:
 
     assert world.reason is Ending.COMPLETED
     assert world.progress_m == world.path.goal_m > 200.0
-    with pytest.raises(EvaluationError, match="has ended: goal"):
+    with pytest.raises(EvaluationError, match="has ended: completed"):
         world.step(Control(0.0, 0.0))
 
 
