@@ -113,12 +113,8 @@ REGISTRIES: Mapping[str, Registry[Any]] = {
 """Registries to which other packages add."""
 
 
-def _entries(kind: str) -> tuple[Entry, ...]:
-    return describe(REGISTRIES[kind])
-
-
 KINDS: Mapping[str, Callable[[], tuple[Entry, ...]]] = {
-    **{kind: partial(_entries, kind) for kind in REGISTRIES},
+    **{kind: partial(describe, each) for kind, each in REGISTRIES.items()},  # pyright: ignore[reportArgumentType]
     "recipes": lambda: tuple(
         _toml_entry(path)
         for path in sorted(

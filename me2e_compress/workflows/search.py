@@ -182,7 +182,7 @@ def search(
         # sizes and seconds in base units, as they are measured
         mb, ms, most_j = options.max_mb, options.max_ms, options.max_joules
         asked = (
-            (mb and mb * 1e6, "bytes of weights", _weight_bytes),
+            (mb and mb * 1e6, "bytes of weights", lambda m: graph.size(m).weight_bytes),
             (ms and ms / 1e3, "s", partial(_measure_seconds, trials)),
             (most_j, "J", partial(_measure_joules, trials)),
         )
@@ -192,10 +192,6 @@ def search(
         written = files.write(Int8Choice(tried[-1].modules), options)
     limits = tuple((each.unit, each.limit) for each in budgets)
     return SearchResult(files.output, tried, limits, written)
-
-
-def _weight_bytes(model: ir.Model) -> float:
-    return float(graph.size(model).weight_bytes)
 
 
 def _measure_joules(trials: Trials, model: ir.Model) -> float:

@@ -16,14 +16,6 @@ from benchmarks.measure.energy import COUNTER, FRAMES_MS, conditions, held
 from benchmarks.measure.gpu import ROWS, Bench, provider_or_reason
 from benchmarks.measure.int8_shapes import FORMS as INT8_FORMS
 from benchmarks.measure.int8_shapes import Convolution, product, session
-from benchmarks.measure.levers import (
-    LEVERS,
-    Feeds,
-    Lever,
-    first_frame,
-    measured,
-    opened,
-)
 from benchmarks.subjects.original_patterns import FORMS, restored
 from benchmarks.subjects.runtime_files import REFERENCE
 from benchmarks.subjects.subject import Subject
@@ -127,27 +119,6 @@ def test_layers_run_in_every_form_with_their_own_macs() -> None:
         rows = np.ones((5, 8), np.uint8)
         answer: Any = product(form, 5, (8, 16)).run(None, {"x": rows})[0]
         assert answer.shape == (5, 16)
-
-
-def test_every_lever_answers_as_none_does(tmp_path: Path) -> None:
-    model = save_text(
-        tmp_path / "m.onnx",
-        """m (float[1,2,4] x, float[1,2,4] prev_x)
-            => (float[1,2,4] y, float[1,2,4] next_x) <float[4] s = {1, 2, 3, 4}> {
-        a = Add(x, prev_x) y = LayerNormalization(a, s, s) next_x = Identity(a) }""",
-    )
-
-    def answer(feeds: Feeds, lever: Lever) -> Any:
-        return opened(model, 1, lever).run(["y"], dict(feeds))[0]
-
-    x = np.ones((1, 2, 4), np.float32)
-    feeds = first_frame(model, record(tmp_path / "frames", [{"x": x}]))
-    assert not feeds["prev_x"].any()  # the state of a first frame
-    taken = measured(model, feeds, LEVERS["IO binding"], threads=1, rounds=1)
-    assert all(each.run >= 0 for each in taken)
-    feeds = {"x": x, "prev_x": x}
-    for lever in LEVERS.values():
-        assert np.allclose(answer(feeds, Lever()), answer(feeds, lever), atol=1e-5)
 
 
 def test_the_forms_of_the_original_compute_what_those_of_models_do() -> None:

@@ -1,8 +1,9 @@
 """Results of a leaderboard: its files and their records."""
 
+import os
 import re
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import MappingProxyType
@@ -265,18 +266,32 @@ def find_files(folder: Path) -> RunFiles:
     return files
 
 
-def _files(folder: Path) -> Iterable[Path]:
+def _files(folder: Path) -> Iterator[Path]:
+    """Yield every JSON file once; links to folders are followed, not in circles."""
     if folder.is_file():
-        return [folder]
-    return sorted(path for path in folder.rglob("*.json*") if path.is_file())
+        yield folder
+    seen = set[str]()
+    for where, folders, names in os.walk(folder, followlinks=True):
+        if (place := os.path.realpath(where)) in seen:
+            folders.clear()
+            continue
+        seen.add(place)
+        folders.sort()
+        paths = (Path(where, name) for name in sorted(names))
+        yield from (each for each in paths if ".json" in each.suffix and each.is_file())
 
 
 def _is_checkpoint(path: Path) -> bool:
-    """Return whether a file holds results, whole or not."""
+    """Return whether a file holds results: whole, cut short, in UTF-16 or too large."""
+    if path.suffix != ".json":
+        return False
     try:
-        return path.suffix == ".json" and _CHECKPOINT in documents.read_bytes(path)
-    except (OSError, documents.MalformedError):
-        return False  # it cannot be read, or is too large
+        with path.open("rb") as file:
+            content = file.read(documents.LARGEST_BYTES)
+    except OSError:
+        return False
+    cut = b'{"_checkpoint"'.startswith(b"".join(content[:99].split()))
+    return cut or _CHECKPOINT in content.replace(b"\0", b"")
 
 
 def _read(path: Path) -> ResultFile:

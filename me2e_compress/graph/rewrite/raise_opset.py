@@ -82,7 +82,7 @@ def write_in(
         except (onnx.version_converter.ConvertError, RuntimeError) as error:
             reason = " ".join(str(error).split()).rpartition("failed: ")[2]
             return 0, f"{called} cannot be written in {after}: {reason}"
-        if one_by_one and not _is_same(known[key].graph, old.graph, attributes=False):
+        if one_by_one and _operators(known[key].graph) != _operators(old.graph):
             return 0, f"{called} cannot be written in {after}: it becomes another"
         if not in_function:
             made[node] = ir.serde.deserialize_model(known[key]).graph
@@ -137,22 +137,14 @@ def alone(node: ir.Node, opset: int) -> onnx.ModelProto:
     )
 
 
-def _is_same(
-    new: onnx.GraphProto, old: onnx.GraphProto, *, attributes: bool = True
-) -> bool:
+def _is_same(new: onnx.GraphProto, old: onnx.GraphProto) -> bool:
     """Return whether a graph of one node was converted without a change."""
-    one, other = (
-        [
-            (
-                node.op_type,
-                [*node.input],
-                sorted(map(str, node.attribute)) if attributes else (),
-            )
-            for node in graph.node
-        ]
-        for graph in (new, old)
-    )
-    return one == other
+    one, other = ([sorted(map(str, n.attribute)) for n in g.node] for g in (new, old))
+    return _operators(new) == _operators(old) and one == other
+
+
+def _operators(graph: onnx.GraphProto) -> list[tuple[str, ...]]:
+    return [(node.op_type, *node.input) for node in graph.node]
 
 
 def _not_converted(node: ir.Node, before: int) -> str:

@@ -12,6 +12,7 @@ from me2e_compress.evaluators.bench2drive.real_results import (
     CollectedResults,
 )
 from me2e_compress.metrics.episode import InferenceRecord
+from me2e_compress.registry import documents
 from me2e_compress.testing import check_evaluator
 from tests.evaluators.bench2drive.files import (
     GOOD,
@@ -47,6 +48,40 @@ def test_results_files_have_any_name(tmp_path: Path) -> None:
     assert found.crashed == ["RouteScenario_2084_rep0"]
     assert len(found.missing) == 217
     assert found.missing[0] == "1773"
+
+
+def test_a_file_in_utf_16_is_named(tmp_path: Path) -> None:
+    write(tmp_path / "good.json", checkpoint(GOOD))
+    other = tmp_path / "other.json"
+    other.write_text(json.dumps(checkpoint(OTHER)), "utf-16")
+
+    result = collect(tmp_path)
+
+    assert routes(result) == ["1711"]
+    assert result.broken.keys() == {str(other)}
+    assert result.broken[str(other)].startswith("not JSON: ")
+
+
+def test_a_file_that_is_too_large_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file = tmp_path / "large.json"
+    write(file, checkpoint(GOOD))
+    monkeypatch.setattr(documents, "LARGEST_BYTES", 400)
+    monkeypatch.setattr(documents.read_bytes, "__defaults__", (400,))
+    with pytest.raises(EvaluationError, match=r"large\.json: not JSON: .* too many"):
+        collect(tmp_path)
+
+
+def test_links_to_folders_are_followed_but_not_in_circles(tmp_path: Path) -> None:
+    write(tmp_path / "elsewhere" / "r.json", checkpoint(GOOD))
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / "link").symlink_to(tmp_path / "elsewhere")
+    (tmp_path / "elsewhere" / "back").symlink_to(tmp_path / "run")
+
+    result = collect(tmp_path / "run")
+
+    assert (routes(result), result.repeated) == (["1711"], [])
 
 
 def test_the_evaluator_keeps_its_promises(tmp_path: Path) -> None:
@@ -154,6 +189,8 @@ def test_what_is_broken_is_named_and_the_rest_read(tmp_path: Path) -> None:
     ("content", "message"),
     [
         ("[]", "no whole record of a leaderboard below it$"),
+        ("", r"below it: .*r\.json: not JSON"),
+        ('{ "_check', r"below it: .*r\.json: not JSON"),
         ('{"_checkpoint": {"rec', r"below it: .*r\.json: not JSON"),
         ('{"_checkpoint": 5}', r"r\.json: _checkpoint: Input should be"),
         ('{"_checkpoint": {"records": []}}', "no whole record of a leaderboard"),
@@ -233,18 +270,10 @@ STEPS = recording(30)
 @pytest.mark.parametrize(
     ("beside", "frames", "named", "note"),
     [
-        (
-            {f"{NAME.replace('_36', '_11')}/{INFO}": STEPS},
-            0,
-            0,
-            "of no record",
-        ),
+        ({f"{NAME.replace('_36', '_11')}/{INFO}": STEPS}, 0, 0, "of no record"),
         ({"saved/7/metric_info.json": STEPS}, 0, 0, "of no record"),
         (
-            {
-                f"a/{NAME}/{INFO}": STEPS,
-                f"b/{NAME}/{INFO}": recording(40),
-            },
+            {f"a/{NAME}/{INFO}": STEPS, f"b/{NAME}/{INFO}": recording(40)},
             *(30, 0, "one of 2 of the same drive"),
         ),
         (
