@@ -1,8 +1,8 @@
 """Where a node comes from: its module, its source nodes, the passes that made it.
 
 Stored in the node's ONNX metadata, so that it survives every tool that keeps metadata;
-in a file, origins other than a node's own name stand compressed in the model's. The
-manager refuses a pass that loses it.
+in a file, origins and passes stand compressed in the model's, as does a module that all
+nodes share. The manager refuses a pass that loses it.
 """
 
 import base64
@@ -200,46 +200,51 @@ def decompressed(text: str) -> str:
 
 @contextlib.contextmanager
 def packed(model: ir.Model) -> Iterator[None]:
-    """Take the origins from the nodes while a model is written, into one text.
+    """Move origins from the nodes into one text while a model is written.
 
-    Origins that are a node's own name alone are not written; what two nodes of one name
-    have stays with them.
+    Left out are origins that are a node's own name, and passes. A module that all nodes
+    share is written once, by the name "". Nodes that share a name keep what they have.
     """
-    nodes = list(nodes_in(model.graph))
+    nodes = [node for node in nodes_in(model.graph) if ORIGINS in node.metadata_props]
     times = Counter(node.name for node in nodes)
-    props = {
-        str(node.name): node.metadata_props
-        for node in nodes
-        if ORIGINS in node.metadata_props and times[node.name] == 1
-    }
-    before = {name: dict(each) for name, each in props.items()}
-    texts = {name: each.pop(ORIGINS) for name, each in props.items()}
-    table = {name: text for name, text in texts.items() if text != json.dumps([name])}
-    if texts:
-        model.metadata_props[ORIGINS] = compressed(json.dumps(table))
+    before = [(node, dict(node.metadata_props)) for node in nodes]
+    modules = {props.get(MODULE, "") for _, props in before}
+    table = {"": min(modules)} if len(modules) == 1 else {}
+    moved = (PASSES, MODULE) if table else (PASSES,)
+    for node in nodes:
+        if node.name and times[node.name] == 1:
+            origins = node.metadata_props.pop(ORIGINS)
+            if origins != json.dumps([node.name]):
+                table[node.name] = origins
+            for key in moved:
+                node.metadata_props.pop(key, None)
+    if table:
+        text = json.dumps(table, separators=(",", ":"))
+        model.metadata_props[ORIGINS] = min(compressed(text), text, key=len)
     try:
         yield
     finally:
         model.metadata_props.pop(ORIGINS, None)
-        for name, each in before.items():
-            props[name].clear()
-            props[name].update(each)
+        for node, props in before:
+            node.metadata_props.clear()
+            node.metadata_props.update(props)
 
 
 def unpack(model: ir.Model) -> None:
-    """Give the nodes of a model that was read their origins again.
+    """Give the nodes of a model that was read their modules and origins again.
 
     Raises:
         GraphError: what stands there is not what :func:`packed` wrote.
     """
-    text = model.metadata_props.pop(ORIGINS, None)
-    if text is None:
-        return
+    text = model.metadata_props.pop(ORIGINS, "{}")
     try:
         table = dict(json.loads(decompressed(text)))
     except (ValueError, TypeError, RecursionError) as error:
         raise GraphError(f"its metadata {ORIGINS} is not a table of names") from error
     for node in nodes_in(model.graph):
-        if MODULE in node.metadata_props:
+        props = node.metadata_props
+        if "" in table:
+            props.setdefault(MODULE, str(table[""]))
+        if MODULE in props:
             own = json.dumps([node.name])
-            node.metadata_props.setdefault(ORIGINS, str(table.get(node.name, own)))
+            props.setdefault(ORIGINS, str(table.get(node.name, own)))

@@ -198,6 +198,33 @@ def _adopt(
                     _adopt(inner, message, interface)
 
 
+def records_shapes(model: ir.Model) -> bool:
+    """Return whether a graph says the shape of a value that is no output."""
+    outputs = set(model.graph.outputs)
+    made = (value for node in model.graph for value in node.outputs)
+    return any(value.shape is not None for value in made if value not in outputs)
+
+
+def without_inferable_shapes(model: ir.Model) -> ir.Model:
+    """Return a copy that records no types and shapes which inference gives again.
+
+    Those of initializers stand in the initializers; those of plugins stay.
+    """
+    copy = model.clone()
+    nodes = [node for node in copy.graph if not is_plugin(node)]
+    inner = {value for node in nodes for value in node.outputs}
+    known = {value: (value.type, value.shape) for value in inner}
+    for value in inner.difference(copy.graph.outputs):
+        value.type = value.shape = None
+    infer_shapes(copy)
+    for value in inner.difference(copy.graph.outputs):
+        same = (value.type, value.shape) == known[value]
+        value.type, value.shape = (None, None) if same else known[value]
+    for value in copy.graph.initializers.values():
+        value.type = value.shape = None
+    return copy
+
+
 def unshaped_plugins(model: ir.Model) -> list[ir.Node]:
     """List the plugins that give something whose shape the graph does not record.
 

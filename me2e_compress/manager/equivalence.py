@@ -127,7 +127,7 @@ def rounding_effect(
     ``answers`` are what it gave on the inputs as they are. Returns the largest
     max|a-b|/max|a| of ``NUDGES`` trials, by output.
     """
-    session = Session(model, provider=inputs.provider)
+    session = Session(model, release=True, provider=inputs.provider)
     worst = dict.fromkeys(answers[0], 0.0)
     for seed in range(NUDGES):
         moved = relative_errors(answers, replay(session, inputs.nudged(seed).frames))

@@ -105,7 +105,9 @@ class VerificationInputs:
         Raises:
             GraphError: onnxruntime cannot run it, or an output is no tensor.
         """
-        session = Session(model, optimize=optimize, provider=self.provider)
+        session = Session(
+            model, optimize=optimize, release=True, provider=self.provider
+        )
         for outputs in replay(session, self.frames):
             for name, value in outputs.items():
                 if not isinstance(value, np.ndarray):
@@ -164,7 +166,7 @@ def _runnable_scenes(
     model: ir.Model, seed: int, count: int, provider: Provider
 ) -> list[tuple[Sizes, list[Frame]]]:
     """Return sizes that a graph runs at, with scenes; a PreconditionError if none."""
-    session, reason = Session(model, provider=provider), ""
+    session, reason = Session(model, release=True, provider=provider), ""
     scenes: list[tuple[Sizes, list[Frame]]] = []
     for sizes in size_candidates(model):
         inputs = sized_inputs(model, sizes)

@@ -13,6 +13,7 @@ from me2e_compress.errors import PreconditionError, RecipeError
 from me2e_compress.fidelity.floor import Floor
 from me2e_compress.graph.files import data_names
 from me2e_compress.graph.provenance import drop_traces
+from me2e_compress.graph.shapes import records_shapes, without_inferable_shapes
 from me2e_compress.manager import PassManager, Report
 from me2e_compress.manager import recipe as recipes
 from me2e_compress.manager.pass_manager import pause_collector
@@ -269,6 +270,7 @@ def compress(
     with writing(outputs, inputs, force=options.force), pause_collector():
         loaded = read_graph(source, listener, options.adapter, options.module_map)
         drop_traces(loaded)
+        shaped = records_shapes(loaded)
         modules = load_map(options.module_map, loaded)
         seen = split_frames(source, loaded, frames, passes, options.measure_frames)
         start, provider = cpu_seconds(), options.runs_on
@@ -290,7 +292,7 @@ def compress(
         loss = measure_loss(report, provider, seen, Floor(options.floor), listener)
         linted = lint_written(report.model, passes, output, options.target)
         seconds = cpu_seconds() - start
-        made = _write(report, source, output, int8, loss, seconds, linted)
+        made = _write(report, source, output, int8, loss, seconds, linted, shaped)
         placed = () if int8 is None or int8.slow_here else report.lossy
         if shown is None or provider.native != CPU.native or not placed:
             return made
@@ -334,11 +336,17 @@ def _write(
     loss: MeasuredLoss | None,
     seconds: float,
     linted: LintResult | None,
+    shaped: bool,
 ) -> CompressResult:
-    """Write the graph and its plan, then the report, which vouches for both."""
+    """Write the graph and its plan, then the report, which vouches for both.
+
+    Only a graph whose source has them (``shaped``) gets shapes that can be inferred.
+    """
+    model = with_own_domains(report.model)
+    model = model if shaped else without_inferable_shapes(model)
     plan = plan_of(report.model)  # before writing: metadata may be malformed
     with drafts.all_or_none():
-        graph.save(with_own_domains(report.model), output)
+        graph.save(model, output)
         if plan is not None:
             save_plan(plan, sidecar(output, "plan"))
         sizes = graph.file_bytes(source), graph.file_bytes(output)

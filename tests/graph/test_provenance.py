@@ -7,7 +7,7 @@ import pytest
 from me2e_compress import graph
 from me2e_compress.errors import GraphError
 from me2e_compress.graph import provenance
-from me2e_compress.graph.provenance import ORIGINS, Provenance
+from me2e_compress.graph.provenance import ORIGINS, PASSES, Provenance
 from me2e_compress.registry.documents import MalformedError
 from tests.support.nets import parsed
 
@@ -37,7 +37,9 @@ def test_a_past_of_another_kind_is_named(node: ir.Node, text: str) -> None:
         provenance.read(node)
 
 
-def test_a_file_holds_few_bytes_of_the_past_and_loses_none(tmp_path: Path) -> None:
+def test_a_file_holds_few_bytes_of_the_past_and_loses_but_passes(
+    tmp_path: Path,
+) -> None:
     pasts = {"a": ("a",), "b": ("source/of/a", "source/of/b"), "c": ("a",)}
     model = parsed(
         "m (float[2] x) => (float[2] w) {"
@@ -59,8 +61,32 @@ def test_a_file_holds_few_bytes_of_the_past_and_loses_none(tmp_path: Path) -> No
     held = [{each.key for each in node.metadata_props} for node in written.graph.node]
     assert [ORIGINS in keys for keys in held] == [False, False, True, True]
     read = graph.load(tmp_path / "m.onnx")
-    assert [dict(node.metadata_props) for node in read.graph] == before
+    kept = [PASSES in keys for keys in held]
+    assert kept == [False, False, True, True]
+    assert [
+        {key: text for key, text in props.items() if keep or key != PASSES}
+        for props, keep in zip(before, kept, strict=True)
+    ] == [dict(node.metadata_props) for node in read.graph]
     assert not read.metadata_props
+
+
+@pytest.mark.parametrize("others", [("m", "m"), ("m", "other")])
+def test_a_module_that_all_nodes_share_is_written_once(
+    others: tuple[str, str], tmp_path: Path
+) -> None:
+    model = parsed("m (float[2] x) => (float[2] w) { t = Relu (x) w = Relu (t) }")
+    for node, name, module in zip(model.graph, "ab", others, strict=True):
+        node.name = name
+        provenance.stamp(node, Provenance(module, (name,)))
+    graph.save(model, tmp_path / "m.onnx")
+
+    written = onnx.load(tmp_path / "m.onnx")
+    shared = len(set(others)) == 1
+    assert [bool(node.metadata_props) for node in written.graph.node] == [
+        not shared
+    ] * 2
+    pasts = [provenance.read(node) for node in graph.load(tmp_path / "m.onnx").graph]
+    assert pasts == [Provenance(m, (n,)) for m, n in zip(others, "ab", strict=True)]
 
 
 @pytest.mark.parametrize("text", ["eJyr", "!", "[1]", '{"a": ', "[" * 300])
