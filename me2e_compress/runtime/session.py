@@ -196,7 +196,7 @@ def _open_with_retry(
     try:
         return _open_once(source, options, provider, left_out)
     except REFUSALS as error:
-        refusal = error
+        refusal = error.with_traceback(None)  # no circle that holds our callers
     # Disable that step; setting the option twice would make onnxruntime warn.
     try:
         options.get_session_config_entry(_KEEP_INT8)

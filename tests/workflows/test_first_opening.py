@@ -1,6 +1,8 @@
 """Opened in a process of its own, once."""
 
+import gc
 import subprocess
+import weakref
 from functools import partial
 from pathlib import Path
 
@@ -150,6 +152,18 @@ def test_what_only_the_optimizer_refuses_is_run_as_it_stands_and_told(
     assert np.all(Session(path, int8_kernels=True).run({"x": x})["y"] == 12)
     with pytest.raises(GraphError, match="MatMulNBits"):
         Session(path, int8_kernels=True, rewritten=tmp_path / "written.onnx")
+
+
+def test_a_session_that_opened_at_a_second_try_is_freed_without_the_collector(
+    tmp_path: Path,
+) -> None:
+    path = save_text(tmp_path / "half.onnx", HALF)
+    gc.disable()  # as `compress` does
+    try:
+        session = weakref.ref(Session(path, int8_kernels=True))
+        assert session() is None
+    finally:
+        gc.enable()
 
 
 def test_layers_in_functions_are_counted_as_often_as_they_are_called() -> None:

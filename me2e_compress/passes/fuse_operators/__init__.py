@@ -153,7 +153,7 @@ class _Run:
             try:
                 self._replace(body, *sampling, least=guess.draws)
             except (PreconditionError, GraphError) as error:
-                reason = error
+                reason = error.with_traceback(None)  # no circle of frames
                 continue
             self._failed.remove(floors)
             self.sampled += 1
