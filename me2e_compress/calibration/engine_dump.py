@@ -9,7 +9,7 @@ from pathlib import Path
 
 from me2e_compress.calibration.dataset import CalibrationSet, load_arrays, read_headers
 from me2e_compress.display import plural
-from me2e_compress.errors import FORMER_NAMES, FramesError
+from me2e_compress.errors import FramesError
 from me2e_compress.runtime.frames import Array
 
 _CACHED = 8
@@ -34,7 +34,10 @@ class EngineDump:
             raise FramesError(f"{self.path}: no such folder")
         self.stems = tuple(sorted(each.stem for each in self.path.glob("*.npz")))
         if not self.stems:
-            raise FramesError(f"{self.path}: {FORMER_NAMES['dump json']}")
+            raise FramesError(
+                f"{self.path}: no .npz; JSON of other tools: docs/engine-dumps.md, in"
+                " the repository"
+            )
         self._at = functools.lru_cache(maxsize=_CACHED)(self._read)
         self.names = tuple(self[0])
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from me2e_compress.cli.signals import INTERRUPTED, TERMINATED, handle_signals
 from me2e_compress.display import escape_controls
-from me2e_compress.errors import Me2eError, OptionError, cites_old_name
+from me2e_compress.errors import Me2eError, OptionError
 
 RUN_AGAIN = "run again to go on"
 RESUMES = {
@@ -78,6 +78,6 @@ def _run(run: Callable[[], None]) -> int:
             text = f"{os.fsdecode(hint.filename)}: {hint.strerror}"
         line = escape_controls(" ".join(text.split()))
         errors.print(f"me2e-compress: {line}", soft_wrap=True, markup=False)
-        usage = isinstance(error, CycloptsError | OptionError) or cites_old_name(error)
+        usage = isinstance(error, CycloptsError | OptionError)
         return 2 if usage else 1
     return 0

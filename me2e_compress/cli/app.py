@@ -1,14 +1,12 @@
 """The application: all commands, and the options before or after their names."""
 
 import inspect
-from collections.abc import Sequence
 from typing import Annotated
 
-from cyclopts import App, CycloptsError, Group, Parameter
+from cyclopts import App, Group, Parameter
 
 from me2e_compress.cli import commands, driving
 from me2e_compress.cli.console import printing
-from me2e_compress.errors import FORMER_NAMES
 from me2e_compress.extras import missing_module
 from me2e_compress.version import __version__
 
@@ -46,7 +44,6 @@ def build_app(name: str, about: str = "") -> App:
         """
         printing.quiet, printing.verbose = quiet, verbose and not quiet
         printing.json = json
-        _check_former(tokens)
         app(tokens)
 
     return app
@@ -93,20 +90,6 @@ def options_of(name: str) -> list[str]:
     """List the options of a command, by their first names."""
     arguments = app[name].assemble_argument_collection()
     return [each.name for each in arguments if each.parse and each.name[:1] == "-"]
-
-
-def _check_former(words: Sequence[str]) -> None:
-    """Raise a CycloptsError that says what replaces a command or option of 0.2."""
-    name, flags = next(iter(words), ""), set[str]()
-    if message := FORMER_NAMES.get(f"command {name}"):
-        raise CycloptsError(message)
-    if name in COMMANDS:
-        arguments = app[name].assemble_argument_collection()
-        flags = {flag for each in arguments if each.parse for flag in each.names}
-    for flag in (word.partition("=")[0] for word in words[1:]):
-        message = FORMER_NAMES.get(f"{name} {flag}") or FORMER_NAMES.get(flag)
-        if message and flag not in flags:
-            raise CycloptsError(message)
 
 
 app = _main_app()

@@ -15,7 +15,7 @@ import pydantic
 from pydantic_core import CoreSchema, core_schema
 
 from me2e_compress.display import with_prefix
-from me2e_compress.errors import FORMER_NAMES, Me2eError
+from me2e_compress.errors import Me2eError
 from me2e_compress.registry.text import (
     ParsedItem,
     TextError,
@@ -109,7 +109,7 @@ class Registry(Generic[T]):
         if unknown := [option for option in options if option not in known]:
             there = ", ".join(known) or "none"
             line = f"{name} has no option {unknown[0]!r}; it has {there}"
-            raise self.error(FORMER_NAMES.get(f"{name} {unknown[0]}", line))
+            raise self.error(line)
         try:
             made: T = _adapter(cls).validate_python(dict(options))
         except pydantic.ValidationError as error:
@@ -193,8 +193,7 @@ class Registry(Generic[T]):
 
     def _unknown_name(self, name: str) -> Me2eError:
         there = ", ".join(self.names()) or "none"
-        line = f"no {self.kind} {name!r}; there are {there}"
-        return self.error(FORMER_NAMES.get(f"{self.kind} {name}", line))
+        return self.error(f"no {self.kind} {name!r}; there are {there}")
 
     def _build(
         self, item: ParsedItem, cls: type[T], more: Mapping[str, object] | None = None

@@ -7,7 +7,7 @@ from typing import Self
 
 import pydantic
 
-from me2e_compress.errors import FORMER_NAMES, GraphError
+from me2e_compress.errors import GraphError
 from me2e_compress.registry import drafts
 from me2e_compress.registry.documents import reading
 from me2e_compress.runtime.atomic import write_bytes
@@ -91,9 +91,7 @@ def card(name: str) -> ModelCard:
         GraphError: unknown model, or its card is missing or malformed.
     """
     if name not in SHIPPED:
-        line = f"no model {name!r} ships; there is {', '.join(SHIPPED)}"
-        former = (FORMER_NAMES.get(f"{kind} {name}") for kind in ("model", "stack"))
-        raise GraphError(next(filter(None, former), line))
+        raise GraphError(f"no model {name!r} ships; there is {', '.join(SHIPPED)}")
     return ModelCard.load(WEIGHTS / f"{name}.json")
 
 

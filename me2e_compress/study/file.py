@@ -7,7 +7,7 @@ from pathlib import Path
 from pydantic import TypeAdapter, ValidationError
 
 from me2e_compress.driving.policies import PythonDriver, driver_named
-from me2e_compress.errors import FORMER_NAMES, StudyError
+from me2e_compress.errors import StudyError
 from me2e_compress.registry import documents
 from me2e_compress.study.definition import Study
 
@@ -92,8 +92,7 @@ def load_study(
 def _content(path: Path) -> dict[str, object]:
     """Return the tables of a file."""
     if not path.exists():
-        gone = FORMER_NAMES.get(f"study {path}")
-        raise StudyError(gone or f"no study {path}: no such file")
+        raise StudyError(f"no study {path}: no such file")
     with documents.reading(path, StudyError, "not TOML"):
         content = documents.from_toml(documents.read_bytes(path))
     if "set_size" in content:  # Python's own
@@ -109,5 +108,4 @@ def _complaint(error: ValidationError) -> str:
     where = ".".join(map(str, first["loc"]))
     if not unknown:
         return f"{where}: {first['msg']}"
-    names = ".".join(each for each in first["loc"] if isinstance(each, str))
-    return FORMER_NAMES.get(f"study {names}", f"no key {where}")
+    return f"no key {where}"

@@ -34,7 +34,7 @@ from me2e_compress import graph
 from me2e_compress.calibration.dataset import CalibrationSet, npz_bytes
 from me2e_compress.display import plural
 from me2e_compress.driving.adapter.outputs import adapted, state_and_plan
-from me2e_compress.errors import FORMER_NAMES, GraphError
+from me2e_compress.errors import GraphError
 from me2e_compress.graph.modules.assign import map_of
 from me2e_compress.graph.modules.module_map import ModuleMap
 from me2e_compress.graph.nodes import is_read, is_standard, nodes_of, opset_of
@@ -64,10 +64,7 @@ def model_path(text: str | Path, folder: Path = Path()) -> Path:
         return path
     if str(text) in SHIPPED:
         return shipped_model(str(text))
-    line = f"{text}: no such file; models that ship: {', '.join(SHIPPED)}"
-    name = str(text).partition(":")[0]
-    former = (FORMER_NAMES.get(f"{kind} {name}") for kind in ("model", "stack"))
-    raise GraphError(next(filter(None, former), line))
+    raise GraphError(f"{text}: no such file; models that ship: {', '.join(SHIPPED)}")
 
 
 def load_graph(path: Path) -> ir.Model:

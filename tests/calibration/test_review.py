@@ -380,8 +380,7 @@ class RootMeanSquare(Observer):
         ("percentile:x", "percentile: percent: Input should be a valid number"),
         ("percentile:nan", "percentile: percent must be above 0"),
         ("percentile:0", "must be above 0 and at most 100, found 0"),
-        ("entropy", "^entropy is gone since 0.3.0: use mse$"),
-        ("moving-average:0.1", "^moving-average is gone since 0.3.0: use max-min$"),
+        ("entropy", "^no calibration method 'entropy'; there are"),
     ],
 )
 def test_what_is_no_method_is_refused(text: str, message: str) -> None:

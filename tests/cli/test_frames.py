@@ -72,8 +72,6 @@ def test_a_log_of_another_package_becomes_the_frames_that_it_is_asked_for(
     ("words", "message"),
     [
         ("m.onnx --from kitti:log", "no driving log 'kitti'; there are rides"),
-        ("m.onnx --from nuscenes:log", "nuscenes is gone since 0.3.0: use examples"),
-        ("m.onnx --from bench2drive:log", "bench2drive is gone since 0.3.0: use"),
         ("nothing --from rides:log", "nothing: no such file; models that ship"),
     ],
 )

@@ -91,11 +91,3 @@ def test_what_is_wrong_with_a_real_run_is_said(cli: Cli, run: Path) -> None:
     assert "not at 20 Hz │ RouteScenario_1711_rep0 │ 1" in shown
     assert "odd: 2 of 2 routes do not count as they should" in shown
     assert "odd: 1 files or records are broken and left out" in shown
-
-
-@pytest.mark.parametrize("flag", ["--abilities", "--penalties", "--junctions"])
-def test_older_rules_are_usage_errors(cli: Cli, flag: str) -> None:
-    refused = cli(f"score run {flag} 1.0")
-
-    assert refused.code == 2
-    assert f"{flag} is gone since 0.3.0" in refused.err

@@ -111,7 +111,7 @@ def test_a_route_does_not_depend_on_what_drove_before() -> None:
         ),
         ("limited{source=often, fps=10}", "no latency source 'often'"),
         ("limited{source=10, fps=10}", "limited: source: Input should be an instance"),
-        ("agents{source=none, per_agent_us=1}", "agents is gone since 0.3.0: use exam"),
+        ("agents{source=none, per_agent_us=1}", "no latency source 'agents'"),
         ("host-stage{source=none, per_iteration_us=-2}", "greater than or equal"),
     ],
 )

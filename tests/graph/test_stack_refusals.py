@@ -81,12 +81,12 @@ backbone (float[1,4] img, float[1,4] next_bev) => (float[1,4] feats)
         (
             TWO_PARTS + 'first_frame = "first.onnx"\n',
             {},
-            "first_frame is gone since 0.3.0: use a TOML of its own",
+            "part.1.first_frame: Extra inputs are not permitted",
         ),
         (
             TWO_PARTS + '[state]\nprev_bev = {first = "bev.npy"}\n',
             {},
-            "first is gone since 0.3.0: use [recurrent] of the adapter",
+            "state.prev_bev: Input should be a valid string",
         ),
         (TWO_PARTS.replace("backbone", "head"), {}, "two parts are called head"),
         (TWO_PARTS + "[egdes]\n", {}, "not a stack of several files: egdes: Extra"),

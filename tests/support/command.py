@@ -64,13 +64,10 @@ class Cli:
         return found
 
     def refused(self, line: str, *more: str | Path) -> str:
-        """Run what must be refused: one line says why, and no file changes.
-
-        A name that is gone ends as a usage does that is none: with 2.
-        """
+        """Run what must be refused: one line says why, and no file changes."""
         before = contents(self.folder)
         said = self(line, *more)
-        assert said.code == (2 if " is gone since " in said.err else 1)
+        assert said.code == 1
         lines = [e for e in said.err.splitlines() if not e.startswith("warning: ")]
         assert len(lines) == 1, said.err
         assert contents(self.folder) == before

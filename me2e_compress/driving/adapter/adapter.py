@@ -22,7 +22,7 @@ from me2e_compress.driving.input_sources import (
     InputSource,
     Observed,
 )
-from me2e_compress.errors import FORMER_NAMES, EvaluationError
+from me2e_compress.errors import EvaluationError
 from me2e_compress.graph.recurrence import RECURRENT, declared_pairs
 from me2e_compress.registry import documents
 from me2e_compress.runtime.frames import Array
@@ -200,7 +200,6 @@ class Adapter(BaseModel):
             first = error.errors(include_url=False)[0]
             where = ".".join(map(str, first["loc"]))
             words = first["msg"].removeprefix("Value error, ")
-            words = FORMER_NAMES.get(f"adapter key {where}", words)
             raise EvaluationError(f"{origin} {where}: {words}") from error
 
     def metadata(self, own: Mapping[str, str]) -> dict[str, str]:

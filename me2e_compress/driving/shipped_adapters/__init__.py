@@ -3,7 +3,7 @@
 from importlib import resources
 from pathlib import Path
 
-from me2e_compress.errors import FORMER_NAMES, EvaluationError
+from me2e_compress.errors import EvaluationError
 
 __all__ = ["adapter_file", "shipped_adapters"]
 
@@ -22,4 +22,4 @@ def adapter_file(named: Path) -> Path:
     if str(named) in shipped_adapters():
         return Path(str(resources.files(__name__) / f"{named}.toml"))
     line = f"adapter {named}: no such file; we ship {', '.join(shipped_adapters())}"
-    raise EvaluationError(FORMER_NAMES.get(f"adapter {named}", line))
+    raise EvaluationError(line)

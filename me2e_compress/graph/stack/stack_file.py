@@ -11,7 +11,7 @@ from typing import Any, Self
 import onnx_ir as ir
 import pydantic
 
-from me2e_compress.errors import FORMER_NAMES, GraphError
+from me2e_compress.errors import GraphError
 from me2e_compress.graph.files import load
 from me2e_compress.graph.recurrence import SessionPort, declared_pairs, port_of
 from me2e_compress.registry import documents
@@ -32,13 +32,6 @@ class PartEntry(pydantic.BaseModel):
 
     name: str
     file: Path
-
-    @pydantic.model_validator(mode="before")
-    @classmethod
-    def _without_first_frame(cls, value: Any) -> Any:
-        if isinstance(value, dict) and "first_frame" in value:
-            raise ValueError(FORMER_NAMES["stack first_frame"])
-        return value
 
     @pydantic.model_validator(mode="after")
     def _named(self) -> Self:
@@ -66,13 +59,6 @@ class StackFile(pydantic.BaseModel):
     edges: dict[str, str] = pydantic.Field(default_factory=dict)
     state: dict[str, str] = pydantic.Field(default_factory=dict)
     metadata: dict[str, Any] = pydantic.Field(default_factory=dict)
-
-    @pydantic.field_validator("state", mode="before")
-    @classmethod
-    def _without_first(cls, state: Any) -> Any:
-        if isinstance(state, dict) and any(isinstance(e, dict) for e in state.values()):
-            raise ValueError(FORMER_NAMES["stack first"])
-        return state
 
     @pydantic.field_validator("metadata")
     @classmethod

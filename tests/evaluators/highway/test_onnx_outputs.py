@@ -62,7 +62,7 @@ def test_waypoints_of_any_number_in_the_models_axes(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("toml", "message"),
     [
-        ("[control]\nsteer = 'gas'", "controls of a graph is gone since 0.3.0: use a"),
+        ("[control]\nsteer = 'gas'", "control: Extra inputs are not permitted"),
         ("[plan]\noutput = 'gas'\nstep_s = 0.5", "gas has shape [1, 3], a plan is"),
         ("[plan]\noutput = 'plan'\nstep_s = 0", "plan.step_s: Input should be greater"),
         ("[plan]\noutput = 'plan'\nshape = [6, 0]", "every side is 1 or more"),

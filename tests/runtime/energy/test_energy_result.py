@@ -163,7 +163,6 @@ def test_no_counter_lists_what_each_answered(monkeypatch: pytest.MonkeyPatch) ->
     ("text", "fault"),
     [
         ("watts", "no energy counter 'watts'; there are nvml, recorded"),
-        ("rapl", "rapl is gone since 0.3.0: use examples/energy_counters"),
         ("nvml:-1", "nvml: index -1"),
         ("nvml{size=1}", "nvml has no option 'size'"),
         ("recorded", "recorded needs the option file"),
