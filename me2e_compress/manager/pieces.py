@@ -73,45 +73,44 @@ def operand_names(steps: Sequence[Jump]) -> dict[str, str]:
 
 def piece_errors(
     before: ir.Model,
-    others: Sequence[tuple[ir.Model, VerificationInputs]],
+    other: ir.Model,
     steps: Sequence[Jump],
     inputs: VerificationInputs,
-) -> tuple[list[Errors], Errors]:
-    """Run a graph once, and others on what its steps gave; nodes run as they stand.
+    others: VerificationInputs | None = None,
+) -> tuple[Errors, Errors]:
+    """Run a graph, and another on what its steps gave; nodes run as they stand.
 
-    Recurrent state, too, is that of the first, which ``inputs`` are of. Returns the
-    largest errors of each over all frames, and how large those of operands may be, by
-    their dtypes.
+    Recurrent state, too, is that of the first. ``others`` are inputs of the other
+    graph; None gives both the same. Returns the largest errors over all frames, and how
+    large those of operands may be, by their dtypes.
 
     Raises:
         GraphError: onnxruntime cannot run one.
     """
-    names, provider = operand_names(steps), inputs.provider
-    worst, allowed = [Errors() for _ in others], Errors()
-    sessions = [
-        Session(
-            _substitute(model, steps), optimize=False, release=True, provider=provider
-        )
-        for model, _ in others
-    ]
+    names = operand_names(steps)
+    errors, allowed = Errors(), Errors()
+    session = Session(
+        _substitute(other, steps),
+        optimize=False,
+        release=True,
+        provider=inputs.provider,
+    )
     state: Mapping[str, Array] = {}
-    for index, left in enumerate(inputs.run(_expose(before, steps), optimize=False)):
-        for session, errors, (_, own) in zip(sessions, worst, others, strict=True):
-            # A frame, and state and answers of the first graph
-            frame = own.frames[index]
-            if frame.starts_scene:
-                state = session.first_state(frame.arrays)
-            answers = {name: left[name] for name in left if name in session.inputs}
-            right = session.run({**frame.arrays, **state, **answers})
-            for name, value in right.items():
-                called = names.get(name, name)
-                error = relative_error(left[name], value)
-                errors[called] = max(errors.get(called, 0.0), error)
-                if name in names:
-                    allowed[called] = TOLERANCES.get(value.dtype.name, 0.0)
-        recurrent = sessions[0].recurrent.items()
-        state = {name: left[answer] for name, answer in recurrent}
-    return worst, allowed
+    answers = inputs.run(_expose(before, steps), optimize=False)
+    for frame, left in zip((others or inputs).frames, answers, strict=True):
+        # A frame, and state and answers of the first graph
+        if frame.starts_scene:
+            state = session.first_state(frame.arrays)
+        given = {name: left[name] for name in left if name in session.inputs}
+        right = session.run({**frame.arrays, **state, **given})
+        for name, value in right.items():
+            called = names.get(name, name)
+            error = relative_error(left[name], value)
+            errors[called] = max(errors.get(called, 0.0), error)
+            if name in names:
+                allowed[called] = TOLERANCES.get(value.dtype.name, 0.0)
+        state = {name: left[answer] for name, answer in session.recurrent.items()}
+    return errors, allowed
 
 
 def nudged_weights(model: ir.Model, seed: int) -> ir.Model:
