@@ -24,9 +24,7 @@ CAMERA_HEIGHT_M = 1.6
 HORIZON = 0.42
 """Row of the horizon as a part of the image height: nuScenes-like crops show more
 road than sky. The cameras look along the horizon (no pitch, no roll)."""
-SMALLEST_SIDE_PX, LARGEST_SIDE_PX = 16, 4096
-
-
+SIDES_PX = (16, 4096)
 CameraName = Literal[
     "FRONT", "FRONT_LEFT", "FRONT_RIGHT", "BACK", "BACK_LEFT", "BACK_RIGHT"
 ]
@@ -68,12 +66,11 @@ class CameraRig:
     width: int = 160
 
     def __post_init__(self) -> None:
+        low, high = SIDES_PX
         for name, side in (("height", self.height), ("width", self.width)):
-            if not SMALLEST_SIDE_PX <= side <= LARGEST_SIDE_PX:
-                raise EvaluationError(
-                    f"camera {name} {side} px is out of range: "
-                    f"{SMALLEST_SIDE_PX} to {LARGEST_SIDE_PX} px"
-                )
+            if not low <= side <= high:
+                words = f"camera {name} {side} px is out of range: {low} to {high} px"
+                raise EvaluationError(words)
 
     @cached_property
     def focals_px(self) -> Floats:
@@ -118,7 +115,7 @@ class CameraRig:
         depth in metres and (u, v) the continuous pixel (column, row).
         """
         matrices = np.zeros((len(CAMERAS), 4, 4))
-        # a point p of the ego frame is R (p - position) in the camera frame
+        # A point p of the ego frame is R (p - position) in the camera frame
         moved = -np.einsum("kij,kj->ki", self.rotations, self.positions)
         matrices[:, :3, :3] = self.intrinsics @ self.rotations
         matrices[:, :3, 3] = np.einsum("kij,kj->ki", self.intrinsics, moved)
@@ -169,13 +166,11 @@ DRAWN = ("clear",) * 8 + ("rain", "night", "fog", "dirt")
 
 
 def drawn_weather(kind: str, strength: float, seed: int) -> Weather:
-    """Return weather of `DRAWN`; the strength is 0 to 1."""
-    if kind == "rain":
-        return Weather(rain=0.3 + 0.7 * strength, seed=seed)
-    if kind == "night":
-        return Weather(night=0.5 + 0.5 * strength)
-    if kind == "fog":
-        return Weather(fog_m=round(150.0 - 90.0 * strength, 1))
-    if kind == "dirt":
-        return Weather(brightness=1.0 - 0.4 * strength, noise=12.0 * strength)
-    return CLEAR
+    """Return the weather of a kind in `DRAWN` at a strength from 0 to 1."""
+    drawn = {
+        "rain": Weather(rain=0.3 + 0.7 * strength, seed=seed),
+        "night": Weather(night=0.5 + 0.5 * strength),
+        "fog": Weather(fog_m=round(150.0 - 90.0 * strength, 1)),
+        "dirt": Weather(brightness=1.0 - 0.4 * strength, noise=12.0 * strength),
+    }
+    return drawn.get(kind, CLEAR)

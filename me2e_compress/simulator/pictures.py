@@ -167,11 +167,6 @@ class RoutePicture:
         return tuple(dict.fromkeys(e for e in events if e.kind in INFRACTIONS))
 
     @cached_property
-    def trail(self) -> Floats:
-        """[N, 2] positions of the ego, world metres."""
-        return np.array([(m.scene.ego.x, m.scene.ego.y) for m in self.moments])
-
-    @cached_property
     def _map(self) -> Image.Image:
         """The class raster in the figure's colours, at half its resolution."""
         palette = np.zeros((256, 3), np.uint8)
@@ -184,9 +179,10 @@ class RoutePicture:
         moment, ego = self.moments[index], self.moments[index].scene.ego
         corner = self.texture.west_m, self.texture.north_m
         view = View(self._map, corner, ego, size)
-        # layers, what matters most last
+        # Draw layer by layer, what matters most last
         view.line(self.route, ROUTE, 2)
-        view.line(self.trail[: index + 1], TRAIL, 3)
+        driven = (past.scene.ego for past in self.moments[: index + 1])
+        view.line([(past.x, past.y) for past in driven], TRAIL, 3)
         for signal in moment.scene.signals:
             view.signal(signal)
         for actor in moment.scene.actors:

@@ -1,10 +1,8 @@
 """Geometry of a route and of the roads around it, in the right-handed plane."""
 
-from collections.abc import Iterable
 from dataclasses import dataclass
 from enum import IntEnum, StrEnum
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -80,10 +78,9 @@ class Roadmap:
         starts = np.concatenate([lane.centre[:-1] for lane in self.lanes])
         steps = np.concatenate([np.diff(lane.centre, axis=0) for lane in self.lanes])
         lengths = np.hypot(steps[:, 0], steps[:, 1])
-        half_widths = [
-            np.full(len(lane.centre) - 1, lane.width / 2) for lane in self.lanes
-        ]
-        return starts, steps / lengths[:, None], lengths, np.concatenate(half_widths)
+        chords = [len(lane.centre) - 1 for lane in self.lanes]
+        half_widths = np.repeat([lane.width / 2 for lane in self.lanes], chords)
+        return starts, steps / lengths[:, None], lengths, half_widths
 
 
 @dataclass(frozen=True, eq=False)
@@ -166,8 +163,7 @@ class RoutePath:
 
     def command_at(self, s_m: float) -> Command:
         """Return the navigation command at an arc length."""
-        i = int(np.clip(s_m, 0, len(self.commands) - 1))
-        return Command(int(self.commands[i]))
+        return Command(self.commands[int(np.clip(s_m, 0, len(self.commands) - 1))])
 
     @cached_property
     def curvature(self) -> Floats:
@@ -188,8 +184,7 @@ def resample(points: Floats, spacing_m: float) -> Floats:
     steps = np.hypot(*np.diff(points, axis=0).T)
     arc = np.concatenate([[0.0], np.cumsum(steps)])
     stations = np.arange(0.0, arc[-1] + 1e-9, spacing_m)
-    columns: Iterable[Floats] = (np.interp(stations, arc, c) for c in points.T)
-    return np.stack(list(columns), axis=1)
+    return np.stack([np.interp(stations, arc, c) for c in points.T], axis=1)
 
 
 # Boxes in the plane: rows of x, y, heading, length and width, metres and radians.
@@ -244,11 +239,10 @@ def contact_times(one: Floats, other: Floats, approach: Floats) -> Floats:
 
 def _along_axes(one: Floats, other: Floats, vectors: Floats) -> Floats:
     """Return [..., 4] vectors along and across the first box and the other."""
-    columns: list[Any] = []
+    columns, (x, y) = list[Floats](), np.moveaxis(vectors, -1, 0)
     for box in (one, other):
         cos, sin = np.cos(box[..., 2]), np.sin(box[..., 2])
-        columns.append(vectors[..., 0] * cos + vectors[..., 1] * sin)
-        columns.append(vectors[..., 1] * cos - vectors[..., 0] * sin)
+        columns += [x * cos + y * sin, y * cos - x * sin]
     return np.stack(columns, axis=-1)
 
 
@@ -256,7 +250,7 @@ def _room(one: Floats, other: Floats) -> Floats:
     """Return [..., 4] centre distances at contact, on each axis."""
     turn = other[..., 2] - one[..., 2]
     cos, sin = np.abs(np.cos(turn)), np.abs(np.sin(turn))
-    columns = []
+    columns = list[Floats]()
     for box, second in ((one, other), (other, one)):
         length, width = second[..., 3], second[..., 4]
         columns.append((box[..., 3] + length * cos + width * sin) / 2)

@@ -9,7 +9,7 @@ namesake in scenario_runner, on our roads; its layout or script says where it di
 import hashlib
 import json
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
@@ -126,9 +126,8 @@ class Route:
 
     def record(self) -> dict[str, Any]:
         """Return it as files and digests hold it, with its type's first ability."""
-        own = asdict(self)
-        named = {"id": own.pop("id"), "scenario": own.pop("scenario")}
-        return {**named, "ability": self.abilities[0], **own, **GENERATION}
+        named = {"id": self.id, "scenario": self.scenario, "ability": self.abilities[0]}
+        return {**named, "seed": self.seed, "parameters": self.parameters, **GENERATION}
 
 
 def is_route_id(text: str) -> bool:
@@ -137,7 +136,6 @@ def is_route_id(text: str) -> bool:
 
 
 _MANIFEST = TypeAdapter(list[Route])
-_RECORDS = TypeAdapter(list[dict[str, Any]])
 
 
 def load_routes(path: Path = SHIPPED) -> tuple[Route, ...]:
@@ -150,17 +148,17 @@ def load_routes(path: Path = SHIPPED) -> tuple[Route, ...]:
     with documents.reading(path, EvaluationError, "not routes"):
         content = documents.read_bytes(path)
         routes = _MANIFEST.validate_json(content, strict=True)
-        records = _RECORDS.validate_json(content)
-    # a set of this road, as it was admitted
+    # Check that they are a set of this road, as it was admitted
     if routes:
-        check_version(path, records[0].get(VERSION))
-    if routes and records[0].get(DIGEST) != digest_of(routes):
-        raise EvaluationError(
-            f"{path}: changed after its routes were admitted (its {DIGEST} does not fit"
-            " them); python -m benchmarks.tools.admit_routes of the repository makes"
-            " a set"
-        )
-    # ids are unique
+        first = json.loads(content)[0]
+        check_version(path, first.get(VERSION))
+        if first.get(DIGEST) != digest_of(routes):
+            raise EvaluationError(
+                f"{path}: changed after its routes were admitted (its {DIGEST} does not"
+                " fit them); python -m benchmarks.tools.admit_routes of the repository"
+                " makes a set"
+            )
+    # Check that ids are unique
     seen: dict[str, int] = {}
     for index, route in enumerate(routes):
         if route.id in seen:
@@ -194,8 +192,8 @@ def save_routes(routes: Sequence[Route], path: Path) -> None:
     """Write a manifest atomically, one route a line."""
     records = [route.record() for route in routes]
     made = {VERSION: ROAD_VERSION, DIGEST: digest_of(routes)}
-    mark: dict[str, Any] = IN_JSON | made
-    records[:1] = [mark | each for each in records[:1]]  # a list has no other place
+    if records:  # a list has no other place for what holds for all
+        records[0] = {**IN_JSON, **made, **records[0]}
     lines = ",\n".join(map(json.dumps, records))
     with drafts.writing_errors(path, EvaluationError):
         write_bytes(path, f"[\n{lines}\n]\n".encode())

@@ -216,16 +216,7 @@ class World:
 
 def _actor(body: Car | Walker | StaticObject) -> Actor:
     x, y = body.position.tolist()
-    return Actor(
-        body.id,
-        body.kind,
-        x,
-        -y,
-        -float(body.heading),
-        float(body.speed),
-        float(body.LENGTH),
-        float(body.WIDTH),
-        float(body.height),
-        bool(body.braking),
-        body.indicator,
-    )
+    pose = (x, -y, -float(body.heading))
+    size = (float(body.LENGTH), float(body.WIDTH), float(body.height))
+    shown = (bool(body.braking), body.indicator)
+    return Actor(body.id, body.kind, *pose, float(body.speed), *size, *shown)

@@ -64,26 +64,20 @@ class GroundPlan:
     ) -> None:
         """Paint a band along a polyline [N, 2] of world points.
 
-        Piece by piece, since cv2 paints convex polygons without bias and others not.
-        Antialiased, it rounds them out by half a texel on each side: taken off here.
+        The band is painted piece by piece: cv2 fills convex polygons without bias, and
+        no others. Antialiasing widens a polygon by half a texel on each side, so the
+        colours' band is narrower by one texel.
         """
-        normals = left_of(line)
-        aliased = self._quads(line, normals, width_m)
-        smooth = self._quads(line, normals, width_m - RESOLUTION_M)
-        for sharp, soft in zip(aliased, smooth, strict=True):
-            cv2.fillConvexPoly(
-                self.classes, sharp, (int(kind),), cv2.LINE_8, SUBPIXEL_BITS
-            )
-            cv2.fillConvexPoly(self.colours, soft, colour, cv2.LINE_AA, SUBPIXEL_BITS)
-
-    def _quads(
-        self, line: Floats, normals: tuple[Floats, Floats], width_m: float
-    ) -> npt.NDArray[np.int32]:
-        """Return [N - 1, 4, 2], the pieces of a band."""
-        normal, length = normals
-        sides = (line + normal * (side * width_m / length) for side in (0.5, -0.5))
-        left, right = (fixed_point(self.texels(side)) for side in sides)
-        return np.stack([left[:-1], right[:-1], right[1:], left[1:]], axis=1)
+        normal, length = left_of(line)
+        bands = []
+        for metres in (width_m, width_m - RESOLUTION_M):
+            sides = (line + normal * (side * metres / length) for side in (0.5, -0.5))
+            left, right = (fixed_point(self.texels(side)) for side in sides)
+            bands.append(np.stack([left[:-1], right[:-1], right[1:], left[1:]], axis=1))
+        fill, label = cv2.fillConvexPoly, (int(kind),)
+        for sharp, soft in zip(*bands, strict=True):
+            fill(self.classes, sharp, label, cv2.LINE_8, SUBPIXEL_BITS)
+            fill(self.colours, soft, colour, cv2.LINE_AA, SUBPIXEL_BITS)
 
 
 def left_of(line: Floats) -> tuple[Floats, Floats]:
@@ -181,38 +175,34 @@ def paint_texture(roadmap: Roadmap, route: npt.NDArray[np.float64]) -> GroundTex
 
     The texture covers the bounding box of ``route``, [N, 2] metres, and 60 m around.
     """
-    # the raster's extent
+    # The raster's extent
     west, south = route.min(axis=0) - MARGIN_M
     east, north = route.max(axis=0) + MARGIN_M
-    # whole texels, divisible down to the coarsest level
+    # Whole texels, divisible down to the coarsest level
     coarsest = 1 << (LEVELS - 1)
     height, width = (
         int(np.ceil(span / RESOLUTION_M / coarsest)) * coarsest
         for span in (north - south, east - west)
     )
-    plan = GroundPlan(
-        west_m=float(west),
-        north_m=float(north),
-        colours=np.empty((height, width, 3), np.uint8),
-        classes=np.full((height, width), PixelClass.TERRAIN, np.uint8),
-    )
-    # from grass up: lanes, grain, then everything painted on top
-    plan.colours[0] = GRASS
-    plan.colours[1:] = plan.colours[0]
+    colours = np.empty((height, width, 3), np.uint8)
+    classes = np.full((height, width), PixelClass.TERRAIN, np.uint8)
+    plan = GroundPlan(float(west), float(north), colours, classes)
+    # Paint from the grass up: lanes, grain, then everything on top
+    colours[0] = GRASS
+    colours[1:] = colours[0]
     paint_lanes(plan, roadmap)
     _add_grain(plan, np.random.default_rng(0))
     paint_markings(plan, roadmap)
     for ends in roadmap.stop_lines:
         plan.strip(np.array(ends, float), STOP_LINE_M, WHITE, PixelClass.STOP_LINE)
     paint_crosswalks(plan, roadmap)
-    # mip levels: halve again and again; sizes are divisible, so texels nest exactly
-    levels = [np.asarray(cv2.cvtColor(plan.colours, cv2.COLOR_RGB2RGBA), np.uint8)]
-    while len(levels) < LEVELS:
-        height, width = levels[-1].shape[:2]
-        size, how = (width // 2, height // 2), cv2.INTER_AREA
+    # Mip levels: halve again and again; sizes are divisible, so texels nest exactly
+    levels = [np.asarray(cv2.cvtColor(colours, cv2.COLOR_RGB2RGBA), np.uint8)]
+    for k in range(1, LEVELS):
+        size, how = (width >> k, height >> k), cv2.INTER_AREA
         half = cv2.resize(levels[-1], size, interpolation=how)
         levels.append(np.asarray(half, np.uint8))
-    return GroundTexture(plan.west_m, plan.north_m, tuple(levels), plan.classes)
+    return GroundTexture(plan.west_m, plan.north_m, tuple(levels), classes)
 
 
 def _add_grain(plan: GroundPlan, rng: np.random.Generator) -> None:
@@ -318,12 +308,6 @@ class GroundSampler:
         position = self.rig.positions[:, None, None, :2]
         return np.asarray(position + depth * (forward + tangent * right))
 
-    @cached_property
-    def distances_m(self) -> Floats:
-        """[6, H, W] along the ground from the camera to each pixel; `SKY_M` for sky."""
-        offset = self.places - self.rig.positions[:, None, None, :2]
-        return np.asarray(np.hypot(offset[..., 0], offset[..., 1]))
-
     def _coordinates(
         self, group: RowGroup, texture: GroundTexture, ego: Ego
     ) -> tuple[Floats32, Floats32]:
@@ -357,17 +341,22 @@ class GroundSampler:
     def _group(
         self, camera: npt.NDArray[np.intp], row: npt.NDArray[np.intp], taps: int
     ) -> RowGroup:
-        # rows sorted by mip level, so that each level is one slice
-        levels = self._levels(camera, row, taps)
+        # The mip level at which neither columns nor samples skip texels
+        depth = row_depths(self.rig, 1)[0, camera, row]
+        across = depth / self.rig.focals_px[camera]
+        along = across * depth / CAMERA_HEIGHT_M / taps
+        texels = np.maximum(across, BLUR * along) / RESOLUTION_M
+        levels = np.clip(np.log2(texels).astype(np.intp), 0, LEVELS - 1)
+        # Sort the rows by level, so that each level is one slice
         order = np.argsort(levels, kind="stable")
         camera, row, levels = camera[order], row[order], levels[order]
-        # start and step of each row on the ground
+        # Start and step of each row on the ground
         depth = row_depths(self.rig, taps)[:, camera, row][..., None]
         right = self.rig.rotations[camera, 0, :2]
         forward = self.rig.rotations[camera, 2, :2]
         steps = depth / self.rig.focals_px[camera, None] * right
         centre = self.rig.positions[camera, :2] + depth * forward
-        # slices of equal level
+        # Slices of equal level
         distinct, first = np.unique(levels, return_index=True)
         last = [*first[1:].tolist(), len(levels)]
         shape = (len(levels), taps, self.rig.width)
@@ -380,16 +369,6 @@ class GroundSampler:
             coordinates=(np.empty(shape, np.float32), np.empty(shape, np.float32)),
             samples=np.empty((*shape, 4), np.uint8),
         )
-
-    def _levels(
-        self, camera: npt.NDArray[np.intp], row: npt.NDArray[np.intp], taps: int
-    ) -> npt.NDArray[np.intp]:
-        """Return the mip level at which neither columns nor samples skip texels."""
-        depth = row_depths(self.rig, 1)[0, camera, row]
-        across = depth / self.rig.focals_px[camera]
-        along = across * depth / CAMERA_HEIGHT_M / taps
-        texels = np.maximum(across, BLUR * along) / RESOLUTION_M
-        return np.asarray(np.clip(np.log2(texels).astype(np.intp), 0, LEVELS - 1))
 
 
 def row_depths(rig: CameraRig, taps: int) -> Floats:

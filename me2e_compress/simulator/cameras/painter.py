@@ -9,7 +9,6 @@ two solids share columns of an image and their edges contradict it, the edges wi
 """
 
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -33,17 +32,6 @@ TOUCH_M = 0.05
 """Footprints that sink into each other by less still count as apart."""
 
 
-class Edges(NamedTuple):
-    """Corners [4, V], the outward normals of the edges after them and their places."""
-
-    x: Floats
-    y: Floats
-    normal_x: Floats
-    normal_y: Floats
-    at: Floats
-    """Position of the edge along its normal: negative if the camera is outside."""
-
-
 def painting_order(right: Floats, forward: Floats, visible: Flags) -> tuple[Ints, Ints]:
     """Order the visible solids of every camera from far to near.
 
@@ -54,12 +42,12 @@ def painting_order(right: Floats, forward: Floats, visible: Flags) -> tuple[Ints
     Returns:
         Camera and solid, [V] each: camera by camera, the first to paint first.
     """
-    # by distance, camera by camera
+    # Sort by distance, camera by camera
     nearest = np.hypot(right, forward).min(axis=1)
     camera, solid = np.nonzero(visible)
     order = np.lexsort((-nearest[camera, solid], camera))
     camera, solid = camera[order], solid[order]
-    # pairs in the same columns whose separating edges contradict the distance
+    # Pairs in the same columns whose separating edges contradict the distance
     x, y = right[camera, :, solid].T, forward[camera, :, solid].T
     bearing = np.arctan2(x, y)
     low, high = bearing.min(axis=0), bearing.max(axis=0)
@@ -69,10 +57,9 @@ def painting_order(right: Floats, forward: Floats, visible: Flags) -> tuple[Ints
     first, second = np.nonzero(np.triu(shared, 1))
     if len(first) == 0:
         return camera, solid
-    edges = _edges(x, y)
-    before, after = _hides(edges, first, second)
+    before, after = _hides(x, y, first, second)
     wrong = after & ~before
-    # sort the cameras with such a pair anew, by the edges
+    # Sort the cameras with such a pair anew, by the edges
     for k in np.unique(camera[first[wrong]]).tolist():
         begin, end = np.searchsorted(camera, [k, k + 1]).tolist()
         behind = np.zeros((end - begin, end - begin), np.bool_)
@@ -84,32 +71,30 @@ def painting_order(right: Floats, forward: Floats, visible: Flags) -> tuple[Ints
     return camera, solid
 
 
-def _edges(x: Floats, y: Floats) -> Edges:
+def _hides(x: Floats, y: Floats, first: Ints, second: Ints) -> tuple[Flags, Flags]:
+    """Return whether an edge shows that second[i], or first[i], is the nearer solid.
+
+    Either an edge of the farther solid has both the camera and the nearer one outside,
+    or an edge of the nearer one has the camera inside. ``x`` and ``y`` are corners
+    [4, V].
+    """
+    # Outward normals of the edges that follow the corners
     following = [1, 2, 3, 0]
     normal_x, normal_y = y[following] - y, x - x[following]
     length = np.maximum(np.hypot(normal_x, normal_y), 1e-9)
     normal_x, normal_y = normal_x / length, normal_y / length
-    return Edges(x, y, normal_x, normal_y, normal_x * x + normal_y * y)
-
-
-def _hides(edges: Edges, first: Ints, second: Ints) -> tuple[Flags, Flags]:
-    """Return whether an edge shows that second[i], or first[i], is the nearer solid.
-
-    Either an edge of the farther solid has both the camera and the nearer one outside,
-    or an edge of the nearer one has the camera inside.
-    """
-    one, other = _outside(edges, first, second), _outside(edges, second, first)
-    out_one, out_other = (edges.at[:, solid] < 0.0 for solid in (first, second))
-    before = (one & out_one) | (other & ~out_other)
-    after = (other & out_other) | (one & ~out_one)
+    # Where an edge lies along its normal: negative if the camera is outside
+    at = normal_x * x + normal_y * y
+    # [4, P] edges of one footprint with all corners of the other outside
+    outside = []
+    for one, other in ((first, second), (second, first)):
+        reach = normal_x[:, None, one] * x[:, other]
+        reach += normal_y[:, None, one] * y[:, other]
+        outside.append(reach.min(axis=1) - at[:, one] > -TOUCH_M)
+    camera_outside = [at[:, solid] < 0.0 for solid in (first, second)]
+    before = (outside[0] & camera_outside[0]) | (outside[1] & ~camera_outside[1])
+    after = (outside[1] & camera_outside[1]) | (outside[0] & ~camera_outside[0])
     return np.asarray(before.any(axis=0)), np.asarray(after.any(axis=0))
-
-
-def _outside(edges: Edges, of: Ints, other: Ints) -> Flags:
-    """Return [4, P]: all corners of one footprint lie outside each edge of another."""
-    reach = edges.normal_x[:, None, of] * edges.x[:, other]
-    reach += edges.normal_y[:, None, of] * edges.y[:, other]
-    return np.asarray(reach.min(axis=1) - edges.at[:, of] > -TOUCH_M)
 
 
 def _sorted(behind: Flags) -> list[int]:
@@ -241,6 +226,7 @@ class Painter:
     def _polygons(
         self, points: Floats, pixels: Floats, camera: Ints
     ) -> list[npt.NDArray[np.int32]]:
+        """Return the pixels of faces, which are cut where they cross the near plane."""
         polygons = list(_fixed(pixels.transpose(2, 1, 0)))
         for i in np.flatnonzero((points[2] < NEAR_M).any(axis=0)).tolist():
             kept = _cut(points[:, :, i].T.tolist())

@@ -74,8 +74,9 @@ class Atmosphere:
     @cached_property
     def _pixels(self) -> tuple[npt.NDArray[np.float32], Bytes]:
         """Factor and summand for every pixel of the stacked images [6 * H, W, 3]."""
-        distance = self.ground.distances_m
         x, y = np.moveaxis(self.ground.places, -1, 0)
+        camera_x, camera_y = self.ground.rig.positions[:, :2, None, None].swapaxes(0, 1)
+        distance = np.hypot(x - camera_x, y - camera_y)
         light = np.where(distance < SKY_M, self._light(x, y), self._daylight)
         through = self._through(distance)[..., None]
         gain = np.broadcast_to(light[..., None] * through, (*light.shape, 3))

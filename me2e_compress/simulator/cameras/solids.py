@@ -85,19 +85,18 @@ def van(*, beacon: bool) -> Template:
     roof, front = (0.92 if beacon else 1.0), ((-0.5, 0.42), (-0.5, 0.3))
     upper = Box(front[0], FULL, (0.5, roof), Slot.BODY, front[1], (-0.47, 0.47))
     decals = _lamps(body, (0.5, 0.85), 0.16)
-    if beacon:
-        decals += [
-            body.on(f, (0.0, 1.0), (0.8, 1.0), Slot.STRIPE) for f in ("left", "right")
-        ]
+    for side in ("left", "right") if beacon else ():
+        decals.append(body.on(side, (0.0, 1.0), (0.8, 1.0), Slot.STRIPE))
     decals += _wheels(body, (0.19, 0.81), 0.07, 0.45)
     # upper body with its windows
-    glass = [upper.on("front", (0.07, 0.93), (0.1, 0.85), Slot.GLASS)]
-    glass += [upper.on("right", (0.68, 0.95), (0.2, 0.8), Slot.GLASS)]
-    glass += [upper.on("left", (0.05, 0.32), (0.2, 0.8), Slot.GLASS)]
-    glass += [
-        upper.on("back", u, (0.35, 0.85), Slot.GLASS)
-        for u in ((0.08, 0.47), (0.53, 0.92))
-    ]
+    windows = (
+        ("front", (0.07, 0.93), (0.1, 0.85)),
+        ("right", (0.68, 0.95), (0.2, 0.8)),
+        ("left", (0.05, 0.32), (0.2, 0.8)),
+        ("back", (0.08, 0.47), (0.35, 0.85)),
+        ("back", (0.53, 0.92), (0.35, 0.85)),
+    )
+    glass = [upper.on(*window, Slot.GLASS) for window in windows]
     glass.append(upper.on("back", (0.4, 0.6), (0.9, 1.0), Slot.THIRD_LAMP))
     quads = [VEHICLE_SHADOW, *body.quads(decals), *upper.quads(glass)]
     if beacon:

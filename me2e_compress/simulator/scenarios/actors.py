@@ -9,11 +9,11 @@ from me2e_compress.simulator.scenarios.flows import (
     encounter,
     hold,
     keep_clear,
-    met,
+    meet,
     near,
     release,
     stand,
-    steps_out,
+    step_out,
     stream,
 )
 from me2e_compress.simulator.scenarios.roads import BEFORE_M, Ramp, Street
@@ -40,7 +40,7 @@ def crashed_cars(stage: Stage, street: Street) -> Script:
         place = stage.route_pose(s + 8.0 + 7.0 * k, aside)
         stage.static_object(ActorKind.PARKED, place.turned(askew))
     stage.static_object(ActorKind.EMERGENCY, stage.route_pose(s))
-    yield from met(stage, s, "crashed_cars")
+    yield from meet(stage, s, "crashed_cars")
 
 
 def construction(stage: Stage, street: Street) -> Script:
@@ -49,14 +49,13 @@ def construction(stage: Stage, street: Street) -> Script:
     keep_clear(stage, street.ahead(), s)
     length = stage.uniform("works_m", 8.0, 14.0)
     for k in range(4):
-        stage.static_object(
-            ActorKind.CONE, stage.route_pose(s + 2.0 * k, -1.4 + 0.8 * k)
-        )
+        place = stage.route_pose(s + 2.0 * k, -1.4 + 0.8 * k)
+        stage.static_object(ActorKind.CONE, place)
     for along in (9.0, 9.0 + length):
         stage.static_object(ActorKind.BARRIER, stage.route_pose(s + along))
     for k in range(int(length // 3)):
         stage.static_object(ActorKind.CONE, stage.route_pose(s + 10.5 + 3.0 * k, 1.3))
-    yield from met(stage, s, "construction")
+    yield from meet(stage, s, "construction")
 
 
 def parked_car(stage: Stage, street: Street) -> Script:
@@ -66,7 +65,7 @@ def parked_car(stage: Stage, street: Street) -> Script:
     kind = ActorKind(stage.choice("obstacle", ("parked", "van", "truck")))
     aside = stage.uniform("aside_m", 0.0, 0.6) * -free_side(stage)
     stage.static_object(kind, stage.route_pose(s, aside))
-    yield from met(stage, s, "parked_car")
+    yield from meet(stage, s, "parked_car")
 
 
 TOGETHER = Behaviour(headway_s=0.4, jam_gap_m=1.5)
@@ -81,10 +80,8 @@ def slow_cyclists(stage: Stage, street: Street) -> Script:
     last: Car | None = None
     keep_clear(stage, street.ahead(), first + 60.0)
     for k in range(count):
-        s = BEFORE_M + first + 4.5 * k
-        rider = stage.car(
-            street.ahead(), s, speed, speed, ActorKind.BICYCLE, behaviour=TOGETHER
-        )
+        s, kind = BEFORE_M + first + 4.5 * k, ActorKind.BICYCLE
+        rider = stage.car(street.ahead(), s, speed, speed, kind, TOGETHER)
         rider.offset_m = -0.8
         right = rider.pose.moved(0.0, -0.8)
         rider.position[:] = (right.x, -right.y)
@@ -103,9 +100,8 @@ def opening_door(stage: Stage, street: Street) -> Script:
         stage.static_object(ActorKind.PARKED, stage.route_pose(s + 6.5 * k, side))
     yield from near(stage, s)
     hinge = side + 1.95 / 2
-    door = stage.static_object(
-        ActorKind.DOOR, stage.route_pose(s + 0.6, hinge + 0.6), (0.2, 1.2, 1.2)
-    )
+    pose = stage.route_pose(s + 0.6, hinge + 0.6)
+    door = stage.static_object(ActorKind.DOOR, pose, (0.2, 1.2, 1.2))
     stage.fire("opening_door", door)
 
 
@@ -191,16 +187,14 @@ def queue_cut_in(stage: Stage, street: Street) -> Script:
     # a standing queue with room ahead of the car that leaves it
     for index in (lane, street.lane):
         keep_clear(stage, street.ahead(index), s)
-    cutter: Car | None = None
-    for aside in (-14.0, -7.0, 0.0, 11.0, 18.0):
-        car = stage.car(chain, BEFORE_M + s + aside, 0.0)
+    places = (-14.0, -7.0, 0.0, 11.0, 18.0)
+    queue = [stage.car(chain, BEFORE_M + s + aside, 0.0) for aside in places]
+    for car in queue:
         stand(car)
-        cutter = car if aside == 0.0 else cutter
     # leave when the ego is near
     yield from near(stage, s - 2.0)
-    if cutter is not None:
-        side = 1 if street.lane < lane else -1
-        yield from _cut_in(stage, cutter, street.ahead(), side, "queue_cut_in", crawl_s)
+    side = 1 if street.lane < lane else -1
+    yield from _cut_in(stage, queue[2], street.ahead(), side, "queue_cut_in", crawl_s)
 
 
 def ramp_cut_in(stage: Stage, ramp: Ramp) -> Script:
@@ -243,9 +237,7 @@ def queue_at_light(stage: Stage, crossing: Crossing) -> Script:
         for k in range(count)
     ]
     tail = line - 3.5 - 7.0 * (count - 1) - 2.5
-    while stage.ahead_m(tail) > 35.0:
-        yield
-    stage.fire("queue_at_light", queue[-1])
+    yield from meet(stage, tail, "queue_at_light", queue[-1], 35.0)
 
 
 def blocked_exit(stage: Stage, crossing: Crossing) -> Script:
@@ -263,9 +255,7 @@ def blocked_exit(stage: Stage, crossing: Crossing) -> Script:
     stage.play(leave())
     pose = truck.pose
     s, _ = stage.path.project(pose.x, pose.y)
-    while stage.ahead_m(s) > 40.0:
-        yield
-    stage.fire("blocked_exit", truck)
+    yield from meet(stage, s, "blocked_exit", truck, 40.0)
 
 
 def _cut_in(
@@ -299,8 +289,7 @@ def walker_behind_van(stage: Stage, _: Street) -> Script:
     van = stage.route_pose(s - 5.0, -(HALF_LANE_M + 1.1))
     stage.static_object(ActorKind.VAN, van)
     walker = _across_route(stage, s, speed, -(HALF_LANE_M + 2.2), 6.5)
-    yield from steps_out(stage, walker, s)
-    stage.fire("walker_behind_van", walker)
+    yield from step_out(stage, walker, s, "walker_behind_van")
 
 
 def walker_between_cars(stage: Stage, _: Street) -> Script:
@@ -311,8 +300,7 @@ def walker_between_cars(stage: Stage, _: Street) -> Script:
         pose = stage.route_pose(s + aside, -(HALF_LANE_M + 1.3))
         stage.static_object(ActorKind.PARKED, pose)
     walker = _across_route(stage, s, speed, -(HALF_LANE_M + 2.4), 7.0)
-    yield from steps_out(stage, walker, s)
-    stage.fire("walker_between_cars", walker)
+    yield from step_out(stage, walker, s, "walker_between_cars")
 
 
 def walkers_on_zebra(stage: Stage, _: Street) -> Script:
@@ -398,10 +386,9 @@ def _cross_exit(
         stop = crossing.arm(crossing.move, out_m, -side * end)
         line = np.array([[begin.x, begin.y], [stop.x, stop.y]])
         people.append(stage.walker(kind, line, speed))
-    yield from steps_out(stage, people[1], route_s)
+    yield from step_out(stage, people[1], route_s, name)
     for walker in people:
         walker.going = True
-    stage.fire(name, people[1])
 
 
 def _across_route(

@@ -22,7 +22,7 @@ from me2e_compress.simulator.scenarios.crossings import (
 from me2e_compress.simulator.scenarios.flows import Traffic, stream
 from me2e_compress.simulator.scene import ActorKind, SignalKind, SignalState
 from me2e_compress.simulator.traffic.network import LaneIndex, LaneTable, Network
-from me2e_compress.simulator.traffic.stage import Stage
+from me2e_compress.simulator.traffic.stage import Script, Stage
 
 # Background of a route: traffic on every lane, people beside it.
 
@@ -47,10 +47,8 @@ OFF_M, END_M = 0.5, 10
 def populate(stage: Stage) -> None:
     """Put traffic on every lane that no script uses, and people beside the roads."""
     network, schedule = stage.network, stage.schedule
-    calm, fast = (
-        stage.uniform("gap_s", *GAP_S),
-        stage.uniform("fast_gap_s", *FAST_GAP_S),
-    )
+    calm = stage.uniform("gap_s", *GAP_S)
+    fast = stage.uniform("fast_gap_s", *FAST_GAP_S)
     for entry in entries(network):
         if entry in schedule.claimed:
             continue
@@ -93,8 +91,8 @@ def _successors(network: Network) -> dict[LaneIndex, list[LaneIndex]]:
     successors: dict[LaneIndex, list[LaneIndex]] = {}
     for index in lanes:
         away = np.hypot(*(begins - network.centre(index)[-1]).T)
-        successors[index] = [lanes[i] for i in np.flatnonzero(away < 0.5).tolist()]
-        successors[index] = [each for each in successors[index] if each[0] == index[1]]
+        nearby = [lanes[i] for i in np.flatnonzero(away < 0.5).tolist()]
+        successors[index] = [lane for lane in nearby if lane[0] == index[1]]
     return successors
 
 
@@ -171,9 +169,19 @@ SIDE_ROAD = partial(junction, sign=SignalKind.GIVE_WAY, arms=("left", "back", "r
 """The ego comes out of a side road."""
 
 
-def lights(moves: tuple[str, ...]) -> Callable[[Stage], Crossing]:
-    """Return the layout of a junction with lights, at which the ego has green."""
-    return partial(signal_junction, moves=moves)
+def lights(
+    moves: tuple[str, ...], ego_light: SignalState | None = SignalState.GREEN
+) -> Callable[[Stage], Crossing]:
+    """Return the layout of a junction with lights; see `signal_junction`."""
+    return partial(signal_junction, moves=moves, ego_light=ego_light)
+
+
+def overtaking(
+    obstacle: Callable[[Stage, roads.Street], Script],
+    road: Callable[[Stage], roads.Street] = roads.two_way,
+) -> tuple[Callable[..., Any], ...]:
+    """Return a two-way road with an obstacle, and oncoming cars in the lane beside."""
+    return road, obstacle, actors.oncoming_cars
 
 
 def give_way(moves: tuple[str, ...]) -> Callable[[Stage], Crossing]:
@@ -191,26 +199,14 @@ FROM_SIDE = partial(flows.FROM_LEFT, cars=False)
 SCENARIOS: dict[str, tuple[Callable[..., Any], ...]] = {
     # something stands or crawls in the lane: go round it
     "Accident": (roads.multilane, actors.crashed_cars),
-    "AccidentTwoWays": (roads.two_way, actors.crashed_cars, actors.oncoming_cars),
+    "AccidentTwoWays": overtaking(actors.crashed_cars),
     "ConstructionObstacle": (roads.multilane, actors.construction),
-    "ConstructionObstacleTwoWays": (
-        roads.two_way,
-        actors.construction,
-        actors.oncoming_cars,
-    ),
+    "ConstructionObstacleTwoWays": overtaking(actors.construction),
     "HazardAtSideLane": (roads.multilane, actors.slow_cyclists),
-    "HazardAtSideLaneTwoWays": (
-        roads.two_way,
-        actors.slow_cyclists,
-        actors.oncoming_cars,
-    ),
+    "HazardAtSideLaneTwoWays": overtaking(actors.slow_cyclists),
     "ParkedObstacle": (roads.bend, actors.parked_car),
-    "ParkedObstacleTwoWays": (roads.two_way, actors.parked_car, actors.oncoming_cars),
-    "VehicleOpensDoorTwoWays": (
-        roads.parking_street,
-        actors.opening_door,
-        actors.oncoming_cars,
-    ),
+    "ParkedObstacleTwoWays": overtaking(actors.parked_car),
+    "VehicleOpensDoorTwoWays": overtaking(actors.opening_door, roads.parking_street),
     # join, cross or leave moving traffic; latecomers may ignore the ego's green
     "CrossingBicycleFlow": (lights(TURNS), actors.bicycle_stream),
     "EnterActorFlow": (roundabout, flows.ring_flow),
@@ -238,10 +234,7 @@ SCENARIOS: dict[str, tuple[Callable[..., Any], ...]] = {
         partial(flows.TO_ENTER, late=True),
     ),
     # another road user appears suddenly
-    "BlockedIntersection": (
-        partial(signal_junction, moves=MOVES, ego_light=None),
-        actors.blocked_exit,
-    ),
+    "BlockedIntersection": (lights(MOVES, None), actors.blocked_exit),
     "DynamicObjectCrossing": (roads.two_way, actors.walker_behind_van),
     "HardBreakRoute": (roads.single_lane, actors.hard_brake),
     "OppositeVehicleTakingPriority": (STRAIGHT_ON, flows.crossing_car),
@@ -250,10 +243,7 @@ SCENARIOS: dict[str, tuple[Callable[..., Any], ...]] = {
     "PedestrianCrossing": (roads.zebra_street, actors.walkers_on_zebra),
     "ParkingCrossingPedestrian": (roads.parking_street, actors.walker_between_cars),
     "StaticCutIn": (roads.multilane, actors.queue_cut_in),
-    "VehicleTurningRoute": (
-        partial(signal_junction, moves=TURNS, ego_light=None),
-        actors.cyclists_on_exit,
-    ),
+    "VehicleTurningRoute": (lights(TURNS, None), actors.cyclists_on_exit),
     "VehicleTurningRoutePedestrian": (
         partial(crosswalk_junction, moves=TURNS),
         actors.pedestrians_on_exit,
@@ -270,7 +260,7 @@ SCENARIOS: dict[str, tuple[Callable[..., Any], ...]] = {
     "VanillaNonSignalizedTurn": (give_way(TURNS), flows.priority_car),
     "VanillaSignalizedTurnEncounterGreenLight": (lights(TURNS), actors.queue_at_light),
     "VanillaSignalizedTurnEncounterRedLight": (
-        partial(signal_junction, moves=TURNS, ego_light=SignalState.RED),
+        lights(TURNS, SignalState.RED),
         flows.red_light,
     ),
     "VanillaNonSignalizedTurnEncounterStopsign": (

@@ -46,18 +46,25 @@ def meeting(stage: Stage, chain: Sequence[LaneIndex]) -> float:
     return float(i)
 
 
-def steps_out(stage: Stage, walker: Walker, route_s: float) -> Script:
+def step_out(stage: Stage, walker: Walker, route_s: float, name: str) -> Script:
     """Start a walker, who crosses the route at ``route_s``, once the ego is near."""
     walker.crosses = True
     yield from near(stage, route_s)
     walker.going = True
+    stage.fire(name, walker)
 
 
-def met(stage: Stage, route_s: float, name: str) -> Script:
-    """Note that the ego has come near a standing obstacle."""
-    while stage.ahead_m(route_s) > NEAR_M:
+def meet(
+    stage: Stage,
+    route_s: float,
+    name: str,
+    body: Car | None = None,
+    within_m: float = NEAR_M,
+) -> Script:
+    """Record the event of a script once the ego has come near a place."""
+    while stage.ahead_m(route_s) > within_m:
         yield
-    stage.fire(name)
+    stage.fire(name, body)
 
 
 def hold(stage: Stage, seconds: float) -> Script:
@@ -139,20 +146,18 @@ def stream(
     turns = np.array([any(rank % 3 for rank in several) for several in ranks])
     weights = np.where(turns, TURNING / len(chains), 1.0 - TURNING)
     clear = stage.clear.get(entry, (0.0, 0.0))
-    cars = list[Car]()
-    for time_s in arrival_times(
-        random, traffic.gap_s, -free_m / usual, traffic.platoons
-    ):
+    cars, begin_s = list[Car](), -free_m / usual
+    for time_s in arrival_times(random, traffic.gap_s, begin_s, traffic.platoons):
         chain = chains[int(random.choice(len(chains), p=weights / weights.sum()))]
         at = max(-time_s, 0.0) * usual
         car = _driver(stage, random, chain, at, traffic)
+        to_ego_m = math.hypot(*(car.position - stage.ego.position))
+        far_enough = to_ego_m >= EGO_ROOM_M + (car.LENGTH + stage.ego.LENGTH) / 2
         if time_s >= 0.0:
             schedule.add(time_s, car)
-        elif not clear[0] < at < clear[1] and (
-            math.hypot(*(car.position - stage.ego.position))
-            >= EGO_ROOM_M + (car.LENGTH + stage.ego.LENGTH) / 2
-            and is_free(car, [*stage.bodies, *stage.static_objects])
-        ):
+        elif clear[0] < at < clear[1] or not far_enough:
+            continue
+        elif is_free(car, [*stage.bodies, *stage.static_objects]):
             stage.bodies.append(car)
         else:
             continue
@@ -170,11 +175,11 @@ def _driver(
     """Draw one driver with a vehicle."""
     limit = float(stage.network.lane(chain[0]).speed_limit)
     heedless, slow, kind, reckless = random.random(4)
-    wanted = limit * random.uniform(0.85, 1.0)
+    wanted = limit * float(random.uniform(0.85, 1.0))
     if traffic.speed is not None:
-        wanted = random.uniform(*traffic.speed)
+        wanted = float(random.uniform(*traffic.speed))
     elif slow < SLOW:
-        wanted *= random.uniform(0.6, 0.75)
+        wanted *= float(random.uniform(0.6, 0.75))
     mind = Behaviour(
         acceleration_mps2=float(random.uniform(1.5, 3.0)),
         jam_gap_m=float(random.uniform(2.0, 3.5)),
@@ -188,7 +193,6 @@ def _driver(
         mind = replace(mind, headway_s=0.7, jam_gap_m=1.8, gap_s=0.5)
     vehicle = ActorKind.VAN if kind < 0.12 else ActorKind.CAR
     vehicle = ActorKind.TRUCK if kind > 0.93 else vehicle
-    wanted = float(wanted)
     car = stage.car(chain, s_m, wanted, wanted, vehicle, mind, comes=True)
     car.joins = list(traffic.joins) or None
     if traffic.blind_to_ego and random.random() < traffic.blind_to_ego:
@@ -233,10 +237,7 @@ def across(
 def encounter(
     stage: Stage, others: Sequence[Car | Walker], route_s: float | None, name: str
 ) -> Script:
-    """Note that the ego and one of some others are at a place together.
-
-    Without a place: wherever they meet.
-    """
+    """Record that the ego meets one of some others: at a place, or anywhere if None."""
     place = None if route_s is None else stage.route_pose(route_s)
     while True:
         yield
@@ -352,17 +353,15 @@ def bay_flow(stage: Stage, street: Street) -> Script:
 
 
 def red_light(stage: Stage, crossing: Crossing) -> Script:
-    """Note that the ego comes to a light that its plan holds red then."""
+    """Record that the ego comes to a light which its plan keeps red then."""
     line_s = crossing.signals["back"].line_s or crossing.approach_m
-    while stage.ahead_m(line_s) > 35.0:
-        yield
-    stage.fire("red_light")
+    yield from meet(stage, line_s, "red_light", within_m=35.0)
 
 
 def stop_sign(stage: Stage, crossing: Crossing) -> Script:
     """Wait for the ego at a stop sign without traffic: only the stop counts."""
     sign = crossing.signals["back"]
-    yield from met(stage, sign.line_s or crossing.approach_m, "stop_sign")
+    yield from meet(stage, sign.line_s or crossing.approach_m, "stop_sign")
 
 
 INVADING, INTO_M = 0.4, (0.9, 1.2)
@@ -397,8 +396,9 @@ is behind at the end: it may come too late to be let by."""
 def emergency_behind(stage: Stage, street: Street) -> Script:
     """Let an emergency vehicle come from behind that wants to pass.
 
-    It comes from a place that is drawn, and is judged at the end of the route.
-    scenario_runner's YieldToEmergencyVehicleTest only asks whether it is ahead then.
+    It starts at a random place; whether the ego yielded is decided at the end of the
+    route. scenario_runner's YieldToEmergencyVehicleTest only asks whether the vehicle
+    is ahead then.
     """
     lanes = street.ahead()
     mind = Behaviour(
@@ -407,20 +407,17 @@ def emergency_behind(stage: Stage, street: Street) -> Script:
     begin = BEFORE_M - stage.uniform("behind_m", 24.0, 56.0)
     car = stage.car(lanes, begin, 16.0, 20.0, ActorKind.EMERGENCY, mind)
     stream(stage, "same_way", [lanes], Traffic(SPARSE_S))
-    held = [0.0]
+    delay_s = 0.0
 
-    def judge() -> Event | None:
-        if held[0] < HELD_UP_S or stage.gap_m(car) > 0:
+    def yield_event() -> Event | None:
+        if delay_s < HELD_UP_S or stage.gap_m(car) > 0:
             return None
         return stage.event(EventKind.YIELD_EMERGENCY, "it was held up", car)
 
-    stage.at_goal.append(judge)
-    fired = False
+    stage.at_goal.append(yield_event)
     while True:
         yield
-        if not -HELD_UP_M < stage.gap_m(car) < 0:
-            continue
-        held[0] += 0.1
-        if not fired:
-            fired = True
-            stage.fire("emergency_behind", car)
+        if -HELD_UP_M < stage.gap_m(car) < 0:
+            if delay_s == 0.0:
+                stage.fire("emergency_behind", car)
+            delay_s += 0.1

@@ -82,9 +82,8 @@ class EgoVehicle(_Body, Vehicle):  # type: ignore[misc]  # highway-env is untype
         wheel = min(max(self.wanted.steering_rad, -MAX_STEERING_RAD), MAX_STEERING_RAD)
         follow = 1 - math.exp(-dt / ACCELERATION_LAG_S)
         self._thrust_mps2 += follow * (thrust - self._thrust_mps2)
-        self.steering_rad += (1 - math.exp(-dt / STEERING_LAG_S)) * (
-            wheel - self.steering_rad
-        )
+        turn_in = 1 - math.exp(-dt / STEERING_LAG_S)
+        self.steering_rad += turn_in * (wheel - self.steering_rad)
         # speed, limited by grip
         pushed = min(max(self._thrust_mps2, -self.grip_mps2), self.grip_mps2)
         before = float(self.speed)
@@ -100,9 +99,8 @@ class EgoVehicle(_Body, Vehicle):  # type: ignore[misc]  # highway-env is untype
         turn = mean * curvature * dt
         # pose, in highway-env's plane
         course = -self.heading + slip + turn / 2
-        self.position = self.position + mean * dt * flip(
-            math.cos(course), math.sin(course)
-        )
+        direction = flip(math.cos(course), math.sin(course))
+        self.position = self.position + mean * dt * direction
         self.heading -= turn
         self.speed = after
         self.acceleration_mps2 = (after - before) / dt
@@ -110,14 +108,14 @@ class EgoVehicle(_Body, Vehicle):  # type: ignore[misc]  # highway-env is untype
 
     def snapshot(self) -> Ego:
         """Return the state, right-handed."""
-        pose = self.pose
+        pose, speed = self.pose, float(self.speed)
         return Ego(
             pose.x,
             pose.y,
             pose.heading,
-            float(self.speed),
+            speed,
             self.acceleration_mps2,
-            float(self.speed) * self.yaw_rate_radps,
+            speed * self.yaw_rate_radps,
             self.yaw_rate_radps,
             self.steering_rad,
             float(self.LENGTH),
@@ -171,13 +169,9 @@ class Walker(_Body, Vehicle):  # type: ignore[misc]  # highway-env is untyped
         leg = min(max(bisect.bisect_right(ends, self.walked_m) - 1, 0), len(ends) - 2)
         dx, dy = xs[leg + 1] - xs[leg], ys[leg + 1] - ys[leg]
         self.heading = -math.atan2(dy, dx)
-        if self.walked_m >= ends[-1]:
-            self.position = flip(xs[-1], ys[-1])
-            return
         length, along = ends[leg + 1] - ends[leg], self.walked_m - ends[leg]
-        self.position = flip(
-            dx / length * along + xs[leg], dy / length * along + ys[leg]
-        )
+        x, y = dx / length * along + xs[leg], dy / length * along + ys[leg]
+        self.position = flip(xs[-1], ys[-1]) if self.done else flip(x, y)
 
     def rest(self) -> Floats:
         """Return [M, 2], the rest of its line from its position on."""
@@ -259,14 +253,7 @@ class Car(_Body, IDMVehicle):  # type: ignore[misc]  # highway-env is untyped
         behaviour: Behaviour | None = None,
     ) -> None:
         pose = network.pose(lanes[0], s_m)
-        super().__init__(
-            None,
-            flip(pose.x, pose.y),
-            -pose.heading,
-            speed_mps,
-            enable_lane_change=False,
-            timer=0.5,
-        )
+        super().__init__(None, flip(pose.x, pose.y), -pose.heading, speed_mps)
         self.become(id, kind)
         self.network = network
         self.speed: float = speed_mps
@@ -310,10 +297,9 @@ class Car(_Body, IDMVehicle):  # type: ignore[misc]  # highway-env is untyped
     def act(self, action: object = None) -> None:
         """Decide: follow the lane, keep the gap, obey the script."""
         # enter the next lane of the chain where the present one ends
-        s, r = self.road.seat(self, self.lanes[self.leg])
-        if self.leg + 1 < len(self.lanes) and s > self.network.length(
-            self.lanes[self.leg]
-        ):
+        lane = self.lanes[self.leg]
+        s, r = self.road.seat(self, lane)
+        if self.leg + 1 < len(self.lanes) and s > self.network.length(lane):
             self.leg += 1
             s, r = self.road.seat(self, self.lanes[self.leg])
         self.target_lane_index = self.lane_index = self.lanes[self.leg]

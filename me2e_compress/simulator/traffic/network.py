@@ -225,17 +225,16 @@ class LaneTable:
         lanes = network.lanes_dict()
         self.column: dict[LaneIndex, int] = {key: i for i, key in enumerate(lanes)}
         self.length: Floats = np.array([lane.length for lane in lanes.values()])
-        # straight and circular lanes apart, each as arrays
-        straight, circular = list[int](), list[int]()
-        for i, lane in enumerate(lanes.values()):
-            (straight if isinstance(lane, StraightLane) else circular).append(i)
-        self._straight: npt.NDArray[np.int64] = np.array(straight, dtype=np.int64)
-        self._circular: npt.NDArray[np.int64] = np.array(circular, dtype=np.int64)
-        values = list(lanes.values())
-        lines = [lane for lane in values if isinstance(lane, StraightLane)]
+        # Straight and circular lanes apart, each as arrays
+        is_line = np.array([isinstance(e, StraightLane) for e in lanes.values()], bool)
+        self._straight, self._circular = (
+            np.flatnonzero(is_line),
+            np.flatnonzero(~is_line),
+        )
+        lines = [lane for lane in lanes.values() if isinstance(lane, StraightLane)]
         self._start = np.array([lane.start for lane in lines]).reshape(-1, 2)
         self._along = np.array([lane.direction for lane in lines]).reshape(-1, 2)
-        arcs = [lane for lane in values if isinstance(lane, CircularLane)]
+        arcs = [lane for lane in lanes.values() if isinstance(lane, CircularLane)]
         self._centre = np.array([lane.center for lane in arcs]).reshape(-1, 2)
         self._radius = np.array([lane.radius for lane in arcs])
         self._phase = np.array([lane.start_phase for lane in arcs])
@@ -248,28 +247,23 @@ class LaneTable:
         """
         s = np.empty((len(points), len(self.length)))
         r = np.empty_like(s)
-        if len(self._straight):
-            dx, dy = (points[:, i, None] - self._start[:, i] for i in (0, 1))
-            ax, ay = self._along[:, 0], self._along[:, 1]
-            s[:, self._straight] = dx * ax + dy * ay
-            r[:, self._straight] = dy * ax - dx * ay
-        if len(self._circular):
-            dx, dy = (points[:, i, None] - self._centre[:, i] for i in (0, 1))
-            turn = np.arctan2(dy, dx) - self._phase
-            turn = (turn + np.pi) % (2 * np.pi) - np.pi
-            s[:, self._circular] = self._sense * turn * self._radius
-            away = np.hypot(dx, dy)
-            r[:, self._circular] = self._sense * (self._radius - away)
+        dx, dy = (points[:, i, None] - self._start[:, i] for i in (0, 1))
+        ax, ay = self._along.T
+        s[:, self._straight] = dx * ax + dy * ay
+        r[:, self._straight] = dy * ax - dx * ay
+        dx, dy = (points[:, i, None] - self._centre[:, i] for i in (0, 1))
+        turn = np.arctan2(dy, dx) - self._phase
+        turn = (turn + np.pi) % (2 * np.pi) - np.pi
+        s[:, self._circular] = self._sense * turn * self._radius
+        r[:, self._circular] = self._sense * (self._radius - np.hypot(dx, dy))
         return s, r
 
     def headings(self, s: Floats) -> Floats:
         """Return headings [N, lanes] (highway-env's sign) at arc lengths [N, lanes]."""
         angles = np.empty_like(s)
-        along = np.arctan2(self._along[:, 1], self._along[:, 0])
-        angles[:, self._straight] = along
-        if len(self._circular):
-            turned = s[:, self._circular] / self._radius + np.pi / 2
-            angles[:, self._circular] = self._phase + self._sense * turned
+        angles[:, self._straight] = np.arctan2(self._along[:, 1], self._along[:, 0])
+        turned = s[:, self._circular] / self._radius + np.pi / 2
+        angles[:, self._circular] = self._phase + self._sense * turned
         return angles
 
 
@@ -311,15 +305,12 @@ def build_path(network: Network, legs: Sequence[Leg], goal_m: float) -> RoutePat
         poses = [network.pose(leg.lane, float(s)) for s in stations]
         piece = np.array([(p.x, p.y) for p in poses])
         begin = done
-        if pieces and np.hypot(*(piece[0] - pieces[-1][-1])) > 0.5:
-            bridge = _bridge(pieces[-1], piece)
-            pieces.append(bridge)
-            done += _length(bridge)
+        bridged = pieces and np.hypot(*(piece[0] - pieces[-1][-1])) > 0.5
+        for line in (_bridge(pieces[-1], piece), piece) if bridged else (piece,):
+            change_end = done
+            pieces.append(line)
+            done += float(np.hypot(*np.diff(line, axis=0).T).sum())
             owners.append((done, number))
-        change_end = done
-        pieces.append(piece)
-        done += _length(piece)
-        owners.append((done, number))
         stop = change_end if leg.command in _CHANGES else done
         marks.append((begin - ANNOUNCED_M, stop, leg.command))
     # points 1 m apart, each with what its lane and the road beside it allow
@@ -353,10 +344,6 @@ def _bridge(before: Floats, after: Floats) -> Floats:
     return np.asarray(points)
 
 
-def _length(points: Floats) -> float:
-    return float(np.hypot(*np.diff(points, axis=0).T).sum())
-
-
 def _commands(
     count: int, marks: Sequence[tuple[float, float, Command]]
 ) -> npt.NDArray[np.int64]:
@@ -380,20 +367,14 @@ def _room_beside(
     # probe points to either side of the route, every quarter of a metre
     reach = np.arange(PROBE_M, WIDEST_M, PROBE_M)
     sides = list[Floats]()
-    for sign, same_way, with_shoulder in (
-        (1, True, False),
-        (-1, True, True),
-        (1, False, True),
-    ):
+    cases = ((1, True, False), (-1, True, True), (1, False, True))
+    for sign, same_way, with_shoulder in cases:
         normal = np.stack([-np.sin(headings), np.cos(headings)], axis=1) * sign
         probes = points[:, None, :] + reach[None, :, None] * normal[:, None, :]
         flat = probes.reshape(-1, 2) @ np.diag(flip(1.0, 1.0))
         s, r = table.coordinates(flat)
-        inside = (
-            (s > -0.5)
-            & (s < table.length + 0.5)
-            & (np.abs(r) <= widths / 2 + TOUCHING_M)
-        )
+        inside = (s > -0.5) & (s < table.length + 0.5)
+        inside &= np.abs(r) <= widths / 2 + TOUCHING_M
         # oncoming lanes and shoulders count on some sides only
         if same_way:
             mine = -np.repeat(headings, len(reach))[:, None]

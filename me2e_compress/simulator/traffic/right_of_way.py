@@ -43,8 +43,8 @@ class Regulator:
     line_s: float | None
     state: SignalState | None = None
     width_m: float = LANE_WIDTH_M
-    nearest_s: Callable[[], float] = field(default=lambda: float("inf"), repr=False)
-    conflict_s: float = float("inf")
+    nearest_s: Callable[[], float] = field(default=lambda: math.inf, repr=False)
+    conflict_s: float = math.inf
     _conflict_passed: bool = False
     _tail_passed: bool = False
     _stopped: bool = False
@@ -54,10 +54,11 @@ class Regulator:
         left = self.line.moved(0.0, self.width_m / 2)
         right = self.line.moved(0.0, -self.width_m / 2)
         post = self.line.moved(0.5, -self.width_m / 2 - 0.8)
-        ends = ((left.x, left.y), (right.x, right.y))
-        return Signal(
-            self.id, self.kind, post.x, post.y, self.line.heading, self.state, ends
+        pose, ends = (
+            (post.x, post.y, post.heading),
+            ((left.x, left.y), (right.x, right.y)),
         )
+        return Signal(self.id, self.kind, *pose, self.state, ends)
 
     def check(self, front_s: float, tail_s: float, speed: float) -> EventKind | None:
         """Return which rule the ego breaks now, between two arc lengths of its route.
@@ -335,19 +336,15 @@ def conflicts_of(network: Network) -> dict[LaneIndex, list[Conflict]]:
             if a[0] == b[0] or a[1] == b[0] or b[1] == a[0]:
                 continue
             theirs = network.centre(b)
-            away = np.hypot(
-                mine[:, None, 0] - theirs[None, :, 0],
-                mine[:, None, 1] - theirs[None, :, 1],
-            )
-            close = away < TOUCH_M
-            if close.any():
-                spans = []
-                mine_too, theirs_too = np.max(close, axis=1), np.max(close, axis=0)
-                for lane, touched in ((a, mine_too), (b, theirs_too)):
-                    share = network.length(lane) / (len(touched) - 1)
-                    at = np.flatnonzero(touched)
-                    spans.append((float(at[0]) * share, float(at[-1]) * share))
-                conflicts.setdefault(a, []).append(Conflict(b, spans[0], spans[1]))
+            close = np.hypot(*(mine[:, None] - theirs).transpose(2, 0, 1)) < TOUCH_M
+            if not close.any():
+                continue
+            spans = []
+            for lane, touched in ((a, close.any(axis=1)), (b, close.any(axis=0))):
+                share = network.length(lane) / (len(touched) - 1)
+                at = np.flatnonzero(touched)
+                spans.append((float(at[0]) * share, float(at[-1]) * share))
+            conflicts.setdefault(a, []).append(Conflict(b, *spans))
     return conflicts
 
 

@@ -71,8 +71,7 @@ class Schedule:
     def due(self, time_us: int, present: Sequence[Body]) -> list[Car | Walker]:
         """Return who appears now; who finds the place taken stays away for good."""
         arrivals = list[Car | Walker]()
-        while self._next < len(self.arrivals):
-            arrives_us, body = self.arrivals[self._next]
+        for arrives_us, body in self.arrivals[self._next :]:
             if arrives_us > time_us:
                 break
             self._next += 1
@@ -255,10 +254,8 @@ class Stage:
 
         One that ``comes`` is not there yet.
         """
-        lanes, s = self.network.rest(chain, s_m)
-        car = Car(
-            self._id(), self.network, lanes, s, speed_mps, target_mps, kind, behaviour
-        )
+        place = (self.network, *self.network.rest(chain, s_m))
+        car = Car(self._id(), *place, speed_mps, target_mps, kind, behaviour)
         if not comes:
             self.bodies.append(car)
         return car
@@ -322,16 +319,9 @@ class Stage:
     ) -> Event:
         """Return an event here and now."""
         pose = self.ego.pose
-        return Event(
-            self.time_us,
-            kind,
-            detail,
-            pose.x,
-            pose.y,
-            float(self.ego.speed),
-            None if body is None else body.id,
-            None if body is None else body.kind,
-        )
+        other = (None, None) if body is None else (body.id, body.kind)
+        speed = float(self.ego.speed)
+        return Event(self.time_us, kind, detail, pose.x, pose.y, speed, *other)
 
     def _id(self) -> int:
         self._next_id += 1

@@ -223,10 +223,8 @@ class TrafficRoad(Road):  # type: ignore[misc]  # highway-env is untyped
             chain = car.joins
             station = car.network.lane(chain[0]).local_coordinates(car.position)[0]
             lanes, _ = car.network.rest(chain, float(station))
-            if (
-                _imposed(car, lanes) <= JOIN_IMPOSED_MPS2
-                and _wanted(car, lanes) >= -4.0
-            ):
+            bearable = _imposed(car, lanes) <= JOIN_IMPOSED_MPS2
+            if bearable and _wanted(car, lanes) >= -4.0:
                 car.change_lane(lanes, 1)
                 car.joins = None
                 return wanted_mps2
