@@ -72,25 +72,26 @@ def test_a_bar_on_the_road_is_drawn_where_lidar2img_says(
         for roads in (roadmap, Roadmap(()))
     )
     added = (painted - bare).sum(axis=3)
-    seen = 0
+    views, wide = 0, False
     for camera in range(6):
         pixels = np.array([project(rig, camera, ego, *corner) for corner in corners])
-        if not is_judged(pixels):
+        wide = wide or is_wide(pixels)
+        if not is_sharp(pixels):
             continue
         white = added[camera]
         rows, columns = np.mgrid[0:128, 0:224] + 0.5
-        found = np.array([(columns * white).sum(), (rows * white).sum()]) / white.sum()
+        middle = np.array([(columns * white).sum(), (rows * white).sum()]) / white.sum()
         # One pixel; close by, where a texel of 0.125 m covers many, a quarter of it, as
         # it is seen: turned against the camera it is wider than its side.
         square = np.array([(x, y)]) + (corners - (x, y)) * (0.125, 0.25)
         texel = np.array([project(rig, camera, ego, *corner) for corner in square])
         allowed = max(1.0, np.ptp(texel[:, :2], axis=0).max() / 4)
-        np.testing.assert_allclose(found, centroid(pixels[:, :2]), atol=allowed)
-        seen += 1
-    assert seen >= 1 or not is_wide_in_view(rig, ego, corners)
+        np.testing.assert_allclose(middle, centroid(pixels[:, :2]), atol=allowed)
+        views += 1
+    assert views >= 1 or not wide
 
 
-def is_judged(pixels: npt.NDArray[np.float64]) -> bool:
+def is_sharp(pixels: npt.NDArray[np.float64]) -> bool:
     """Whether a bar's centroid says anything: whole in the image, two rows at least.
 
     Thinner than that, a slanted bar is sampled in steps.
@@ -99,14 +100,10 @@ def is_judged(pixels: npt.NDArray[np.float64]) -> bool:
     return bool(inside and pixels[:, 2].min() >= 2.0 and np.ptp(pixels[:, 1]) >= 2.0)
 
 
-def is_wide_in_view(rig: CameraRig, ego: Ego, corners: npt.NDArray[np.float64]) -> bool:
-    """Whether some camera has the whole bar well inside its image, three rows high."""
-    for camera in range(6):
-        pixels = np.array([project(rig, camera, ego, *corner) for corner in corners])
-        whole = (np.abs(pixels[:, 0] - 112) < 100).all() and (pixels[:, 1] < 120).all()
-        if pixels[:, 2].min() > 2.0 and whole and np.ptp(pixels[:, 1]) >= 3.0:
-            return True
-    return False
+def is_wide(pixels: npt.NDArray[np.float64]) -> bool:
+    """Whether the whole bar is well inside an image, and three rows high."""
+    whole = (np.abs(pixels[:, 0] - 112) < 100).all() and (pixels[:, 1] < 120).all()
+    return bool(whole and pixels[:, 2].min() > 2.0 and np.ptp(pixels[:, 1]) >= 3.0)
 
 
 @pytest.mark.parametrize("size", [(33, 47), (96, 160), (241, 321)])
@@ -125,14 +122,12 @@ def test_the_texture_is_read_only_and_its_levels_nest(texture: GroundTexture) ->
         texture.classes[0, 0] = 0
 
 
-STORM = Weather(fog_m=60.0, night=0.5, rain=0.7, brightness=1.1, noise=4.0, seed=3)
 PROGRAM = """
 import hashlib
 from tests.simulator.cameras import town
 from me2e_compress.simulator.camera_rig import CameraRig, Weather
 from me2e_compress.simulator.cameras.renderer import Cameras
-weather = Weather(fog_m=60.0, night=0.5, rain=0.7, brightness=1.1, noise=4.0, seed=3)
-for options in (Weather(), weather):
+for options in (Weather(), town.STORM):
     images = Cameras(town.paint(), CameraRig(96, 160), options).render(town.busy())
     print(hashlib.sha256(images.tobytes()).hexdigest())
 """
@@ -151,11 +146,11 @@ def see(texture: GroundTexture, rig: CameraRig) -> Eyes:
 def test_an_image_does_not_depend_on_those_before(
     texture: GroundTexture, rig: CameraRig, see: Eyes
 ) -> None:
-    cameras = Cameras(texture, rig, STORM)
+    cameras = Cameras(texture, rig, town.STORM)
     for time_us in (500_000, 50_000):
         cameras.render(replace(town.busy(), time_us=time_us))
     again = cameras.render(replace(town.busy(), time_us=0))
-    np.testing.assert_array_equal(again, see(STORM))
+    np.testing.assert_array_equal(again, see(town.STORM))
 
 
 @pytest.mark.parametrize(("seed", "time_us"), [(2, 0), (1, 10)])
@@ -168,15 +163,11 @@ def test_another_seed_or_time_gives_other_noise(
 
 def test_frames_are_the_same_in_every_process() -> None:
     def hashes(salt: str) -> list[str]:
-        done = subprocess.run(
-            [sys.executable, "-c", PROGRAM],
-            capture_output=True,
-            text=True,
-            check=True,
-            env={**os.environ, "PYTHONHASHSEED": salt},
-            cwd=Path(__file__).parents[3],
-        )
-        return done.stdout.split()
+        command, place = [sys.executable, "-c", PROGRAM], Path(__file__).parents[3]
+        salted = {**os.environ, "PYTHONHASHSEED": salt}
+        return subprocess.check_output(
+            command, env=salted, cwd=place, text=True
+        ).split()
 
     first = hashes("1")
     assert first == hashes("2")

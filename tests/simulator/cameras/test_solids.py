@@ -9,11 +9,7 @@ from me2e_compress.simulator.camera_rig import CAMERA_NAMES, CameraRig
 from me2e_compress.simulator.cameras.painter import painting_order
 from me2e_compress.simulator.cameras.renderer import Cameras
 from me2e_compress.simulator.cameras.solids import TEMPLATES
-from me2e_compress.simulator.scene import (
-    Actor,
-    ActorKind,
-    SignalState,
-)
+from me2e_compress.simulator.scene import Actor, ActorKind, Ego, SignalState
 from tests.simulator.cameras import town
 from tests.support.profiles import scaled
 
@@ -82,10 +78,15 @@ def test_the_nearer_car_hides_the_farther_one_whatever_their_order(
     far = town.actor(18.0, 0.4, number=PAINTS_APART[1])
     both = cameras.render(town.scene(near, far))
     np.testing.assert_array_equal(both, cameras.render(town.scene(far, near)))
-    alone = cameras.render(town.scene(near))[FRONT]
-    mask = town.covered(cameras.rig, town.scene(near))[FRONT]
-    core = cv2.erode(mask.astype(np.uint8), np.ones((5, 5), np.uint8)).astype(bool)
-    np.testing.assert_array_equal(both[FRONT][core], alone[core])
+    assert_hides(cameras, near, far, town.ego())
+
+
+def assert_hides(cameras: Cameras, near: Actor, far: Actor, ego: Ego) -> None:
+    alone = town.scene(near, seen_from=ego)
+    mask = town.covered(cameras.rig, alone)[FRONT].astype(np.uint8)
+    core = cv2.erode(mask, np.ones((5, 5), np.uint8)).astype(bool)
+    both = cameras.render(town.scene(far, near, seen_from=ego))[FRONT]
+    np.testing.assert_array_equal(both[core], cameras.render(alone)[FRONT][core])
 
 
 def test_a_car_beside_a_long_truck_is_not_painted_over(cameras: Cameras) -> None:
@@ -93,13 +94,7 @@ def test_a_car_beside_a_long_truck_is_not_painted_over(cameras: Cameras) -> None
     # car behind its far side must not show through
     truck = town.actor(12.0, 0.0, ActorKind.TRUCK, number=3)
     hidden = town.actor(11.5, 2.6, ActorKind.PEDESTRIAN)
-    eye = town.ego(0.0, -4.0)
-    with_both = cameras.render(town.scene(hidden, truck, seen_from=eye))
-    alone = cameras.render(town.scene(truck, seen_from=eye))
-    mask = town.covered(cameras.rig, town.scene(truck, seen_from=eye))[FRONT]
-    core = cv2.erode(mask.astype(np.uint8), np.ones((5, 5)))
-    seen = core.astype(bool)
-    np.testing.assert_array_equal(with_both[FRONT][seen], alone[FRONT][seen])
+    assert_hides(cameras, truck, hidden, town.ego(0.0, -4.0))
 
 
 def rectangle(

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from me2e_compress.simulator.camera_rig import SUBPIXEL_BITS, CameraRig
+from me2e_compress.simulator.camera_rig import SUBPIXEL_BITS, CameraRig, Weather
 from me2e_compress.simulator.cameras.ground import GroundTexture, paint_texture
 from me2e_compress.simulator.cameras.painter import Painter
 from me2e_compress.simulator.cameras.solids import solids_of
@@ -22,6 +22,7 @@ from me2e_compress.simulator.scene import (
     SignalState,
 )
 
+STORM = Weather(fog_m=60.0, night=0.5, rain=0.7, brightness=1.1, noise=4.0, seed=3)
 STOP_LINE = ((20.0, -2.0), (20.0, 6.0))
 CROSSWALK = ((22.0, -2.0), (22.0, 6.0), (26.0, 6.0), (26.0, -2.0))
 
@@ -86,20 +87,12 @@ def covered(rig: CameraRig, scene: Scene) -> npt.NDArray[np.bool_]:
 
 def busy() -> Scene:
     """One of everything, some of it in the way of a camera."""
-    actors = tuple(
-        actor(
-            14 * math.cos(angle),
-            14 * math.sin(angle),
-            kind,
-            number=i,
-            heading=angle + 1.0,
-            braking=i % 2 == 0,
-            indicator=i % 3 - 1,
-        )
-        for i, (kind, angle) in enumerate(
-            zip(ActorKind, np.linspace(0.0, 6.0, len(ActorKind)), strict=True)
-        )
-    )
+    actors, angles = [], np.linspace(0.0, 6.0, len(ActorKind)).tolist()
+    for i, (kind, angle) in enumerate(zip(ActorKind, angles, strict=True)):
+        x, y, looks = 14 * math.cos(angle), 14 * math.sin(angle), angle + 1.0
+        lit, side = i % 2 == 0, i % 3 - 1
+        body = actor(x, y, kind, number=i, heading=looks, braking=lit, indicator=side)
+        actors.append(body)
     states = (SignalState.RED, None, None)
     signals = tuple(
         Signal(i, kind, 9.0, 3.0 * i - 4.0, 0.1, states[i], STOP_LINE)

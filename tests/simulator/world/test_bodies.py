@@ -1,3 +1,4 @@
+import itertools
 import math
 
 import numpy as np
@@ -112,11 +113,11 @@ def test_a_follower_never_reverses_nor_hits_a_leader_with_room(
     assert rear.lane_s < front.lane_s
 
 
-def bent(heading: float, before: float, radius: float, angle: float) -> Network:
-    network = Network()
-    pose = network.straight("a", "b", Pose(0.0, 0.0, heading), before, Section())
-    pose = network.arc("b", "c", pose, radius, angle, Section())
-    network.straight("c", "d", pose, 60.0, Section())
+def bent(pose: Pose, radius: float, angle: float, lanes: int = 2) -> Network:
+    network, section = Network(), Section(lanes)
+    pose = network.straight("a", "b", pose, 40.0, section)
+    pose = network.arc("b", "c", pose, radius, angle, section)
+    network.straight("c", "d", pose, 60.0, section)
     return network
 
 
@@ -124,7 +125,7 @@ BENT = [("a", "b", 0), ("b", "c", 0), ("c", "d", 0)]
 
 
 def test_a_car_stops_behind_what_stands_around_the_corner() -> None:
-    network = bent(0.0, 40.0, 15.0, math.pi / 2)
+    network = bent(Pose(0.0, 0.0, 0.0), 15.0, math.pi / 2, 1)
     road, car = road_on(network), Car(1, network, BENT, 5.0, 8.0)
     parked = StaticObject(2, ActorKind.PARKED, network.pose(("c", "d", 0), 8.0))
     put(road, car, parked)
@@ -137,7 +138,7 @@ def test_a_car_stops_behind_what_stands_around_the_corner() -> None:
 
 
 def test_a_car_keeps_to_its_lane_through_a_bend() -> None:
-    network = bent(1.0, 30.0, 12.0, -math.pi / 2)
+    network = bent(Pose(0.0, 0.0, 1.0), 12.0, -math.pi / 2, 1)
     road, car = road_on(network), Car(1, network, BENT, 5.0, 8.0)
     put(road, car)
 
@@ -151,9 +152,8 @@ def test_manners_belong_to_one_car_and_leave_the_class_alone() -> None:
     network, _ = one_lane()
     before = {name: getattr(IDMVehicle, name) for name in ("TIME_WANTED", "DELTA")}
 
-    pushy = Car(
-        1, network, [("a", "b", 0)], 5.0, 8.0, behaviour=Behaviour(headway_s=0.3)
-    )
+    mind = Behaviour(headway_s=0.3)
+    pushy = Car(1, network, [("a", "b", 0)], 5.0, 8.0, behaviour=mind)
     polite = Car(2, network, [("a", "b", 0)], 30.0, 8.0)
 
     assert pushy.TIME_WANTED == 0.3
@@ -206,31 +206,19 @@ angles = st.floats(-3.0, 3.0)
 places = st.floats(-50.0, 50.0)
 
 
-def winding(pose: Pose, radius: float, angle: float) -> Network:
-    network = Network()
-    section = Section(lanes=2)
-    pose = network.straight("a", "b", pose, 40.0, section)
-    pose = network.arc("b", "c", pose, radius, angle, section)
-    network.straight("c", "d", pose, 40.0, section)
-    return network
-
-
 @given(places, places, angles, st.floats(10.0, 60.0), st.sampled_from([-1.2, 0.9]))
 def test_pieces_join_without_a_kink(
     x: float, y: float, heading: float, radius: float, angle: float
 ) -> None:
-    network = winding(Pose(x, y, heading), radius, angle)
+    network = bent(Pose(x, y, heading), radius, angle)
 
-    for lane in (0, 1):
-        for first, second in ((("a", "b"), ("b", "c")), (("b", "c"), ("c", "d"))):
-            here, there = (*first, lane), (*second, lane)
-            end = network.pose(here, network.length(here))
-            begin = network.pose(there, 0.0)
+    for lane, (first, second) in itertools.product((0, 1), itertools.pairwise(BENT)):
+        here, there = (*first[:2], lane), (*second[:2], lane)
+        end, begin = network.pose(here, network.length(here)), network.pose(there, 0.0)
 
-            assert math.hypot(end.x - begin.x, end.y - begin.y) < 1e-6
-            assert math.remainder(end.heading - begin.heading, math.tau) == (
-                pytest.approx(0, abs=1e-6)
-            )
+        assert math.hypot(end.x - begin.x, end.y - begin.y) < 1e-6
+        turn = math.remainder(end.heading - begin.heading, math.tau)
+        assert turn == pytest.approx(0, abs=1e-6)
 
 
 @given(angles, st.floats(10.0, 60.0))
@@ -247,8 +235,7 @@ def test_a_positive_angle_turns_left(heading: float, radius: float) -> None:
 
 
 def test_lanes_lie_to_the_right_and_the_rest_of_a_chain_begins_at_its_length() -> None:
-    network = winding(Pose(0.0, 0.0, 0.0), 30.0, 0.9)
-    chain = [("a", "b", 0), ("b", "c", 0), ("c", "d", 0)]
+    network, chain = bent(Pose(0.0, 0.0, 0.0), 30.0, 0.9), BENT
 
     assert network.pose(("a", "b", 1), 10.0).y == pytest.approx(-3.5)
     assert network.length(("b", "c", 1)) == pytest.approx(33.5 * 0.9)
@@ -261,7 +248,7 @@ def test_lanes_lie_to_the_right_and_the_rest_of_a_chain_begins_at_its_length() -
 
 @given(st.lists(st.tuples(places, places), min_size=1, max_size=8))
 def test_the_table_agrees_with_highway_env(points: list[tuple[float, float]]) -> None:
-    network = winding(Pose(-20.0, 5.0, 0.4), 25.0, -1.2)
+    network = bent(Pose(-20.0, 5.0, 0.4), 25.0, -1.2)
     table = LaneTable(network.graph)
     flipped = np.array([flip(x, y) for x, y in points])
 
