@@ -21,7 +21,7 @@ from me2e_compress.study.report.figures import (
     WIDTH_IN,
     styled,
 )
-from me2e_compress.study.workload import held_frames
+from me2e_compress.study.workload import frames_per_decision
 
 RATE_TICKS = (1, 2, 3, 5, 10, 20, 30)
 COLOURS = (
@@ -90,7 +90,7 @@ def _driven_rates(
 ) -> list[tuple[float, str]]:
     """Return the paper's rates that were driven, each with its condition."""
     held = {
-        held_frames(result.study, each): each.name
+        frames_per_decision(result.study, each): each.name
         for each in reversed(result.study.conditions)
         if each.name in conditions and not (each.traced or each.mean_of)
     }

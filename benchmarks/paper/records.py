@@ -22,7 +22,7 @@ from me2e_compress.study import Listener, Study
 from me2e_compress.study.drive_record import DriveRecord
 from me2e_compress.study.prepared import PreparedVariant
 from me2e_compress.study.run import StudyCells, prepare_study
-from me2e_compress.study.workload import held_frames
+from me2e_compress.study.workload import frames_per_decision
 from me2e_compress.study.workspace import Workspace
 
 RECORDS = "records"
@@ -113,7 +113,7 @@ def _keep_accident(setup: StudyCells, prepared: Sequence[PreparedVariant]) -> No
     # the highest rate comes first
     study = setup.study
     driver = next(each for each in prepared if each.variant is study.reference)
-    for condition in sorted(study.conditions, key=partial(held_frames, study)):
+    for condition in sorted(study.conditions, key=partial(frames_per_decision, study)):
         file = setup.workspace.record(study.reference, condition)
         record = DriveRecord.load(file) if file.is_file() else None
         happened = None if record is None else first_accident(record)

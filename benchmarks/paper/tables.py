@@ -29,7 +29,7 @@ from me2e_compress.display import Cell, Table
 from me2e_compress.metrics.route_summary import PERCENTS
 from me2e_compress.study.cells import MISSING
 from me2e_compress.study.definition import StudyBlock
-from me2e_compress.study.workload import held_frames
+from me2e_compress.study.workload import frames_per_decision
 
 OURS = (
     "Means with their 95 % intervals over these scenario types. The paper's figures"
@@ -71,7 +71,7 @@ def table_2(result: PaperDrives, block: StudyBlock) -> Table:
         (
             Cell("own" if each.traced else "own mean"),
             Cell(each.name),
-            *rate_cells(held_frames(study, each)),
+            *rate_cells(frames_per_decision(study, each)),
             *score_cells(result, name, each.name),
             *given_cells(own if each.traced else None),
         )
@@ -249,7 +249,7 @@ def _at_rates(
     # the condition of each number of held frames
     study, name = result.study, block.variants[0]
     held = {
-        held_frames(study, each): each.name
+        frames_per_decision(study, each): each.name
         for each in reversed(study.conditions)
         if each.name in block.conditions
     }

@@ -63,12 +63,11 @@ class Condition:
         if bool(self.latency) == bool(self.mean_of):
             raise StudyError(f"condition {self.name}: give a latency or mean_of")
         try:
-            source = None if self.mean_of else self.source(0)
+            if self.latency:
+                self.source(0)
             self.drive  # noqa: B018
         except EvaluationError as error:
             raise EvaluationError(f"condition {self.name}: {error}") from error
-        if source is not None and source.measures:
-            raise StudyError(self._refusal())
 
     @functools.cached_property
     def drive(self) -> Drive:
@@ -87,9 +86,15 @@ class Condition:
     def _parsed(self) -> LatencySource:
         text = self.latency
         names_a_file = text.startswith(TRACE) and name_in(text) != TRACE
-        if names_a_file or "trace:" in text or "trace=" in text:
-            raise StudyError(self._refusal())
-        return LATENCY_SOURCES.parse(text)
+        names_a_file = names_a_file or "trace:" in text or "trace=" in text
+        source = None if names_a_file else LATENCY_SOURCES.parse(text)
+        if source is None or source.measures:
+            raise StudyError(
+                f"condition {self.name}: latency {text!r}: a study knows none, "
+                f"fps:F and {TRACE}, and what is made of them (a file is a variant's: "
+                "trace = FILE)"
+            )
+        return source
 
     @property
     def traced(self) -> bool:
@@ -97,15 +102,20 @@ class Condition:
         return not self.mean_of and self._parsed.lacks_trace
 
     @property
+    def _options(self) -> dict[str, object]:
+        """Options of its drive, with the latency apart."""
+        names = ("latency_model", "dt_ms", "weather")
+        return {name: getattr(self, name) for name in names}
+
+    @property
     def _changed(self) -> dict[str, object]:
-        """The options of its drive that are not the usual ones."""
-        usual = {"latency_model": "drop", "dt_ms": 50.0, "weather": ""}
-        own = {name: getattr(self, name) for name in usual}
-        return {name: each for name, each in own.items() if each != usual[name]}
+        """Options of its drive that are not the defaults."""
+        own = self._options.items()
+        return {name: value for name, value in own if value != getattr(Condition, name)}
 
     @property
     def asks_for(self) -> tuple[str, ...]:
-        """What an evaluator must take to drive under it."""
+        """Options that an evaluator must support to drive under it."""
         return (*("latency",) * (self.latency != "none"), *self._changed)
 
     def described(self, device: str) -> str:
@@ -117,18 +127,5 @@ class Condition:
 
     def to_json(self) -> dict[str, Any]:
         """Return every option; ``charged`` is the latency, None for a mean."""
-        return {
-            "name": self.name,
-            "charged": self.latency or None,
-            "mean_of": self.mean_of or None,
-            "latency_model": self.latency_model,
-            "dt_ms": self.dt_ms,
-            "weather": self.weather,
-        }
-
-    def _refusal(self) -> str:
-        return (
-            f"condition {self.name}: latency {self.latency!r}: a study knows none, "
-            f"fps:F and {TRACE}, and what is made of them (a file is a variant's: "
-            "trace = FILE)"
-        )
+        charged = {"charged": self.latency or None, "mean_of": self.mean_of or None}
+        return {"name": self.name, **charged, **self._options}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import itertools
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
@@ -44,14 +45,14 @@ def check_unique(kind: str, names: Iterable[str]) -> None:
         raise StudyError(f"{count} {kind}s are named {name}")
 
 
-def check_there(what: str, name: str, names: Sequence[str]) -> None:
-    """Check that a name is one of those that there are."""
+def check_known(what: str, name: str, names: Sequence[str]) -> None:
+    """Check that a name is among the known ones."""
     if name not in names:
         raise StudyError(f"{what} {name}; there are {', '.join(names) or 'none'}")
 
 
-# What a file names lies beside it: its folder is the context of the validation, which
-# Python's own objects do not go through.
+# Paths in a study's file are relative to the file's folder, which is the context of
+# the validation. Objects that Python code makes are not validated.
 
 
 def _folder(info: ValidationInfo) -> Path:
@@ -59,34 +60,32 @@ def _folder(info: ValidationInfo) -> Path:
 
 
 def _beside(name: object, info: ValidationInfo) -> object:
+    """Return the path of a file beside the study's."""
     return str(_folder(info) / name) if isinstance(name, str) else name
 
 
+def _file_or_name(name: str, info: ValidationInfo) -> str:
+    """Return the path of a file beside the study's; the name if there is none."""
+    file = _folder(info) / name
+    return str(file) if file.is_file() else name
+
+
 def _adapter(name: object, info: ValidationInfo) -> object:
-    """Return the path of a file beside the study, else of an adapter that ships."""
+    """Return the path of a file beside the study's, or of a shipped adapter."""
     if isinstance(name, str) and name in shipped_adapters():
         file = _folder(info) / name
         return str(file if file.is_file() else adapter_file(Path(name)))
     return _beside(name, info)
 
 
-def _file_or_name(name: str, info: ValidationInfo) -> str:
-    """Return the path of a file beside the study, else what ships by that name."""
-    file = _folder(info) / name
-    return str(file) if file.is_file() else name
-
-
 def _policy(text: str, info: ValidationInfo) -> str:
     """Return the policy with the path of its model; a file of a model's name wins."""
-    folder = _folder(info)
-    if not text:
-        return text
     if text in SHIPPED:
-        text = str(model_path(text, folder))
-    driver = driver_named(text)
+        text = str(model_path(text, _folder(info)))
+    driver = driver_named(text) if text else None
     if not isinstance(driver, OnnxDriver):
         return text
-    return POLICIES.text(replace(driver, path=model_path(driver.path, folder)))
+    return POLICIES.text(replace(driver, path=model_path(driver.path, _folder(info))))
 
 
 def _passes(given: object) -> tuple[Pass, ...]:
@@ -136,24 +135,26 @@ class Variant:
         check_name("variant", self.name)
         if self.recipe is not None and self.passes:
             raise StudyError(f"variant {self.name}: give a recipe or passes, not both")
+        resolved = dict[str, object]()
         if self.recipe is not None:
-            object.__setattr__(self, "passes", recipes.load(self.recipe))
-            object.__setattr__(self, "recipe", None)
+            resolved |= {"passes": recipes.load(self.recipe), "recipe": None}
+        passes = resolved.get("passes", self.passes)
+        others = (self.module_map, self.adapter, self.trace, self.host_stage)
         driver = driver_named(self.policy) if self.policy else None
         if isinstance(driver, OnnxDriver):
-            object.__setattr__(self, "policy", str(driver.path))
-            object.__setattr__(self, "adapter", self.adapter or driver.adapter)
-            modules = self.module_map or driver.module_map
-            object.__setattr__(self, "module_map", modules)
-            stage = self.host_stage or str(driver.host_stage or "")
-            object.__setattr__(self, "host_stage", stage)
-        elif driver is not None and any(
-            (self.passes, self.module_map, self.adapter, self.trace, self.host_stage)
-        ):
+            resolved |= {
+                "policy": str(driver.path),
+                "adapter": self.adapter or driver.adapter,
+                "module_map": self.module_map or driver.module_map,
+                "host_stage": self.host_stage or str(driver.host_stage or ""),
+            }
+        elif driver is not None and any((passes, *others)):
             raise StudyError(
                 f"variant {self.name}: {self.policy} is not a model: there is nothing "
                 "to compress, adapt or time"
             )
+        for name, value in resolved.items():
+            object.__setattr__(self, name, value)
 
 
 @with_config(FORM)
@@ -256,20 +257,19 @@ class Study:
     plugins: tuple[File, ...] = ()
 
     def __post_init__(self) -> None:
-        # names must be unique, and refer to something
+        # Names must be unique, and refer to something
         check_unique("variant", (variant.name for variant in self.variants))
         check_unique("condition", (condition.name for condition in self.conditions))
         self._check_names()
-        # variants that name no policy take the study's
-        for each in self.variants:
-            if not (each.policy or self.policy):
+        # Variants that name no policy take the study's
+        variants = list[Variant]()
+        for variant in self.variants:
+            if not (variant.policy or self.policy):
                 raise StudyError(
-                    f"variant {each.name}: neither it nor the study names a policy"
+                    f"variant {variant.name}: neither it nor the study names a policy"
                 )
-        variants = (
-            each if each.policy else replace(each, policy=self.policy)
-            for each in self.variants
-        )
+            own = variant if variant.policy else replace(variant, policy=self.policy)
+            variants.append(own)
         object.__setattr__(self, "variants", tuple(variants))
         self._check_evaluator()
         if self.to_record is None:
@@ -288,23 +288,23 @@ class Study:
         return f" (preview: {driven} of {whole} routes)" if partial else ""
 
     def _check_names(self) -> None:
-        """Check that what is named is there; means refer to drives before theirs."""
-        variants = [each.name for each in self.variants]
-        conditions = [each.name for each in self.conditions]
-        check_there("baseline: no variant", self.baseline, variants)
+        """Check that all names are known; a mean is of a drive before its condition."""
+        variants = [variant.name for variant in self.variants]
+        conditions = [condition.name for condition in self.conditions]
+        check_known("baseline: no variant", self.baseline, variants)
         for block in self.blocks:
             for name in block.variants:
-                check_there(f"block {block.name}: no variant", name, variants)
+                check_known(f"block {block.name}: no variant", name, variants)
             for name in block.conditions:
-                check_there(f"block {block.name}: no condition", name, conditions)
+                check_known(f"block {block.name}: no condition", name, conditions)
         drives = [f"{one}.{other}" for other in conditions for one in variants]
-        for name in (name for pair in self.pairs for name in pair):
-            check_there("pair: no VARIANT.CONDITION", name, drives)
-        for number, each in enumerate(self.conditions):
-            if each.mean_of:
-                what = f"condition {each.name}: mean_of: no VARIANT.CONDITION before it"
+        for name in itertools.chain.from_iterable(self.pairs):
+            check_known("pair: no VARIANT.CONDITION", name, drives)
+        for number, condition in enumerate(self.conditions):
+            if condition.mean_of:
+                what = f"condition {condition.name}: mean_of: no VARIANT.CONDITION"
                 before = drives[: number * len(variants)]
-                check_there(what, each.mean_of, before)
+                check_known(f"{what} before it", condition.mean_of, before)
 
     def _check_evaluator(self) -> None:
         """Check that the evaluator takes all that variants and conditions ask for."""
@@ -321,39 +321,35 @@ class Study:
             raise StudyError(str(error)) from error
 
     def _check_frames(self) -> None:
-        # passes that calibrate need frames
-        needy = [
-            (variant.name, each.name)
-            for variant in self.variants
-            for each in variant.passes
-            if each.needs_frames
-        ]
-        if needy and self.frames is None:
-            raise StudyError(
-                f"variant {needy[0][0]}: {needy[0][1]} measures on recorded frames,"
-                " and there are none (frames = FRAMES)"
-            )
-        # models without a trace are timed on held-out frames
-        untimed = [
-            each
-            for each in self.variants
-            if isinstance(driver_named(each.policy), OnnxDriver) and not each.trace
-        ]
-        traced = [each.name for each in self.conditions if each.traced]
-        if traced and untimed and self.held_out is None:
-            raise StudyError(
-                f"condition {traced[0]}: the latency of {untimed[0].name} is measured "
-                "on held-out frames, and there are none (held_out = FRAMES)"
-            )
+        """Check that there are frames for passes that calibrate and for latencies."""
+        for variant in self.variants:
+            for step in variant.passes:
+                if step.needs_frames and self.frames is None:
+                    raise StudyError(
+                        f"variant {variant.name}: {step.name} measures on recorded"
+                        " frames, and there are none (frames = FRAMES)"
+                    )
+        # Models without a trace are timed on held-out frames
+        traced = [condition.name for condition in self.conditions if condition.traced]
+        if not traced or self.held_out is not None:
+            return
+        for variant in self.variants:
+            driver = driver_named(variant.policy)
+            if isinstance(driver, OnnxDriver) and not variant.trace:
+                raise StudyError(
+                    f"condition {traced[0]}: the latency of {variant.name} is measured "
+                    "on held-out frames, and there are none (held_out = FRAMES)"
+                )
 
     def inputs(self) -> Iterator[str | Path]:
-        """List the files and folders that it reads."""
+        """Yield the files and folders that it reads."""
         yield from filter(None, (self.frames, self.held_out))
         yield from self.provider.plugins
-        for each in self.variants:
-            named = (each.policy, each.module_map, each.adapter, each.trace)
-            yield from filter(None, named)
-            yield from (file for step in each.passes for file in step.files())
+        for own in self.variants:
+            yield from filter(
+                None, (own.policy, own.module_map, own.adapter, own.trace)
+            )
+            yield from (file for step in own.passes for file in step.files())
 
     def check(self) -> None:
         """Check that there are routes and recordings, and that files exist.
@@ -363,10 +359,11 @@ class Study:
         """
         if not self.routes and "routes" in self.driven_by.takes:
             raise StudyError(f"{self.title}: there is no route to drive")
-        for each in self.variants:
-            for key, file in (("adapter", each.adapter), ("trace", each.trace)):
+        for variant in self.variants:
+            for key, file in (("adapter", variant.adapter), ("trace", variant.trace)):
                 if file is not None and not file.is_file():
-                    raise StudyError(f"variant {each.name}: {key} {file}: no such file")
+                    words = f"variant {variant.name}: {key} {file}: no such file"
+                    raise StudyError(words)
         for name, folder in (("frames", self.frames), ("held_out", self.held_out)):
             try:
                 if folder is not None:
@@ -378,32 +375,30 @@ class Study:
         """Return the variants under a condition, with the baseline if there are any."""
         if not self.blocks:
             return self.variants
-        blocks = [each for each in self.blocks if condition.name in each.conditions]
-        wanted = {name for each in blocks for name in (*each.variants, self.baseline)}
-        return tuple(each for each in self.variants if each.name in wanted)
+        blocks = [block for block in self.blocks if condition.name in block.conditions]
+        names = {name for block in blocks for name in (*block.variants, self.baseline)}
+        return tuple(variant for variant in self.variants if variant.name in names)
 
     def of_blocks(self, names: Sequence[str]) -> Study:
         """Return the part that some blocks need."""
-        there = {each.name: each for each in self.blocks}
+        blocks = {block.name: block for block in self.blocks}
         for name in names:
-            check_there("no block", name, list(there))
-        chosen = [there[name] for name in names]
-        drive = {self.baseline, *(name for each in chosen for name in each.variants)}
-        under = {name for each in chosen for name in each.conditions}
-        return replace(
-            self,
-            blocks=tuple(chosen),
-            variants=tuple(each for each in self.variants if each.name in drive),
-            conditions=tuple(each for each in self.conditions if each.name in under),
-        )
+            check_known("no block", name, list(blocks))
+        chosen = tuple(blocks[name] for name in names)
+        driven = {self.baseline, *(name for block in chosen for name in block.variants)}
+        under = {name for block in chosen for name in block.conditions}
+        variants = tuple(own for own in self.variants if own.name in driven)
+        conditions = tuple(own for own in self.conditions if own.name in under)
+        return replace(self, blocks=chosen, variants=variants, conditions=conditions)
 
     @property
     def reference(self) -> Variant:
         """The baseline variant."""
-        return next(each for each in self.variants if each.name == self.baseline)
+        return next(own for own in self.variants if own.name == self.baseline)
 
     def drive_of(self, name: str) -> tuple[Variant, Condition]:
         """Return variant and condition of ``VARIANT.CONDITION``."""
+        variants = {variant.name: variant for variant in self.variants}
+        conditions = {condition.name: condition for condition in self.conditions}
         variant, _, condition = name.partition(".")
-        variants = {each.name: each for each in self.variants}
-        return variants[variant], {e.name: e for e in self.conditions}[condition]
+        return variants[variant], conditions[condition]

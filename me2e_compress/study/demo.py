@@ -42,18 +42,15 @@ def before_and_after(outcome: StudyResult) -> Table:
     rows = list[tuple[Cell, ...]]()
     for drive in outcome.drives:
         variant, gap = outcome.variant(drive.variant), drive.difference
-        score, moved = drive.scores, Cell(MISSING, reason="the baseline itself")
-        rows.append(
-            (
-                Cell(outcome.label(drive)),
-                measure_cell(variant.size_mb, ".2f"),
-                measure_cell(variant.latency_ms[50], ".1f"),
-                measure_cell(variant.fidelity.plan_mean, ".3f"),
-                measure_cell(variant.fidelity.plan_max, ".2f"),
-                Cell(MISSING) if score is None else estimate_cell(score.driving_score),
-                estimate_cell(gap.driving_score, signed=True) if gap else moved,
-            )
-        )
+        fidelity, scores = variant.fidelity, drive.scores
+        measures = variant.size_mb, variant.latency_ms[50]
+        plan = fidelity.plan_mean, fidelity.plan_max
+        costs = map(measure_cell, (*measures, *plan), (".2f", ".1f", ".3f", ".2f"))
+        score = estimate_cell(scores.driving_score) if scores else Cell(MISSING)
+        moved = Cell(MISSING, reason="the baseline itself")
+        if gap is not None:
+            moved = estimate_cell(gap.driving_score, signed=True)
+        rows.append((Cell(outcome.label(drive)), *costs, score, moved))
     columns = ("", "MB", "ms", "plan m", "at most", "driving score", "difference")
     note = "ms: median of a decision; plan: metres that waypoints move."
     return Table("Before and after", columns, tuple(rows), note)
@@ -88,7 +85,7 @@ class DemoResult(Result):
     def view(self) -> View:
         """Return the verdict of the last step, and the warnings of all."""
         *_, last = self.steps.values()
-        alerts = [line for each in self.steps.values() for line in each.alerts()]
+        alerts = [line for step in self.steps.values() for line in step.alerts()]
         return View(last.headline, last.tables(), last.lines(), alerts)
 
 
@@ -137,18 +134,17 @@ class DriverDemo:
     def compress(self, listener: Listener) -> CompressResult:
         """Copy the driver, record frames, and compress it."""
         export_stack(DRIVER, self._source, force=self.force)
-        # frames to calibrate on, and others to compare on, of the next seed
+        # Frames to calibrate on, and others to compare on, of the next seed
         folders = {self._frames: CALIBRATION_FRAMES, self._held_out: HELD_OUT_FRAMES}
         for seed, (folder, count) in enumerate(folders.items()):
             frames = FramesOptions(count=count, seed=seed, force=self.force)
             record_frames(self._source, folder, frames, listener)
-        # fidelity is measured on frames of another seed, see `compare`
+        # Fidelity is measured on frames of another seed, see `compare`
         options = CompressOptions(
             target=DEFAULT_TARGET, measure_frames=0, allow_empty=True, force=self.force
         )
-        result = compress(
-            self._source, self._small, RECIPE, self._frames, options, listener
-        )
+        files = self._source, self._small
+        result = compress(*files, RECIPE, self._frames, options, listener)
         self._sections.append(Section("The passes", result.tables()))
         plan = plan_of(result.report.model)
         if plan is not None:
@@ -169,7 +165,7 @@ class DriverDemo:
 
     def drive(self, listener: Listener) -> DriveResult:
         """Drive the routes with both, and write the report."""
-        # a study of two variants under ideal conditions
+        # A study of two variants under ideal conditions
         everything = load_routes()
         study = Study(
             f"{DRIVER} before and after {RECIPE}",
@@ -183,7 +179,7 @@ class DriverDemo:
         )
         engine = LocalEngine(WORKERS)
         result = run_study(study, self.out, engine, listener, force=self.force)
-        # its report, with the demo's own sections and the files linked from the page
+        # Its report, with the demo's own sections and the files linked from the page
         files = (
             ("the driver", self._source),
             ("the small one", self._small),
@@ -193,8 +189,8 @@ class DriverDemo:
             ("held out", self._held_out),
             ("drives", self.out / "results"),
         )
-        there = ((words, path.name) for words, path in files if path.exists())
-        linked = Section("Files", files=(*there, ("for programs", JSON)))
+        links = ((words, path.name) for words, path in files if path.exists())
+        linked = Section("Files", files=(*links, ("for programs", JSON)))
         words = ("me2e-compress", "demo", "-o", str(self.out))
         sections = (*self._sections, linked)
         written = write_study(result, self.out, words, sections, force=self.force)

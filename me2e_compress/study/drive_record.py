@@ -4,8 +4,10 @@ A drive of 220 routes takes 30 MB of episodes and 0.1 MB of these lines.
 """
 
 import json
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any, Self
 
@@ -70,7 +72,7 @@ class DriveRecord:
     ) -> Self:
         """Summarize episodes; ``made_by`` loses its redundant list of routes."""
         kept = {key: value for key, value in made_by.items() if key != "routes"}
-        routes = (RouteSummary.of(each).rounded() for each in episodes)
+        routes = (RouteSummary.of(episode).rounded() for episode in episodes)
         return cls(variant, condition, tuple(routes), kept)
 
     @property
@@ -81,9 +83,9 @@ class DriveRecord:
     @property
     def mean_latency_us(self) -> int | None:
         """Mean latency of a decision; None without decisions."""
-        decisions = sum(each.decisions for each in self.routes)
-        taken = sum(each.latency_sum_us for each in self.routes)
-        return round(taken / decisions) if decisions else None
+        decisions = sum(route.decisions for route in self.routes)
+        total_us = sum(route.latency_sum_us for route in self.routes)
+        return round(total_us / decisions) if decisions else None
 
     def values(self, column: RouteColumn) -> RouteValues:
         """Return one number of every route; of a drive not made, the reason."""
@@ -97,31 +99,25 @@ class DriveRecord:
 
     def to_json(self) -> dict[str, Any]:
         """Return scores, difference and routes, as they stand in the study's JSON."""
+        keys = ("route", "driving_score", "room_kept", "succeeded", "ending")
+        routes = list[dict[str, Any]]()
+        for route in self.routes:
+            moments = [{"kind": kind, "time_us": us} for kind, us in route.moments]
+            own = {key: getattr(route, key) for key in keys}
+            routes.append({**own, "infractions": moments})
         return {
             "scheme": self.variant,
             "condition": self.condition,
             "reason": self.reason or None,
             "scores": self.scores,
             "difference": self.difference,
-            "routes": [
-                {
-                    "route": each.route,
-                    "driving_score": each.driving_score,
-                    "room_kept": each.room_kept,
-                    "succeeded": each.succeeded,
-                    "ending": each.ending,
-                    "infractions": [
-                        {"kind": kind, "time_us": us} for kind, us in each.moments
-                    ],
-                }
-                for each in self.routes
-            ],
+            "routes": routes,
         }
 
     def save(self, path: Path) -> None:
         """Write it as JSON lines: the fingerprint, then one line per route."""
         head = asdict(_Head(self.variant, self.condition, dict(self.made_by)))
-        rows = [_ROUTE.dump_python(each, mode="json") for each in self.routes]
+        rows = [_ROUTE.dump_python(route, mode="json") for route in self.routes]
         lines = [json.dumps(row, ensure_ascii=False) for row in (head, *rows)]
         with drafts.writing_errors(path, StudyError):
             path.parent.mkdir(parents=True, exist_ok=True)
@@ -138,8 +134,8 @@ class DriveRecord:
             first, *rows = map(documents.from_json, text.splitlines())
             head = _HEAD.validate_python(first)
             routes = tuple(_ROUTE.validate_python(row) for row in rows)
-            names = [each.route for each in routes]
-            if twice := [name for name in names if names.count(name) > 1]:
+            counts = Counter(route.route for route in routes)
+            if twice := [name for name, count in counts.items() if count > 1]:
                 raise documents.MalformedError(f"names route {twice[0]} twice")
             if not isinstance(head.made_by.get("set_size"), int):
                 raise documents.MalformedError("it does not say of how many routes")
@@ -161,11 +157,10 @@ def compared(
     pairs: Sequence[tuple[str, str]], drives: Sequence[DriveRecord], seed: int
 ) -> tuple[Comparison, ...]:
     """Compare pairs of drives (``VARIANT.CONDITION``) if both were driven."""
-    there = {each.name: each for each in drives if each.routes}
+    driven = {drive.name: drive for drive in drives if drive.routes}
     comparisons = list[Comparison]()
     for one, other in pairs:
-        if one in there and other in there:
-            ours, theirs = there[one], there[other]
-            gaps = (ours.minus(theirs, column, seed) for column in (DS, ROOM, SR))
-            comparisons.append(Comparison(one, other, *gaps))
+        if one in driven and other in driven:
+            minus = partial(driven[one].minus, driven[other], seed=seed)
+            comparisons.append(Comparison(one, other, *map(minus, (DS, ROOM, SR))))
     return tuple(comparisons)

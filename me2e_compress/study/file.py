@@ -42,7 +42,7 @@ def load_study(
         EvaluationError: Routes or latency are unknown.
         ProviderError: A provider or library is missing.
     """
-    # read the file, and check its form; options of the caller take precedence
+    # Read the file and check its form; options of the caller take precedence
     path = Path(path)
     content = _content(path)
     which = content.pop("routes", None) if routes is None else routes
@@ -59,24 +59,20 @@ def load_study(
         raise StudyError(f"{path}: {error}") from error
     if study.to_record is not None and (study.frames or study.held_out):
         raise StudyError(f"{path}: give folders of frames, or what to record, not both")
-    # what the caller names needs no trust
-    made = [
-        each.policy
-        for each in study.variants
-        if isinstance(driver_named(each.policy), PythonDriver)
-    ]
-    theirs = () if provider else study.provider.plugins
-    code = [*made, *map(str, (*study.plugins, *theirs))]
+    # Check that code is trusted, but for what the caller names
+    policies = [variant.policy for variant in study.variants]
+    code = [text for text in policies if isinstance(driver_named(text), PythonDriver)]
+    code += map(str, (*study.plugins, *(() if provider else study.provider.plugins)))
     if code and not trust_code:
         raise StudyError(
             f"{path} runs code: {code[0]}; look at it first, then say --trust-code"
         )
+    # Plugins of the study belong to its provider
     plugins = (*study.provider.plugins, *study.plugins)
-    study = dataclasses.replace(
-        study, provider=dataclasses.replace(study.provider, plugins=plugins), plugins=()
-    )
-    study.provider.check()
-    # routes are the evaluator's, which may take none
+    owner = dataclasses.replace(study.provider, plugins=plugins)
+    study = dataclasses.replace(study, provider=owner, plugins=())
+    owner.check()
+    # Find the routes; an evaluator may take none
     if which is None and "routes" in study.driven_by.takes:
         which = "all"
     if which is not None:
@@ -90,7 +86,7 @@ def load_study(
 
 
 def _content(path: Path) -> dict[str, object]:
-    """Return the tables of a file."""
+    """Return the keys and tables of a study's file."""
     if not path.exists():
         raise StudyError(f"no study {path}: no such file")
     with documents.reading(path, StudyError, "not TOML"):
@@ -103,7 +99,7 @@ def _content(path: Path) -> dict[str, object]:
 def _complaint(error: ValidationError) -> str:
     """Describe the first error; unknown keys go first, as they may explain others."""
     errors = error.errors(include_url=False)
-    unknown = [each for each in errors if each["type"] == "unexpected_keyword_argument"]
+    unknown = [e for e in errors if e["type"] == "unexpected_keyword_argument"]
     first = (unknown or errors)[0]
     where = ".".join(map(str, first["loc"]))
     if not unknown:

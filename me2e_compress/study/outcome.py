@@ -10,6 +10,7 @@ import platform
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from pathlib import Path
 
 from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.driving.latency import LatencySource
@@ -48,12 +49,12 @@ class Clock:
     load: Load | None = None
 
     def latencies(self, prepared: PreparedVariant) -> dict[int, Measure]:
-        """Return the percentiles that are shown; none of no model."""
+        """Return the shown percentiles of a variant; without a model, the reason."""
         if prepared.model is None:
             unknown = Measure(None, "ms", prepared.failure or "no model")
             return dict.fromkeys(LATENCY_PERCENTILES, unknown)
-        name = prepared.variant.name
-        return {each: self.latency(name, each) for each in LATENCY_PERCENTILES}
+        shown = LATENCY_PERCENTILES
+        return {percent: self.latency(prepared.name, percent) for percent in shown}
 
     def latency(self, variant: str, percent: float) -> Measure:
         """Return a percentile on the device, ms; None without enough samples."""
@@ -88,28 +89,25 @@ def time_all(
         EvaluationError: A trace cannot be read or written, or the baseline's median,
             which sets the device scale, is zero.
     """
-    traces = {
-        each.variant.name: LatencyTrace.load(each.variant.trace)
-        for each in prepared
-        if each.variant.trace is not None
-    }
-    measured = dict[str, LatencyTrace]()
+    traces, measured = dict[str, LatencyTrace](), dict[str, LatencyTrace]()
+    for variant in (own.variant for own in prepared):
+        if variant.trace is not None:
+            traces[variant.name] = LatencyTrace.load(variant.trace)
     reason = "no held-out frames were given"
     if study.held_out is not None:
         reason = "not a model"
-        timed = [each for each in prepared if each.model and not each.variant.trace]
-        frames = CalibrationSet(study.held_out)
-        measured = _measured(study, frames, timed, workspace, listener)
-    # the highest load under which a trace was measured here
-    known = [each.others for each in measured.values() if each.others is not None]
-    load = max(known, key=lambda load: load.others, default=None)
+        timed = [own for own in prepared if own.model and not own.variant.trace]
+        measured = _measure_traces(study, study.held_out, timed, workspace, listener)
+    # Find the highest load under which a trace was measured here
+    loads = [trace.others for trace in measured.values() if trace.others is not None]
+    load = max(loads, key=lambda load: load.others, default=None)
     traces |= measured
     return Clock(traces, _scale(study, traces), reason, load)
 
 
-def _measured(
+def _measure_traces(
     study: Study,
-    frames: CalibrationSet,
+    held_out: Path,
     timed: Sequence[PreparedVariant],
     workspace: Workspace,
     listener: Listener,
@@ -119,24 +117,25 @@ def _measured(
     Models measured together share their noise, and a machine's speed varies from day to
     day: traces are kept as a set, of the same models, machine, samples and frames.
     """
-    timing = study.timing
+    # Load the set if it is complete
+    timing, frames = study.timing, CalibrationSet(held_out)
     machine = in_turn_text(timing.threads, study.provider)
     parts = machine, str(timing.samples), frames.fingerprint
-    digests = (f"{each.variant.name} {each.sha256}" for each in timed)
+    digests = (f"{own.name} {own.sha256}" for own in timed)
     key = hashlib.sha256("\n".join((*parts, *digests)).encode()).hexdigest()
-    paths = {each.variant.name: workspace.trace(each.variant, key) for each in timed}
+    paths = {own.name: workspace.trace(own.variant, key) for own in timed}
     if all(path.is_file() for path in paths.values()):
         return {name: LatencyTrace.load(path) for name, path in paths.items()}
     traces = record_traces(
-        {each.variant.name: each.model for each in timed if each.model is not None},
+        {own.name: own.model for own in timed if own.model is not None},
         frames,
-        metadata={each.variant.name: each.metadata for each in timed},
+        metadata={own.name: own.metadata for own in timed},
         samples=timing.samples,
         threads=timing.threads,
         provider=study.provider,
         on_sample=partial(listener.on_progress, "latency"),
     )
-    # a kill between leaves no whole set: all are measured again
+    # A kill while they are written leaves no complete set: all are measured again
     for name, path in paths.items():
         traces[name] = replace(traces[name], frames=frames.fingerprint)
         traces[name].save(path)
@@ -145,24 +144,22 @@ def _measured(
 
 def _scale(study: Study, traces: Mapping[str, LatencyTrace]) -> float:
     """Choose the one scale that gives the baseline the requested median."""
-    wanted_s = study.timing.baseline_median_s
-    if wanted_s is None:
+    median_s, baseline = study.timing.baseline_median_s, study.baseline
+    if median_s is None:
         return 1.0
-    if study.baseline not in traces:
+    if baseline not in traces:
         raise EvaluationError(
-            f"latency: the device scale needs a median of {wanted_s} s of "
-            f"{study.baseline}, and there is no trace of it"
+            f"latency: the device scale needs a median of {median_s} s of {baseline},"
+            " and there is no trace of it"
         )
-    median_us = traces[study.baseline].percentile_us(50)
-    if not median_us:
-        raise EvaluationError(
-            f"latency: {study.baseline} has a median of 0 us: no scale makes it "
-            f"{wanted_s} s"
-        )
-    return 1e6 * wanted_s / median_us
+    measured_us = traces[baseline].percentile_us(50)
+    if not measured_us:
+        words = f"latency: {baseline} has a median of 0 us: no scale makes it"
+        raise EvaluationError(f"{words} {median_s} s")
+    return 1e6 * median_s / measured_us
 
 
-def judge(
+def compare_plans(
     study: Study,
     baseline: PreparedVariant,
     prepared: PreparedVariant,
@@ -172,29 +169,25 @@ def judge(
 
     A model with another interface is not an error: the result has a reason instead.
     """
-    # reasons why there is nothing to compare
+    # Reasons why there is nothing to compare
     if study.held_out is None:
         return PlanFidelity.unknown("no held-out frames were given")
     if prepared.model is None or baseline.model is None:
-        lacks = prepared if prepared.model is None else baseline
-        why = prepared.failure or f"{lacks.variant.name} is not a model"
-        return PlanFidelity.unknown(why)
+        lacking = prepared if prepared.model is None else baseline
+        return PlanFidelity.unknown(
+            prepared.failure or f"{lacking.name} is not a model"
+        )
     if prepared is baseline:
         return PlanFidelity.unknown("the baseline itself")
-    # both models over all held-out frames
-    recording = CalibrationSet(study.held_out)
-    stage = f"fidelity of {prepared.variant.name}"
-    left, right = (
-        Session(path, provider=study.provider, metadata=metadata)
-        for path, metadata in (
-            (baseline.model, baseline.metadata),
-            (prepared.model, prepared.metadata),
-        )
-    )
+    # Run both models over all held-out frames
+    recording, provider = CalibrationSet(study.held_out), study.provider
+    left = Session(baseline.model, provider=provider, metadata=baseline.metadata)
+    right = Session(prepared.model, provider=provider, metadata=prepared.metadata)
 
     def reported() -> Iterator[Frame]:
+        stage, total = f"fidelity of {prepared.name}", len(recording)
         for frame in recording:
-            listener.on_progress(stage, frame.index, len(recording), "frames")
+            listener.on_progress(stage, frame.index, total, "frames")
             yield frame
 
     try:
@@ -203,15 +196,15 @@ def judge(
         return PlanFidelity.unknown(str(error))
     if fidelity.plan is None:
         return PlanFidelity.unknown(fidelity.plan_reason)
-    if not math.isfinite(fidelity.plan.max_m):
+    plan, output = fidelity.plan, fidelity.plan_output
+    if not math.isfinite(plan.max_m):
         return PlanFidelity.unknown("its plan is not finite")
-    # an identical plan has an infinite ratio
-    noise = {each.name: each.sqnr_db for each in fidelity.outputs}[fidelity.plan_output]
-    sqnr = Measure(None, "dB", EXACT if noise == math.inf else "no plan")
-    if math.isfinite(noise):
-        sqnr = Measure(noise, "dB")
-    mean_m, max_m = fidelity.plan.mean_m, fidelity.plan.max_m
-    metres = Measure(mean_m, "m"), Measure(max_m, "m")
+    # An identical plan has an infinite ratio
+    noise_db = next(own.sqnr_db for own in fidelity.outputs if own.name == output)
+    sqnr = Measure(None, "dB", EXACT if noise_db == math.inf else "no plan")
+    if math.isfinite(noise_db):
+        sqnr = Measure(noise_db, "dB")
+    metres = Measure(plan.mean_m, "m"), Measure(plan.max_m, "m")
     return PlanFidelity(*metres, sqnr, fidelity.frames)
 
 

@@ -127,12 +127,12 @@ def prepare_variant(
     study: Study, variant: Variant, workspace: Workspace, listener: Listener
 ) -> PreparedVariant:
     """Find or make a variant's driver, and open it once."""
-    # drivers without a file need no preparation
+    # Drivers without a file need no preparation
     driver = driver_named(variant.policy, variant.adapter, variant.module_map)
     if not isinstance(driver, OnnxDriver):
         study.driven_by.check_policy(driver)
         return PreparedVariant(variant, driver)
-    # apply the passes, if there are any
+    # Apply the passes, if there are any
     model = source = driver.path
     if not source.is_file():
         raise StudyError(f"variant {variant.name}: {source}: no such model")
@@ -140,31 +140,25 @@ def prepare_variant(
         model = _compressed(study, variant, source, workspace, listener)
     stage = HOST_STAGES.parse(variant.host_stage) if variant.host_stage else None
     driver = replace(driver, path=model, provider=study.provider, host_stage=stage)
-    # fail early on a model that cannot run or drive
+    # Fail early on a model that cannot run or drive
     try_first(model, model.name, listener=listener, provider=study.provider)
     study.driven_by.check_policy(driver)
-    # origin of the file
-    sha256 = graph.sha256_of(model)
+    # Find what made the file, its state and its plan
     origin = source.name, to_text(variant.passes)
     if not variant.passes:
-        origin = _reported_beside(model) or origin
+        origin = _origin_from_report(model) or origin
     loaded = graph.load(model)
-    weights = loaded.metadata_props.get(WEIGHTS, "")
-    metadata, known = state_and_plan(
-        loaded, model, variant.adapter, variant.module_map, {}
-    )
+    own = variant.adapter, variant.module_map
+    metadata, known = state_and_plan(loaded, model, *own, {})
     if slow := slow_here(loaded, study.provider):
         listener.on_warning(f"variant {variant.name}: {slow}")
-    size = graph.file_bytes(model)
-    return PreparedVariant(
-        *(variant, driver, model, *origin, sha256, size),
-        weights=weights,
-        metadata=metadata,
-        known=known,
-    )
+    facts = (*origin, graph.sha256_of(model), graph.file_bytes(model))
+    prepared = PreparedVariant(variant, driver, model, *facts)
+    weights = loaded.metadata_props.get(WEIGHTS, "")
+    return replace(prepared, weights=weights, metadata=metadata, known=known)
 
 
-def _reported_beside(model: Path) -> tuple[str, str] | None:
+def _origin_from_report(model: Path) -> tuple[str, str] | None:
     """Read source and passes from the report next to a file, if it is of that file."""
     try:
         report = documents.from_json(sidecar(model, "report").read_bytes())
@@ -186,7 +180,7 @@ def _compressed(
     frames = None if study.frames is None else CalibrationSet(study.frames)
     path = workspace.model(variant, _key(study, variant, source, frames))
     if path.is_file() and sidecar(path, "report").is_file():
-        if _reported_beside(path) is not None:
+        if _origin_from_report(path) is not None:
             return path
         listener.on_warning(f"{path}: not what its report is of: made again")
     stage = f"compress {variant.name}"
@@ -194,17 +188,17 @@ def _compressed(
     def report(_: str, done: int, total: int, words: str) -> None:
         listener.on_progress(stage, done, total, words)
 
-    # The study measures on frames of its own; nothing int8 is a finding, not an end.
+    # The study measures on its own frames; a result without int8 is no error here
     options = CompressOptions(
-        force=True,  # what is in the workspace is its own affair
+        force=True,  # files in the workspace may be replaced
         module_map=variant.module_map,
         adapter=variant.adapter,
         provider=study.provider,
         measure_frames=0,
         allow_empty=True,
     )
-    heard = Listener(report, listener.on_warning)
-    compress(source, path, variant.passes, study.frames, options, heard)
+    own = Listener(report, listener.on_warning)
+    compress(source, path, variant.passes, study.frames, options, own)
     return path
 
 
@@ -213,7 +207,7 @@ def _key(
 ) -> str:
     """Hash everything that decides the result of the passes."""
     modules, contents = variant.module_map, list[str]()
-    for file in (file for each in variant.passes for file in each.files()):
+    for file in (file for step in variant.passes for file in step.files()):
         try:
             contents.append(hashlib.sha256(file.read_bytes()).hexdigest())
         except OSError as error:
@@ -227,7 +221,7 @@ def _key(
         "" if frames is None else frames.fingerprint,
         "" if modules is None else repr(ModuleMap.load(modules)),
         str(study.seed),
-        # as before there was a choice, so that what was made then is still found
+        # the key of models made before these options existed stays valid
         *(() if study.provider == CPU else (PROVIDERS.text(study.provider),)),
         *(() if variant.adapter is None else (graph.sha256_of(variant.adapter),)),
         *contents,

@@ -16,12 +16,7 @@ from me2e_compress.study.condition import Condition
 from me2e_compress.study.definition import Study
 from me2e_compress.study.drive_record import DriveRecord
 from me2e_compress.study.file import load_study
-from me2e_compress.study.outcome import (
-    Clock,
-    judge,
-    this_machine,
-    time_all,
-)
+from me2e_compress.study.outcome import Clock, compare_plans, this_machine, time_all
 from me2e_compress.study.prepared import PreparedVariant, prepare_all
 from me2e_compress.study.study_result import StudyResult
 from me2e_compress.study.workspace import HTML, JSON, MARKDOWN, Workspace
@@ -57,7 +52,7 @@ def run_study(
         Me2eError: The baseline cannot drive, frames do not fit, or the folder belongs
             to another study. Another variant that fails is left out, with a warning.
     """
-    # check everything before any work
+    # Check everything before any work
     study = load_study(study) if isinstance(study, str | Path) else study
     study.check()
     if engine not in (None, LocalEngine()):
@@ -67,49 +62,44 @@ def run_study(
     check_replaceable([folder / name for name in (JSON, MARKDOWN, HTML)], force=force)
     with writing(folders=[folder]):
         cells, prepared = prepare_study(study, folder, engine, listener)
-        # plans and drives of every variant are compared with the baseline's
+        # Compare plans and drives of every variant with the baseline's
         study, clock = cells.study, cells.clock
-        baseline = next(each for each in prepared if each.variant == study.reference)
-        variants = [
-            replace(
-                each,
-                latency_ms=clock.latencies(each),
-                fidelity=judge(study, baseline, each, listener),
-            )
-            for each in prepared
-        ]
-        drives = tuple(
-            drive
-            for condition in study.conditions
-            for drive in cells.under(condition, prepared)
+        baseline = next(own for own in prepared if own.variant == study.reference)
+        variants, drives = list[PreparedVariant](), list[DriveRecord]()
+        for own in prepared:
+            fidelity = compare_plans(study, baseline, own, listener)
+            latencies = clock.latencies(own)
+            variants.append(replace(own, latency_ms=latencies, fidelity=fidelity))
+        for condition in study.conditions:
+            drives += cells.drive_variants(condition, prepared)
+        compared, made_by = (
+            (tuple(variants), tuple(drives)),
+            (this_machine(), versions()),
         )
-        made_by = this_machine(), versions()
-        return StudyResult(
-            *(study, tuple(variants), drives, clock.scale, *made_by, clock.load)
-        )
+        return StudyResult(study, *compared, clock.scale, *made_by, clock.load)
 
 
 def prepare_study(
     study: Study, folder: Path, engine: Engine | None, listener: Listener
 ) -> tuple["StudyCells", list[PreparedVariant]]:
     """Record frames, make the models and time them; return what drives them."""
-    # frames are recorded unless they exist; those held out are of the next seed, so
-    # of other routes
-    workspace, asked = Workspace(folder), study.to_record
-    if asked is not None:
+    # Record frames unless they exist; those held out are of the next seed, so of other
+    # routes
+    workspace, wanted, baseline = Workspace(folder), study.to_record, study.reference
+    if wanted is not None:
         frames, held_out = folder / "frames", folder / "frames-held-out"
-        for place, count, seed in (
-            (frames, asked.frames, asked.seed),
-            (held_out, asked.held_out, asked.seed + 1),
-        ):
+        counts = {frames: wanted.frames, held_out: wanted.held_out}
+        for seed, (place, count) in enumerate(counts.items(), wanted.seed):
             if not (place / "scenes.json").is_file():
                 folder.mkdir(parents=True, exist_ok=True)
-                by, provider = study.reference, study.provider
                 options = FramesOptions(
-                    count=count, seed=seed, adapter=by.adapter, provider=provider,
-                    module_map=by.module_map,
-                )  # fmt: skip
-                record_frames(Path(by.policy), place, options, listener)
+                    count=count,
+                    seed=seed,
+                    adapter=baseline.adapter,
+                    provider=study.provider,
+                    module_map=baseline.module_map,
+                )
+                record_frames(Path(baseline.policy), place, options, listener)
         study = replace(study, frames=frames, held_out=held_out, to_record=None)
     prepared = prepare_all(study, workspace, listener)
     clock = time_all(study, prepared, workspace, listener)
@@ -127,41 +117,37 @@ class StudyCells:
     listener: Listener
     means_us: dict[str, int] = field(default_factory=dict)
 
-    def under(
+    def drive_variants(
         self, condition: Condition, prepared: Sequence[PreparedVariant]
-    ) -> tuple[DriveRecord, ...]:
+    ) -> list[DriveRecord]:
         """Drive the variants of one condition, the baseline first."""
         driven, baseline = self.study.driven_under(condition), self.study.baseline
-        prepared = [each for each in prepared if each.variant in driven]
-        # the baseline drives first: others are compared with it
-        ordered = sorted(prepared, key=lambda each: each.variant.name != baseline)
-        records = {e.variant.name: self._driven(e, condition) for e in ordered}
+        prepared = [own for own in prepared if own.variant in driven]
+        # The baseline drives first: others are compared with it
+        ordered = sorted(prepared, key=lambda own: own.name != baseline)
+        records = {own.name: self._drive_cell(own, condition) for own in ordered}
         for name, record in records.items():
             if name != baseline and record.routes and records[baseline].routes:
                 reference, seed = records[baseline].routes, self.study.seed
                 gap = difference(record.routes, reference, seed)
                 records[name] = replace(record, difference=gap)
-        return tuple(records[each.variant.name] for each in prepared)
+        return [records[own.name] for own in prepared]
 
     def drive(self, prepared: PreparedVariant, condition: Condition) -> Drive | None:
         """Return what a cell drives; None without a driver or its latency."""
+        study, name = self.study, condition.name
         if prepared.failure:
             return None
         if not condition.mean_of:
-            latency = self.clock.source(prepared.variant, condition, self.study.seed)
+            latency = self.clock.source(prepared.variant, condition, study.seed)
         else:
-            if condition.name not in self.means_us:
-                self.means_us[condition.name] = self._mean_us(condition)
-            latency = FixedLatency(self.means_us[condition.name])
+            if name not in self.means_us:
+                self.means_us[name] = self._mean_us(condition)
+            latency = FixedLatency(self.means_us[name])
         if latency is None:
             return None
-        return replace(
-            condition.drive,
-            latency=latency,
-            routes=self.study.routes,
-            set_size=self.study.set_size,
-            engine=self.engine,
-        )
+        drive = replace(condition.drive, latency=latency, engine=self.engine)
+        return replace(drive, routes=study.routes, set_size=study.set_size)
 
     def _mean_us(self, condition: Condition) -> int:
         """Return the mean decision of a drive, which must be done."""
@@ -173,9 +159,14 @@ class StudyCells:
             )
         return mean_us
 
-    def _driven(self, prepared: PreparedVariant, condition: Condition) -> DriveRecord:
-        """Drive a cell, or go on; record and score it. No routes without a drive."""
-        study, names = self.study, (prepared.variant.name, condition.name)
+    def _drive_cell(
+        self, prepared: PreparedVariant, condition: Condition
+    ) -> DriveRecord:
+        """Drive a variant under a condition, or resume it; record and score it.
+
+        A cell that cannot be driven has no routes but a reason.
+        """
+        study, names = self.study, (prepared.name, condition.name)
         drive = self.drive(prepared, condition)
         if drive is None:
             why = f"its latency was not measured: {self.clock.reason}"

@@ -18,10 +18,11 @@ from me2e_compress.study.drive_record import Comparison, DriveRecord, compared
 from me2e_compress.study.prepared import PreparedVariant
 from me2e_compress.workflows.result import Result, View, plain
 
-SCORES = tuple(each.name for each in COLUMNS)
+SCORES = tuple(column.name for column in COLUMNS)
 MOST_ROUTES = 40
 """With more routes than this, the table of endings is left out."""
 COSTS = ("size MB", "p50 ms", "p99 ms", "plan m", "SQNR dB")
+GAPS = ("DS, points", "DS, other types", "room, points", "SR, points")
 
 
 @dataclass(frozen=True, repr=False)
@@ -52,14 +53,14 @@ class StudyResult(Result):
     @property
     def timed(self) -> bool:
         """Whether the latency of any variant is known."""
-        return any(each.latency_ms[50].value is not None for each in self.variants)
+        return any(own.latency_ms[50].value is not None for own in self.variants)
 
     @property
     def coverage(self) -> tuple[int, int]:
         """Number of routes driven, and of routes in the whole set."""
         if self.study.routes:
             return len(self.study.routes), self.study.set_size
-        scores = [each.scores for each in self.drives if each.scores is not None]
+        scores = [drive.scores for drive in self.drives if drive.scores is not None]
         return (scores[0].routes, scores[0].expected) if scores else (0, 0)
 
     def label(self, drive: DriveRecord) -> str:
@@ -81,32 +82,30 @@ class StudyResult(Result):
 
     def variant(self, name: str) -> PreparedVariant:
         """Return a variant by its name."""
-        return next(each for each in self.variants if each.name == name)
+        return next(variant for variant in self.variants if variant.name == name)
 
     def view(self) -> View:
         """Return the title with numbers, every table, what failed, a busy machine."""
         study, (driven, whole) = self.study, self.coverage
-        alerts = (
-            *(
-                f"variant {each.name} was left out: {each.failure}"
-                for each in self.variants
-                if each.failure
-            ),
-            *(
-                f"{each.variant}, {each.condition}: {each.scores.failed}"
-                for each in self.drives
-                if each.scores is not None and each.scores.failed
-            ),
-            *([str(self.load)] if self.load is not None and self.load.busy else []),
-        )
-        return View(
+        headline = (
             f"{study.title}: {plural(len(study.variants), 'variant')} under"
             f" {plural(len(study.conditions), 'condition')} on {driven} of"
-            f" {plural(whole, 'route')}",
-            chain.from_iterable(self.tables_by_section.values()),
-            [f"{each.name}: {each.known}" for each in self.variants if each.known],
-            alerts,
+            f" {plural(whole, 'route')}"
         )
+        lines, alerts = list[str](), list[str]()
+        for variant in self.variants:
+            if variant.known:
+                lines.append(f"{variant.name}: {variant.known}")
+            if variant.failure:
+                alerts.append(f"variant {variant.name} was left out: {variant.failure}")
+        for drive in self.drives:
+            if drive.scores is not None and drive.scores.failed:
+                words = f"{drive.variant}, {drive.condition}: {drive.scores.failed}"
+                alerts.append(words)
+        if self.load is not None and self.load.busy:
+            alerts.append(str(self.load))
+        tables = chain.from_iterable(self.tables_by_section.values())
+        return View(headline, tables, lines, alerts)
 
     @cached_property
     def tables_by_section(self) -> Mapping[str, tuple[Table, ...]]:
@@ -165,7 +164,7 @@ def scoreboard(result: StudyResult) -> Table:
         "Bench2Drive's tools (b2d), each with its 95 % interval over these scenario "
         f"types. {MISSING} means not measured."
     )
-    # what the columns of costs are
+    # What the columns of costs are
     if result.timed:
         scale = result.device_scale
         kind = f"times {scale:.3g}, one device scale for all"
@@ -175,55 +174,44 @@ def scoreboard(result: StudyResult) -> Table:
         f" Plan and SQNR: how far waypoints move from {study.baseline}'s on held-out"
         " frames, and the noise on them."
     )
-    costs = {
-        each.name: (
-            measure_cell(each.size_mb, ".2f"),
-            measure_cell(each.latency_ms[50], ".1f"),
-            measure_cell(each.latency_ms[99], ".1f"),
-            measure_cell(each.fidelity.plan_mean, ".3f"),
-            measure_cell(each.fidelity.plan_sqnr, ".1f"),
-        )
-        for each in result.variants
-    }
-    rows = tuple(
-        (Cell(result.label(each)), *_scores(each), *costs[each.variant])
-        for each in result.drives
-    )
+    rows = list[tuple[Cell, ...]]()
+    for drive in result.drives:
+        costs = _cost_cells(result.variant(drive.variant))
+        rows.append((Cell(result.label(drive)), *_score_cells(drive), *costs))
     columns = ("variant", *SCORES, *COSTS)
-    return Table("Scoreboard", columns, rows, note, study.baseline)
+    return Table("Scoreboard", columns, tuple(rows), note, study.baseline)
 
 
-def _scores(drive: DriveRecord) -> tuple[Cell, ...]:
-    if drive.scores is None:
+def _cost_cells(variant: PreparedVariant) -> tuple[Cell, ...]:
+    """Return one cell for each of `COSTS`."""
+    latency, fidelity = variant.latency_ms, variant.fidelity
+    measures = (variant.size_mb, latency[50], latency[99], fidelity.plan_mean)
+    forms = (".2f", ".1f", ".1f", ".3f", ".1f")
+    return tuple(map(measure_cell, (*measures, fidelity.plan_sqnr), forms))
+
+
+def _score_cells(drive: DriveRecord) -> tuple[Cell, ...]:
+    """Return one cell for each of `SCORES`."""
+    if (scores := drive.scores) is None:
         return (Cell(MISSING, reason=drive.reason),) * len(SCORES)
-    of = drive.scores
-    shown = (
-        *(of.driving_score, of.safety.room_kept, of.success_rate, of.efficiency),
-        *(of.bench2drive_efficiency, of.comfort, of.bench2drive_smoothness),
-    )
-    return tuple(map(estimate_cell, shown))
+    own = scores.driving_score, scores.safety.room_kept, scores.success_rate
+    means = scores.efficiency, scores.bench2drive_efficiency
+    comfort = scores.comfort, scores.bench2drive_smoothness
+    return tuple(map(estimate_cell, (*own, *means, *comfort)))
 
 
 def difference_table(result: StudyResult) -> Table:
     """Show every variant minus the baseline, paired by route."""
-    labels = [each for each in result.drives if each.difference is not None]
-    gaps = [each.difference for each in labels if each.difference is not None]
+    compared = [(own, gap) for own in result.drives if (gap := own.difference)]
+    gaps = [gap for _, gap in compared]
     # p-values are corrected for all comparisons shown
-    corrected = holm([each.p_value for each in gaps])
-    rows = tuple(
-        (
-            Cell(result.label(drive)),
-            *_gaps(gap),
-            *map(Cell, (f"{p:.2g}", str(gap.better), str(gap.worse))),
-        )
-        for drive, gap, p in zip(labels, gaps, corrected, strict=True)
-    )
-    columns = (
-        *("variant", "DS, points", "DS, other types", "room, points"),
-        *("SR, points", "SR p", "routes better", "routes worse"),
-    )
+    corrected, rows = holm([gap.p_value for gap in gaps]), list[tuple[Cell, ...]]()
+    for (drive, gap), p in zip(compared, corrected, strict=True):
+        counts = map(Cell, (f"{p:.2g}", str(gap.better), str(gap.worse)))
+        rows.append((Cell(result.label(drive)), *_gap_cells(gap), *counts))
+    columns = ("variant", *GAPS, "SR p", "routes better", "routes worse")
     title = f"Difference to {result.study.baseline} on the same routes"
-    return Table(title, columns, rows, _differences_note(gaps))
+    return Table(title, columns, tuple(rows), _differences_note(gaps))
 
 
 def _differences_note(gaps: Sequence[PairedDifference]) -> str:
@@ -232,7 +220,7 @@ def _differences_note(gaps: Sequence[PairedDifference]) -> str:
         'shows no difference. It is for routes of these scenario types; "DS, other '
         "types\" for types drawn anew. SR p: McNemar's exact test"
     )
-    # several comparisons: the correction, and its limits
+    # Several comparisons: the correction, and its limits
     if len(gaps) > 1:
         note += (
             f", corrected for {len(gaps)} comparisons (Holm). Each interval is a 95 % "
@@ -240,69 +228,64 @@ def _differences_note(gaps: Sequence[PairedDifference]) -> str:
             "differs"
         )
     note += "."
-    # what so few routes cannot show
+    # What so few routes cannot show
     if gaps:
         on, least = plural(gaps[0].driving_score.n, "route"), gaps[0].smallest_shown
         note += f" {on} cannot show a difference below {least:.1f} points."
-    alike = [each for each in gaps if not each.differ]
+    alike = [gap for gap in gaps if not gap.differ]
     if alike:
         routes, share = alike[0].driving_score.n, alike[0].unseen_percent
         note += f" Where 0 of {routes} routes differ, at most {share:.1f} % do (95 %)."
     return note
 
 
-def _gaps(of: Comparison | PairedDifference) -> tuple[Cell, ...]:
-    """Show differences: driving score with both intervals, room kept, success rate."""
-    estimates = of.driving_score, of.room_kept, of.success_rate
-    score, room, rate = (estimate_cell(each, signed=True) for each in estimates)
-    return score, anew_cell(of.driving_score), room, rate
+def _gap_cells(gap: Comparison | PairedDifference) -> tuple[Cell, ...]:
+    """Return one cell for each of `GAPS`."""
+    estimates = gap.driving_score, gap.room_kept, gap.success_rate
+    score, room, rate = (estimate_cell(own, signed=True) for own in estimates)
+    return score, anew_cell(gap.driving_score), room, rate
 
 
 def abilities(result: StudyResult) -> Table:
     """Show the success rate by ability of every drive."""
     columns = ("variant", *(name.replace("_", " ") for name in ABILITIES), "mean")
-    rows = tuple(
-        (
-            Cell(result.label(each)),
-            *map(estimate_cell, (*of.each_ability.values(), of.abilities)),
-        )
-        for each in result.drives
-        if (of := each.scores) is not None
-    )
+    rows = list[tuple[Cell, ...]]()
+    for drive in result.drives:
+        if (scores := drive.scores) is not None:
+            shown = (*scores.each_ability.values(), scores.abilities)
+            rows.append((Cell(result.label(drive)), *map(estimate_cell, shown)))
     note = (
         "A route may test two abilities. Intervals are exact, the mean's by bootstrap."
     )
     title, strong = "Success by ability in %", result.study.baseline
-    return Table(title, columns, rows, note, strong)
+    return Table(title, columns, tuple(rows), note, strong)
 
 
 def pair_table(result: StudyResult) -> Table:
     """Show the pairs of drives that the study names."""
     rows = tuple(
-        (Cell(each.drive), Cell(each.against), *_gaps(each)) for each in result.pairs
-    )
-    columns = (
-        *("drive", "against", "DS, points", "DS, other types", "room, points"),
-        "SR, points",
+        (Cell(pair.drive), Cell(pair.against), *_gap_cells(pair))
+        for pair in result.pairs
     )
     note = (
         "The first drive minus the second, mean over routes with its 95 % interval: one"
         " that holds zero shows no difference."
     )
-    return Table("Pairs of drives on the same routes", columns, rows, note)
+    title, columns = "Pairs of drives on the same routes", ("drive", "against", *GAPS)
+    return Table(title, columns, rows, note)
 
 
 def route_tables(result: StudyResult) -> tuple[Table, ...]:
     """Show how each route ended for each driver; nothing if there are too many."""
-    driven = [each for each in result.drives if each.routes]
+    driven = [drive for drive in result.drives if drive.routes]
     if not driven or len(driven[0].routes) > MOST_ROUTES:
         return ()
     rows = list[tuple[Cell, ...]]()
-    for routes in zip(*(each.routes for each in driven), strict=True):
+    for routes in zip(*(drive.routes for drive in driven), strict=True):
         cells = [Cell(routes[0].route)]
-        for each in routes:
-            room = "" if each.room_kept is None else f"; room {each.room_kept:.0f} %"
-            cells.append(Cell(f"{each.driving_score:.1f}", f"{each.fate}{room}"))
+        for end in routes:
+            room = "" if end.room_kept is None else f"; room {end.room_kept:.0f} %"
+            cells.append(Cell(f"{end.driving_score:.1f}", f"{end.fate}{room}"))
         rows.append(tuple(cells))
     columns = ("route", *map(result.label, driven))
     note = "Driving score, why it is not 100, and the room kept to others."
@@ -317,21 +300,18 @@ def near_misses(result: StudyResult) -> Table:
         cells = (Cell(MISSING, reason=drive.reason),) * len(columns)
         if drive.scores is not None:
             safety = drive.scores.safety
+            least = safety.smallest_ttc, safety.smallest_pet, safety.smallest_distance
             cells = (
                 estimate_cell(safety.ttc_exposure),
-                estimate_cell(safety.smallest_ttc, ".2f"),
-                estimate_cell(safety.smallest_pet, ".2f"),
-                estimate_cell(safety.smallest_distance, ".2f"),
+                *(estimate_cell(smallest, ".2f") for smallest in least),
                 estimate_cell(safety.at_fault_collisions),
             )
         rows.append((Cell(result.label(drive)), *cells))
-    return Table(
-        "Near misses",
-        ("variant", *columns),
-        tuple(rows),
+    note = (
         "Means over routes with their 95 % intervals: share of the time with a time to "
         "collision below 1.5 s, the least of a route, post-encroachment time of "
         "crossing paths, smallest distance; and routes with a collision that the ego "
-        "could have prevented. Least TTC and PET exist on some routes only.",
-        result.study.baseline,
+        "could have prevented. Least TTC and PET exist on some routes only."
     )
+    heads = ("variant", *columns)
+    return Table("Near misses", heads, tuple(rows), note, result.study.baseline)

@@ -47,9 +47,9 @@ class Workload(Result):
         """Return numbers of drives and routes, the time left, and a row per drive."""
         headline = f"{self.title}: {plural(len(self.drives), 'drive')}"
         if self.set_size:
-            routes = sum(each.routes for each in self.drives)
-            done = sum(each.done for each in self.drives)
-            left = format_duration(3600 * sum(each.hours for each in self.drives))
+            routes = sum(drive.routes for drive in self.drives)
+            done = sum(drive.done for drive in self.drives)
+            left = format_duration(3600 * sum(drive.hours for drive in self.drives))
             how = "by this folder's logs" if self.measured else "an estimate"
             headline += (
                 f", {plural(routes, 'route')}, {done:,} of them driven; about"
@@ -57,14 +57,11 @@ class Workload(Result):
             )
         else:
             headline += ", of routes that the evaluator knows"
-        columns = ("variant", "condition", "routes driven", "time left")
-        rows = [
-            (
-                *(each.variant, each.condition, f"{each.done} of {each.routes}"),
-                format_duration(3600 * each.hours),
-            )
-            for each in self.drives
-        ]
+        columns, rows = ("variant", "condition", "routes driven", "time left"), []
+        for drive in self.drives:
+            driven = f"{drive.done} of {drive.routes}"
+            hours = format_duration(3600 * drive.hours)
+            rows.append((drive.variant, drive.condition, driven, hours))
         return View(headline, [table("Drives", columns, rows, words=2)])
 
 
@@ -73,33 +70,33 @@ def workload(study: Study, folder: str | Path, workers: int = 1) -> Workload:
 
     A route costs world frames and decisions; the condition decides their ratio.
     """
-    # speed of this machine, from earlier logs if possible
-    place = Workspace(Path(folder))
-    known = _logged(place.folder)
+    # Speed of this machine, from earlier logs if possible
+    place, total = Workspace(Path(folder)), len(study.routes)
+    known = _logged_speed(place.folder)
     frame_s, decision_s = known or (FRAME_S, DECISION_S)
     drives = list[PlannedDrive]()
     for condition in study.conditions:
-        period = held_frames(study, condition)
+        period = frames_per_decision(study, condition)
         for variant in study.driven_under(condition):
-            # frames and decisions of the missing routes
-            kept = place.folder / "results" / place.drive(variant, condition) / "routes"
+            # Frames and decisions of the missing routes
+            name = place.drive(variant, condition)
+            finished = place.folder / "results" / name / "routes"
             recorded = place.record(variant, condition).is_file()
-            left = [
+            left_s = [
                 study.driven_by.expected_s(route)
                 for route in study.routes
-                if not recorded and not (kept / f"{route.id}.json").is_file()
+                if not recorded and not (finished / f"{route.id}.json").is_file()
             ]
-            frames = 1e6 * sum(left) / condition.drive.dt_us
+            frames = 1e6 * sum(left_s) / condition.drive.dt_us
             hours = frames * (frame_s + decision_s / period) / 3600 / workers
-            total = len(study.routes)
-            names = variant.name, condition.name
-            drives.append(PlannedDrive(*names, total - len(left), total, hours))
+            counts = total - len(left_s), total
+            drives.append(PlannedDrive(variant.name, condition.name, *counts, hours))
     measured = known is not None
     return Workload(study.title, tuple(drives), study.set_size, workers, measured)
 
 
-def held_frames(study: Study, condition: Condition) -> int:
-    """Return how many frames a decision is held: n + 1 of equation 4.
+def frames_per_decision(study: Study, condition: Condition) -> int:
+    """Return the number of frames that a decision is in force: n + 1 of equation 4.
 
     Frames are the condition's steps. For a trace, or a mean of one, it is based on the
     baseline's median on the device, if the study states it, with no road users in view.
@@ -107,7 +104,7 @@ def held_frames(study: Study, condition: Condition) -> int:
     if condition.drive.latency_model is LatencyModel.FIFO:
         return 1
     if condition.mean_of:
-        return held_frames(study, study.drive_of(condition.mean_of)[1])
+        return frames_per_decision(study, study.drive_of(condition.mean_of)[1])
     latency_us = round(1e6 * (study.timing.baseline_median_s or 0.0))
     source = condition.source(study.seed).with_trace((latency_us,), 1.0)
     nobody = DecisionFacts(latency_us, np.empty((0, 2)))
@@ -115,7 +112,7 @@ def held_frames(study: Study, condition: Condition) -> int:
     return skipped_decisions(latency_us, condition.drive.dt_us) + 1
 
 
-def _logged(folder: Path) -> tuple[float, float] | None:
+def _logged_speed(folder: Path) -> tuple[float, float] | None:
     """Scale the seconds of frame and decision to the logs; None with too few logs."""
     rows = [
         json.loads(line)

@@ -15,11 +15,10 @@ from matplotlib.figure import Figure
 from matplotlib.style import context
 
 from me2e_compress.display import cell_text
-from me2e_compress.metrics.measure import Estimate, Measure
+from me2e_compress.metrics.measure import Estimate
 from me2e_compress.metrics.scores import Scores
 from me2e_compress.study.cells import estimate_cell, measure_cell, number
 from me2e_compress.study.drive_record import DriveRecord
-from me2e_compress.study.prepared import PreparedVariant
 from me2e_compress.study.study_result import StudyResult
 
 INK, MUTED, RULE = "#1d2127", "#6b7480", "#d9dde3"
@@ -103,66 +102,62 @@ def answer(outcome: StudyResult) -> Markup:
     A row a variant, with a line for every condition in the panel of the driving score;
     of too many drives those under the first condition alone.
     """
-    conditions = outcome.study.conditions
-    names = {each.name for each in conditions}
+    names = [condition.name for condition in outcome.study.conditions]
     if len(outcome.drives) > MOST_DRIVES:
-        names = {conditions[0].name}
-    # a variant is as high as its drives, and stands in their middle
-    places, drives, top = dict[str, float](), list[tuple[float, DriveRecord]](), 0
+        names = names[:1]
+    # A variant is as high as its drives, and stands in their middle
+    places, rows, top = dict[str, float](), list[tuple[float, DriveRecord]](), 0
     for variant in outcome.variants:
-        theirs = [e for e in outcome.drives if e.variant == variant.name]
-        shown = [each for each in theirs if each.condition in names]
+        theirs = (drive for drive in outcome.drives if drive.variant == variant.name)
+        shown = [drive for drive in theirs if drive.condition in names]
+        rows += enumerate(shown, top)
         height = max(1, len(shown))
         places[variant.name] = top + (height - 1) / 2
-        drives += [(top + line, each) for line, each in enumerate(shown)]
         top += height
-    # the words of a cost say which share of the baseline's it is
-    panels = [*_costs(outcome, places), _road(outcome, drives, len(names) > 1)]
-    return _drawn(places, top, panels)
+    # A cost names its share of the baseline's
+    panels = [
+        *_cost_panels(outcome, places),
+        _score_panel(outcome, rows, len(names) > 1),
+    ]
+    return _draw_panels(places, top, panels)
 
 
 def road(outcome: StudyResult) -> Markup:
     """Draw the scores of every drive."""
     rows = list(enumerate(outcome.drives))
-    panels = [_road(outcome, rows)] * (len(outcome.drives) > MOST_DRIVES)
-    scored = [(place, e.variant, e.scores) for place, e in rows if e.scores]
-    panels += [
-        Panel(
-            title,
-            [Mark.of(at, _colour(outcome, who), pick(of)) for at, who, of in scored],
-            most=most,
-        )
-        for title, most, pick in SCORES
-    ]
-    return _drawn({outcome.label(e): i for i, e in rows}, len(rows), panels)
+    panels = [_score_panel(outcome, rows)] * (len(outcome.drives) > MOST_DRIVES)
+    for title, most, pick in SCORES:
+        marks = [
+            Mark.of(place, _colour(outcome, drive.variant), pick(drive.scores))
+            for place, drive in rows
+            if drive.scores
+        ]
+        panels.append(Panel(title, marks, most=most))
+    names = {outcome.label(drive): place for place, drive in rows}
+    return _draw_panels(names, len(rows), panels)
 
 
 def differences(outcome: StudyResult) -> Markup | None:
     """Draw every difference to the baseline with its interval; None without one."""
-    rows = [(each, gap) for each in outcome.drives if (gap := each.difference)]
+    rows = [(drive, gap) for drive in outcome.drives if (gap := drive.difference)]
     if not rows:
         return None
-    gaps = [gap for _, gap in rows]
-    panels = {
-        "Driving score, points": [each.driving_score for each in gaps],
-        "Success rate, points": [each.success_rate for each in gaps],
-        "Room kept to others, points": [each.room_kept for each in gaps],
+    gaps = {
+        "Driving score, points": [gap.driving_score for _, gap in rows],
+        "Success rate, points": [gap.success_rate for _, gap in rows],
+        "Room kept to others, points": [gap.room_kept for _, gap in rows],
     }
-    names = {outcome.label(each): place for place, (each, _) in enumerate(rows)}
-    return _drawn(
-        names,
-        len(rows),
-        [
-            Panel(title, [_difference(*each) for each in enumerate(of)], signed=True)
-            for title, of in panels.items()
-        ],
-    )
+    panels = list[Panel]()
+    for title, estimates in gaps.items():
+        marks = [_difference_mark(place, gap) for place, gap in enumerate(estimates)]
+        panels.append(Panel(title, marks, signed=True))
+    names = {outcome.label(drive): place for place, (drive, _) in enumerate(rows)}
+    return _draw_panels(names, len(rows), panels)
 
 
-def _difference(place: int, gap: Estimate) -> Mark:
+def _difference_mark(place: int, gap: Estimate) -> Mark:
     words = cell_text(estimate_cell(gap, signed=True))
-    colour = ACCENT if gap.sign else MUTED
-    ends = gap.low, gap.high
+    colour, ends = ACCENT if gap.sign else MUTED, (gap.low, gap.high)
     return Mark(place, colour, words, gap.value, *ends, filled=bool(gap.sign))
 
 
@@ -170,35 +165,32 @@ def _colour(outcome: StudyResult, variant: str) -> str:
     return BASELINE if variant == outcome.study.baseline else ACCENT
 
 
-def _costs(outcome: StudyResult, places: Mapping[str, float]) -> Iterator[Panel]:
-    """Yield the panels of what is known without a drive; none of what nobody has."""
+def _cost_panels(outcome: StudyResult, places: Mapping[str, float]) -> Iterator[Panel]:
+    """Yield the panels of size, time and plan, which are known without a drive."""
     baseline = outcome.variant(outcome.study.baseline)
-
-    def bar(of: PreparedVariant, measure: Measure, its: Measure, form: str) -> Mark:
-        words = measure_cell(measure, form).text
-        if of is not baseline and measure.value is not None and its.value:
-            words += f" ({100.0 * measure.value / its.value:.0f} %)"
-        colour = _colour(outcome, of.name)
-        return Mark(places[of.name], colour, words, measure.value)
-
-    def plan(of: PreparedVariant) -> Mark:
-        mean, most = of.fidelity.plan_mean, of.fidelity.plan_max.value
+    sizes, times, plans = list[Mark](), list[Mark](), list[Mark]()
+    for own in outcome.variants:
+        place, colour = places[own.name], _colour(outcome, own.name)
+        for marks, measure, its, form in (
+            (sizes, own.size_mb, baseline.size_mb, ".2f"),
+            (times, own.latency_ms[50], baseline.latency_ms[50], ".1f"),
+        ):
+            words = measure_cell(measure, form).text
+            if own is not baseline and measure.value is not None and its.value:
+                words += f" ({100.0 * measure.value / its.value:.0f} %)"
+            marks.append(Mark(place, colour, words, measure.value))
+        mean, most = own.fidelity.plan_mean, own.fidelity.plan_max.value
         words = measure_cell(mean, ".2f").text
         if most is not None:
             words += f" (at most {number(most, '.2f')})"
-        words = "the reference" if of is baseline else words
-        colour = _colour(outcome, of.name)
-        return Mark(places[of.name], colour, words, mean.value, mean.value, most)
-
-    variants, p50 = outcome.variants, baseline.latency_ms[50]
-    sizes = [bar(each, each.size_mb, baseline.size_mb, ".2f") for each in variants]
-    times = [bar(each, each.latency_ms[50], p50, ".1f") for each in variants]
+        words = "the reference" if own is baseline else words
+        plans.append(Mark(place, colour, words, mean.value, mean.value, most))
     yield Panel("File, MB", sizes, bars=True)
     yield Panel("Time of a decision, ms", times, bars=True)
-    yield Panel("Plan moves by, m", [plan(each) for each in variants])
+    yield Panel("Plan moves by, m", plans)
 
 
-def _road(
+def _score_panel(
     outcome: StudyResult, rows: Iterable[tuple[float, DriveRecord]], named: bool = False
 ) -> Panel:
     """Return the panel of driving scores, with the condition's name if asked for."""
@@ -208,38 +200,40 @@ def _road(
         if drive.scores is None:
             words = f"{name}: not driven" if name else "not driven"
             marks.append(Mark(place, colour, words, None))
-            continue
-        marks.append(Mark.of(place, colour, drive.scores.driving_score, name))
+        else:
+            marks.append(Mark.of(place, colour, drive.scores.driving_score, name))
     return Panel("Driving score, 0 to 100", marks, most=100.0)
 
 
-def _drawn(names: Mapping[str, float], rows: int, panels: Sequence[Panel]) -> Markup:
+def _draw_panels(
+    names: Mapping[str, float], rows: int, panels: Sequence[Panel]
+) -> Markup:
     """Draw panels side by side; names stand at their places of so many rows."""
     with styled():
         height = FRAME_IN + rows * (ROW_IN if rows <= MANY_ROWS else LOW_ROW_IN)
         figure = Figure(figsize=(WIDTH_IN, height))
         figure.set_layout_engine("constrained", wspace=0.07)
         axes = figure.subplots(1, len(panels), sharey=True, squeeze=False)[0]
-        for each, panel in zip(axes, panels, strict=True):
-            _draw(each, panel)
+        for column, panel in zip(axes, panels, strict=True):
+            _draw_panel(column, panel)
         lines = [textwrap.fill(name, LONGEST_NAME) for name in names]
         axes[0].set_yticks(list(names.values()), lines, color=INK)
         axes[0].set_ylim(rows - 0.4, -0.75)
-        # a rule between names
-        for each in axes:
+        # A rule between names
+        for column in axes:
             for one, other in itertools.pairwise(names.values()):
-                each.axhline((one + other) / 2 - 0.17, color=RULE, linewidth=0.6)
+                column.axhline((one + other) / 2 - 0.17, color=RULE, linewidth=0.6)
         return svg(figure)
 
 
-def _draw(axes: Axes, panel: Panel) -> None:
+def _draw_panel(axes: Axes, panel: Panel) -> None:
     """Draw the marks of a panel, each below its words."""
     axes.grid(visible=True, axis="x")
     axes.spines["left"].set_visible(False)
     axes.locator_params(axis="x", nbins=4)
     axes.set_title(panel.title, color=INK, fontweight="bold")
     for mark in panel.marks:
-        # words are above, where no other mark is
+        # Words are above, where no other mark is
         axes.annotate(
             mark.words,
             (0.0, mark.place),
@@ -266,10 +260,9 @@ def _draw(axes: Axes, panel: Panel) -> None:
             [mark.value], row[:1], "o", color=mark.colour, markersize=5.5,
             markerfacecolor=fill, clip_on=False,
         )  # fmt: skip
-    # an axis shows zero, and what can be reached
-    known = [
-        end for e in panel.marks for end in (e.value, e.low, e.high) if end is not None
-    ]
+    # An axis shows zero, and what can be reached
+    shown = (end for mark in panel.marks for end in (mark.value, mark.low, mark.high))
+    known = [end for end in shown if end is not None]
     most = panel.most or 1.06 * max(known, default=0.0) or 1.0
     if panel.signed:
         axes.axvline(0.0, color=INK, linewidth=0.8)

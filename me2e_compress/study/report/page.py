@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
@@ -14,7 +15,6 @@ from me2e_compress.registry import drafts
 from me2e_compress.registry.drafts import MARK
 from me2e_compress.runtime.atomic import write_bytes, write_document
 from me2e_compress.study.cells import estimate_cell
-from me2e_compress.study.drive_record import DriveRecord
 from me2e_compress.study.report.figures import MOST_DRIVES, answer, differences, road
 from me2e_compress.study.study_result import StudyResult
 from me2e_compress.study.workspace import HTML, JSON, MARKDOWN
@@ -83,7 +83,7 @@ def study_page(
     outcome: StudyResult, command: Sequence[str] = (), sections: Sequence[Section] = ()
 ) -> Page:
     """Return the page of a comparison; ``sections`` stand before how it was made."""
-    # what the variants were made of, and how they were timed
+    # What the variants were made of, and how they were timed
     variants = list[tuple[str, str, str | None]]()
     for prepared in outcome.variants:
         made_of = prepared.source or prepared.variant.policy
@@ -128,7 +128,7 @@ def _sections(outcome: StudyResult) -> list[Section]:
     )
     drawings = {"On the road": (Drawing(road(outcome), note),)}
     titles = {"Differences": f"Differences to {baseline} on the same routes"}
-    # without a difference there is nothing to compare
+    # Without a difference there is nothing to compare
     if (gaps := differences(outcome)) is None:
         tables["Differences"] = ()
     else:
@@ -149,7 +149,7 @@ def _sections(outcome: StudyResult) -> list[Section]:
 def _lede(outcome: StudyResult) -> str:
     study, (driven, whole) = outcome.study, outcome.coverage
     share = "" if driven == whole else f"{driven} of "
-    described = "; ".join(outcome.described(each) for each in study.conditions)
+    described = "; ".join(map(outcome.described, study.conditions))
     return (
         f"Drivers compared in closed loop on the same {share}{plural(whole, 'route')}"
         f" of {study.driven_by.label}. {described}."
@@ -159,7 +159,7 @@ def _lede(outcome: StudyResult) -> str:
 def _how_to_read(outcome: StudyResult) -> str:
     """Say what the bars, dots and lines of the answer are."""
     study = outcome.study
-    frames = max(each.fidelity.frames for each in outcome.variants)
+    frames = max(variant.fidelity.frames for variant in outcome.variants)
     notes = [f"Black: {study.baseline}, which the others are compared with."]
     if outcome.timed:
         notes.append("Time: median of one inference.")
@@ -196,44 +196,39 @@ def findings(outcome: StudyResult) -> tuple[tuple[str, str], ...]:
             for one, other, what in compared
             if one.value is not None and other.value
         ]
-        drives = [each for each in outcome.drives if each.variant == variant.name]
-        parts = [", ".join(costs), *(_road(each, several) for each in drives)]
+        parts = [", ".join(costs)]
+        for drive in outcome.drives:
+            if drive.variant == variant.name and (gap := drive.difference) is not None:
+                where = f"{drive.condition}: " if several else ""
+                points = estimate_cell(gap.driving_score, signed=True)
+                interval = f" ({points.detail})" * bool(points.detail)
+                score = f"{points.text} points{interval}"
+                parts.append(f"{where}driving score {score}, {gap.verdict}")
         words = "; ".join(filter(None, parts)) or "nothing could be compared"
         sentences.append((variant.name, f"{words}."))
     return tuple(sentences)
 
 
-def _road(drive: DriveRecord, several: bool) -> str:
-    where = f"{drive.condition}: " if several else ""
-    if drive.difference is None:
-        return ""
-    points = estimate_cell(drive.difference.driving_score, signed=True)
-    words = f"{points.text} points" + f" ({points.detail})" * bool(points.detail)
-    return f"{where}driving score {words}, {drive.difference.verdict}"
-
-
 def limits(outcome: StudyResult) -> str:
     """Say what differences are, and what so many routes cannot show; or nothing."""
-    gaps = [each.difference for each in outcome.drives if each.difference is not None]
+    gaps = [gap for drive in outcome.drives if (gap := drive.difference) is not None]
     if not gaps:
         return ""
-    (routes, whole), least = outcome.coverage, max(e.smallest_shown for e in gaps)
+    (routes, whole), least = outcome.coverage, max(gap.smallest_shown for gap in gaps)
     rest = f", all {whole} none below {shown_by(whole):.1f}" if routes < whole else ""
     note = (
         f"Differences to {outcome.study.baseline} on the same routes, in brackets the"
         f" 95 % interval of the mean. {plural(routes, 'route')} cannot show a"
         f" difference below {least:.1f} points of driving score{rest}."
     )
-    free = [each.name for each in outcome.study.conditions if each.latency == "none"]
+    free = [own.name for own in outcome.study.conditions if own.latency == "none"]
     if free:
-        note += (
-            f" Decisions cost no time under {', '.join(free)}: no latency shows there."
-        )
+        under = ", ".join(free)
+        note += f" Decisions cost no time under {under}: no latency shows there."
     return note
 
 
-@dataclass(frozen=True)
-class StudyFiles:
+class StudyFiles(NamedTuple):
     """Paths of the JSON record, Markdown tables and HTML report of a study."""
 
     record: Path
@@ -262,19 +257,16 @@ def write_study(
         StudyError: The folder cannot be written.
         GraphError: A file is there that we did not write.
     """
-    # paths, and all tables as Markdown
+    # Paths, and all tables as Markdown
     folder = Path(folder)
     written = StudyFiles(folder / JSON, folder / MARKDOWN, folder / HTML)
     heading = f"{drafts.IN_MARKDOWN}# {escape_markdown(outcome.title)}\n\n"
     text = heading + "\n".join(table.markdown() for table in outcome.tables())
     page = study_page(outcome, command, sections)
-    # all files are written, or none
+    # Write all files, or none
     with drafts.writing_errors(folder, StudyError):
         folder.mkdir(parents=True, exist_ok=True)
-        with (
-            writing([written.record, written.tables, written.report], force=force),
-            drafts.all_or_none(),
-        ):
+        with writing(written, force=force), drafts.all_or_none():
             write_document(written.record, outcome.to_json(), indent=1)
             write_bytes(written.tables, text.encode())
             write_bytes(written.report, page.html().encode())

@@ -11,7 +11,7 @@ from me2e_compress.metrics.route_summary import RouteSummary
 from me2e_compress.simulator.routes import Route
 from me2e_compress.study import Study
 from me2e_compress.study.drive_record import DriveRecord
-from me2e_compress.study.workload import held_frames
+from me2e_compress.study.workload import frames_per_decision
 
 LOST = {"minus-map": 60.0, "minus-motion": 10.0, "full": 6.0, "prediction": 3.0}
 KINDS = (InfractionKind.COLLISION_VEHICLE, InfractionKind.COLLISION_LAYOUT)
@@ -20,7 +20,7 @@ KINDS = (InfractionKind.COLLISION_VEHICLE, InfractionKind.COLLISION_LAYOUT)
 def write_records(study: Study, folder: Path) -> Path:
     """Write a record for every drive of a study, and facts for every variant."""
     for condition in study.conditions:
-        late = held_frames(study, condition) - 1
+        late = frames_per_decision(study, condition) - 1
         for variant in study.driven_under(condition):
             name = variant.name
             lost = 0.2 * late**2 + sum(LOST[k] for k in LOST if k in name)
