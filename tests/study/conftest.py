@@ -51,13 +51,13 @@ def make(models: Path) -> Make:
 
 @pytest.fixture(scope="session")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The folder of the study that is found."""
-    return tmp_path_factory.mktemp("found")
+    """The folder in which the study of `result` ran."""
+    return tmp_path_factory.mktemp("study")
 
 
 @pytest.fixture(scope="session")
-def found(models: Path, folder: Path) -> StudyResult:
-    """What the study finds in the first seconds of its routes."""
+def result(models: Path, folder: Path) -> StudyResult:
+    """The result of the study, whose routes end after some seconds."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(runner, "TIMEOUT_US", 16_000_000)
         return run_study(asked(models), folder, Here())

@@ -50,18 +50,25 @@ def asked(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, models: Path) -> Path
 
 
 def test_another_evaluator_drives_a_study(asked: Path, tmp_path: Path) -> None:
-    found = run_study(asked, tmp_path / "out")
+    result = run_study(asked, tmp_path / "out")
 
-    assert isinstance(found, StudyResult)
-    assert found.coverage == (3, 5)
-    scores = [each.scores.driving_score.value for each in found.drives if each.scores]
+    assert isinstance(result, StudyResult)
+    assert result.coverage == (3, 5)
+    scores = [
+        drive.scores.driving_score.value for drive in result.drives if drive.scores
+    ]
     assert scores == [100.0, 50.0] * 2
-    difference = found.drives[1].difference
+    difference = result.drives[1].difference
     assert difference is not None
     assert difference.driving_score.value == -50.0
-    assert [each.mean_latency_us for each in found.drives] == [0, 0, 250_000, 250_000]
-    assert "3 of 5 routes" in found.headline
-    written = write_study(found, tmp_path / "out")
+    assert [drive.mean_latency_us for drive in result.drives] == [
+        0,
+        0,
+        250_000,
+        250_000,
+    ]
+    assert "3 of 5 routes" in result.headline
+    written = write_study(result, tmp_path / "out")
     page = written.report.read_text(encoding="utf-8")
     assert "the same 3 of 5 routes of lanes{count=5}" in page
     document = json.loads(written.record.read_text(encoding="utf-8"))
@@ -94,9 +101,8 @@ def test_a_short_study_takes_seconds_not_0_0_hours() -> None:
     drive = PlannedDrive("float", "ideal", 0, 1, 20 / 3600)
     ahead = Workload("Short", (drive,), 220, 1, False)
 
-    assert (
-        "1 drive, 1 route, 0 of them driven; about 20 s on 1 worker" in ahead.headline
-    )
+    words = "1 drive, 1 route, 0 of them driven; about 20 s on 1 worker"
+    assert words in ahead.headline
     assert ahead.tables()[0].rows[0][-1].text == "20 s"
 
 
@@ -120,11 +126,10 @@ def provided(make: Make, tmp_path: Path) -> Study:
 @pytest.fixture
 def opened(monkeypatch: pytest.MonkeyPatch) -> list[tuple[Path, ...]]:
     """The libraries of every session that is opened; none is loaded."""
-    found: list[tuple[Path, ...]] = []
-    monkeypatch.setattr(
-        CpuProvider, "attach", lambda self, options: found.append(self.plugins)
-    )
-    return found
+    plugins: list[tuple[Path, ...]] = []
+    attach = lambda self, options: plugins.append(self.plugins)  # noqa: E731
+    monkeypatch.setattr(CpuProvider, "attach", attach)
+    return plugins
 
 
 @pytest.mark.usefixtures("short")

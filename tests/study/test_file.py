@@ -63,9 +63,8 @@ def test_everything_that_a_file_says(models: Path) -> None:
     assert (len(study.routes), study.set_size) == (3, 220)
     assert study.timing.baseline_median_s == 0.43
     assert study.held_out == models / "frames"
-    assert [variant.policy for variant in study.variants] == [
-        str(models / "slow.onnx")
-    ] * 3
+    policies = [variant.policy for variant in study.variants]
+    assert policies == [str(models / "slow.onnx")] * 3
     exact = recipe.load("exact")
     assert [len(variant.passes) for variant in study.variants] == [0, len(exact), 2]
     assert study.conditions == (Condition("ideal", "none"),)
@@ -113,7 +112,7 @@ def test_files_lie_beside_the_study(models: Path, tmp_path: Path) -> None:
     study = load_study(write(tmp_path, text.replace('"exact"', '"my.toml"')))
 
     assert (study.routes, study.set_size) == ((CROSSING, PARKED), 2)
-    assert [each.name for each in study.variants[1].passes] == ["fold-constants"]
+    assert [step.name for step in study.variants[1].passes] == ["fold-constants"]
 
 
 def test_a_name_that_is_no_file_is_one_that_ships_whatever_is_where_you_are(
@@ -168,30 +167,15 @@ def test_provider_and_routes_of_the_command_line_win(models: Path) -> None:
         ("title =", "titel =", StudyError, "no key titel"),
         ("[latency]", "[timing]", StudyError, "no key timing"),
         ("samples", "sample", StudyError, r"no key latency\.sample"),
-        (
-            "routes = 3",
-            "seed = -1",
-            StudyError,
-            "seed: Input should be greater than or",
-        ),
-        (
-            "baseline_median_s = 0.43",
-            "baseline_median_s = 0.0",
-            StudyError,
-            r"latency\.baseline_median_s: Input should be greater than 0",
-        ),
+        ("routes = 3", "seed = -1", StudyError, "seed: Input should be greater than"),
+        ("median_s = 0.43", "median_s = 0.0", StudyError, r"latency\.base.* than 0"),
         (
             "[latency]",
             "[record]\nframes = 0\nheld_out = 4\n[latency]",
             StudyError,
             r"record\.frames: Input should be greater than or equal to 1",
         ),
-        (
-            'name = "small"',
-            'name = "small"\nrecip = "exact"',
-            StudyError,
-            r"no key variant\.1\.recip",
-        ),
+        ("small", 'small"\nrecip = "exact', StudyError, r"no key variant\.1\.recip"),
         (
             'latency = "none"',
             'latency = "none"\nlimit_fps = 5',
@@ -242,14 +226,14 @@ def test_variants_that_name_no_policy_take_the_study_s_and_drive_every_route(
 
     ours = str(shipped_model("highway"))
     named = str(models / "slow.onnx")
-    assert [each.policy for each in study.variants] == [ours, ours, named]
+    assert [variant.policy for variant in study.variants] == [ours, ours, named]
     assert study.routes == load_routes()
 
 
 def test_the_study_of_the_documents_is_one(tmp_path: Path) -> None:
     page = Path(__file__).parents[2] / "docs" / "study.md"
-    found = re.findall(r"```toml\n(.*?)```", page.read_text("utf-8"), re.DOTALL)
-    whole, *parts = found
+    blocks = re.findall(r"```toml\n(.*?)```", page.read_text("utf-8"), re.DOTALL)
+    whole, *parts = blocks
 
     for name in ("frames", "held-out"):
         write_frames(tmp_path / name, command=np.array([3]))
@@ -263,5 +247,5 @@ def test_the_study_of_the_documents_is_one(tmp_path: Path) -> None:
     ours = [part for part in parts if "[[pair]]" not in part]
     of_parts = load_study(write(tmp_path, "\n".join((folders.sub("", whole), *ours))))
 
-    assert [each.name for each in of_parts.blocks] == ["table-3"]
+    assert [block.name for block in of_parts.blocks] == ["table-3"]
     assert of_parts.to_record == FramesToRecord(256, 64)

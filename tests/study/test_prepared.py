@@ -46,28 +46,26 @@ def made(study: Study, folder: Path) -> PreparedVariant:
 @pytest.mark.usefixtures("weights")
 def test_passes_are_run_on_a_model_that_ships(make: Make, tmp_path: Path) -> None:
     variant = Variant("small", "highway", recipe.parse("eliminate-redundant"))
-    study = make(variants=(variant,), baseline="small")
 
-    found = made(study, tmp_path)
+    result = made(make(variants=(variant,), baseline="small"), tmp_path)
 
-    assert found.model is not None
-    assert found.model.parent == tmp_path / "models"
+    assert result.model is not None
+    assert result.model.parent == tmp_path / "models"
 
 
 def test_passes_make_a_model_of_their_own(study: Study, tmp_path: Path) -> None:
     source = Path(study.variants[0].policy)
     before = source.read_bytes()
 
-    found = made(study, tmp_path)
+    result = made(study, tmp_path)
 
-    assert found.model is not None
-    assert found.model.parent == tmp_path / "models"
-    assert found.sha256 == graph.sha256_of(found.model)
-    assert found.size_bytes == found.model.stat().st_size
-    assert "ablate-modules" in found.pipeline
-    assert "occupancy" not in [
-        out.name for out in graph.load(found.model).graph.outputs
-    ]
+    assert result.model is not None
+    assert result.model.parent == tmp_path / "models"
+    assert result.sha256 == graph.sha256_of(result.model)
+    assert result.size_bytes == result.model.stat().st_size
+    assert "ablate-modules" in result.pipeline
+    outputs = graph.load(result.model).graph.outputs
+    assert "occupancy" not in [output.name for output in outputs]
     assert source.read_bytes() == before
 
 
@@ -86,20 +84,18 @@ def test_what_decides_the_model_decides_its_name(
     study: Study, tmp_path: Path, change: str
 ) -> None:
     first, variant = made(study, tmp_path), study.variants[0]
-    if change == "frames":
-        write_images(tmp_path / "others", 1)
-        study = dataclasses.replace(study, frames=tmp_path / "others")
-    elif change == "seed":
-        study = dataclasses.replace(study, seed=1)
-    elif change == "adapter":
-        (tmp_path / "a.toml").write_text("")
-        variant = dataclasses.replace(variant, adapter=tmp_path / "a.toml")
-        study = dataclasses.replace(study, variants=(variant,))
-    elif change == "source":
+    (tmp_path / "a.toml").write_text("")
+    write_images(tmp_path / "others", 1)
+    if change == "source":
         write_model(tmp_path / "m.onnx", seed=1)
+    elif change == "adapter":
+        variant = dataclasses.replace(variant, adapter=tmp_path / "a.toml")
+    elif change == "passes":
+        variant = dataclasses.replace(variant, passes=recipe.load("minus-map"))
     else:
-        other = dataclasses.replace(variant, passes=recipe.load("minus-map"))
-        study = dataclasses.replace(study, variants=(other,))
+        values = {"frames": tmp_path / "others", "seed": 1}
+        study = dataclasses.replace(study, **{change: values[change]})  # type: ignore[arg-type]
+    study = dataclasses.replace(study, variants=(variant,))
 
     assert made(study, tmp_path).model != first.model
 
@@ -132,9 +128,9 @@ def test_the_same_is_made_once_and_an_altered_model_again(
     assert again == first
     assert graph.sha256_of(first.model) == first.sha256
     assert json.loads(report.read_text())["output"]["sha256"] == first.sha256
-    repeated = [each for each in warnings if "made again" in each]
-    told = [f"{first.model}: not what its report is of: made again"]
-    assert repeated == ([] if damage in ("", "no report") else told)
+    repeated = [warning for warning in warnings if "made again" in warning]
+    sentences = [f"{first.model}: not what its report is of: made again"]
+    assert repeated == ([] if damage in ("", "no report") else sentences)
 
 
 def with_overrides(study: Study, file: Path) -> Study:
@@ -164,9 +160,8 @@ def test_a_file_that_a_pass_reads_and_that_is_gone(
 ) -> None:
     asked = with_overrides(study, tmp_path / "gone.toml")
 
-    with pytest.raises(
-        StudyError, match=r"minus-occ: \S+gone\.toml: cannot be read: No"
-    ):
+    words = r"minus-occ: \S+gone\.toml: cannot be read: No"
+    with pytest.raises(StudyError, match=words):
         made(asked, tmp_path)
 
 
@@ -175,13 +170,12 @@ def test_what_made_a_file_is_read_from_the_report_beside_it(
 ) -> None:
     first = made(study, tmp_path)
     assert first.model is not None
-    plain = dataclasses.replace(
-        study, variants=(Variant("minus-occ", str(first.model)),)
-    )
+    variants = (Variant("minus-occ", str(first.model)),)
+    plain = dataclasses.replace(study, variants=variants)
 
-    found = made(plain, tmp_path)
+    result = made(plain, tmp_path)
 
-    assert (found.source, found.pipeline) == ("m.onnx", first.pipeline)
+    assert (result.source, result.pipeline) == ("m.onnx", first.pipeline)
     write_model(first.model, seed=3)
     assert made(plain, tmp_path).pipeline == ""
 
@@ -192,11 +186,11 @@ def test_a_variant_in_tensorrts_form_is_warned_of(make: Make, tmp_path: Path) ->
     variants = tuple(
         Variant(name, str(tmp_path / f"{name}.onnx")) for name in ("float", "slow")
     )
-    study, heard = make(variants=variants, baseline="float"), list[str]()
-    listener = dataclasses.replace(SILENT, on_warning=heard.append)
+    study, messages = make(variants=variants, baseline="float"), list[str]()
+    listener = dataclasses.replace(SILENT, on_warning=messages.append)
 
     for variant in variants:
         prepare_variant(study, variant, Workspace(tmp_path), listener)
 
-    (warning,) = heard
+    (warning,) = messages
     assert warning.startswith("variant slow: it is quantized in TensorRT's form")

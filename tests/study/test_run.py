@@ -53,6 +53,7 @@ pytestmark = pytest.mark.xdist_group("study")
 
 
 ONE = {"variants": (BLIND,), "baseline": "blind", "conditions": (IDEAL,)}
+GONE = Variant("slow", "gone.onnx")
 
 
 def without_latency(record: dict[str, Any]) -> dict[str, Any]:
@@ -61,11 +62,11 @@ def without_latency(record: dict[str, Any]) -> dict[str, Any]:
     return record
 
 
-def test_the_scores_are_those_of_the_results(found: StudyResult, folder: Path) -> None:
+def test_the_scores_are_those_of_the_results(result: StudyResult, folder: Path) -> None:
     folder = folder / "results" / "fast.slow"
     episodes = tuple(ResultsFolder.open(folder).episodes().values())
 
-    drive = [each for each in found.drives if each.condition == SLOW.name][-1]
+    drive = [drive for drive in result.drives if drive.condition == SLOW.name][-1]
 
     assert drive.scores == score(episodes, 220)
     assert drive.scores is not None
@@ -73,26 +74,25 @@ def test_the_scores_are_those_of_the_results(found: StudyResult, folder: Path) -
 
 
 def test_the_same_model_does_not_differ_and_the_baseline_is_not_compared(
-    found: StudyResult,
+    result: StudyResult,
 ) -> None:
-    ideal = [each for each in found.drives if each.condition == IDEAL.name]
+    ideal = [drive for drive in result.drives if drive.condition == IDEAL.name]
     blind, slow, again, fast = (each.difference for each in ideal)
 
     assert slow is None
     assert again is not None
     assert again.driving_score.value == 0.0
-    assert (
-        again.driving_score.low != again.driving_score.high
-    )  # two routes prove little
+    # two routes prove little
+    assert again.driving_score.low != again.driving_score.high
     assert fast is not None
     assert blind is not None
     assert fast.better + fast.worse > 0
 
 
 def test_a_model_has_size_latency_and_fidelity_and_a_driver_has_none(
-    found: StudyResult,
+    result: StudyResult,
 ) -> None:
-    blind, slow, again, fast = found.variants
+    blind, slow, again, fast = result.variants
 
     assert blind.size_mb.value is None
     assert blind.size_mb.reason == "no model"
@@ -102,8 +102,8 @@ def test_a_model_has_size_latency_and_fidelity_and_a_driver_has_none(
     assert again.latency_ms[50].value is not None
     assert fast.latency_ms[99].reason == "needs 100 samples, has 20"
     # fidelity is measured against the baseline
-    plans = [each.fidelity for each in found.variants]
-    reasons = [each.plan_mean.reason for each in plans[:2]]
+    plans = [variant.fidelity for variant in result.variants]
+    reasons = [plan.plan_mean.reason for plan in plans[:2]]
     assert reasons == ["blind is not a model", "the baseline itself"]
     assert plans[2].plan_mean.value == 0.0
     assert plans[2].plan_sqnr.reason == "no noise: equal to the bit"
@@ -152,19 +152,16 @@ def test_a_study_is_silent_and_its_file_is_taken_as_it_is(
     toml = tmp_path / "study.toml"
     toml.write_text(STUDY.replace("routes = 3", "routes = 1"))
 
-    found = run_study(toml, tmp_path / "out", Here())
+    result = run_study(toml, tmp_path / "out", Here())
 
     assert capfd.readouterr() == ("", "")
-    assert found.study == load_study(toml)
+    assert result.study == load_study(toml)
 
 
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        (
-            {"variants": (BLIND, Variant("slow", "gone.onnx"))},
-            r"variant slow: gone\.onnx: no such model",
-        ),
+        ({"variants": (BLIND, GONE)}, r"variant slow: gone\.onnx: no such model"),
         ({"frames": Path("no/gone")}, "^frames: no/gone: no such folder"),
         ({"held_out": Path("no/gone")}, "^held_out: no/gone: no such folder"),
     ],
@@ -201,11 +198,8 @@ def test_a_study_that_was_killed_goes_on(tmp_path: Path) -> None:
             assert time.monotonic() < limit
             time.sleep(0.02)
         os.killpg(running.pid, signal.SIGKILL)
-    done = {
-        (path.parts[-3].removesuffix(".ideal"), path.stem)
-        for path in out.glob("results/*/routes/*.json")
-    }
-    engine = Here()
+    finished, engine = out.glob("results/*/routes/*.json"), Here()
+    done = {(path.parts[-3].removesuffix(".ideal"), path.stem) for path in finished}
     names = {"blind": "blind", "blind:12": "faster"}
 
     resumed = run_study(load_study(toml), out, engine)
@@ -219,23 +213,15 @@ def test_a_study_that_was_killed_goes_on(tmp_path: Path) -> None:
 
 @pytest.mark.usefixtures("short")
 def test_who_listens_hears_every_stage(make: Make, tmp_path: Path) -> None:
-    heard = list[str]()
+    stages = list[str]()
     asked = make(variants=make().variants[1:3], conditions=(IDEAL,))
 
-    run_study(
-        asked,
-        tmp_path,
-        Here(),
-        Listener(lambda stage, *_: heard.append(stage)),
-    )
+    listener = Listener(lambda stage, *_: stages.append(stage))
+    run_study(asked, tmp_path, Here(), listener)
 
-    assert list(dict.fromkeys(heard)) == [
-        "latency",
-        "fidelity of again",
-        "slow, ideal",
-        "again, ideal",
-    ]
-    assert heard.count("slow, ideal") == len(ROUTES) + 1
+    drives = ["slow, ideal", "again, ideal"]
+    assert list(dict.fromkeys(stages)) == ["latency", "fidelity of again", *drives]
+    assert stages.count("slow, ideal") == len(ROUTES) + 1
 
 
 @pytest.mark.usefixtures("short", "weights")
@@ -253,11 +239,9 @@ def test_frames_of_its_own_are_of_other_routes_each(make: Make, tmp_path: Path) 
 
     run_study(asked, tmp_path, Here())
 
-    about = [
-        json.loads((tmp_path / name / "scenes.json").read_text())
-        for name in ("frames", "frames-held-out")
-    ]
-    assert [each["seed"] for each in about] == [4, 5]
+    for name, seed in (("frames", 4), ("frames-held-out", 5)):
+        scenes = json.loads((tmp_path / name / "scenes.json").read_text())
+        assert scenes["seed"] == seed
 
 
 STATED = """
@@ -286,18 +270,14 @@ def test_state_and_plan_are_those_of_the_variant(
     )
     file = tmp_path / "stated.toml"
     file.write_text(STATED[STATED.index("[rec") :] if by == "adapter" else STATED)
-    given = Variant("given", str(model))
-    if by == "map":
-        given = replace(given, module_map=str(file))
-    elif by == "adapter":
-        given = replace(given, adapter=file)
-    else:
-        given = Variant("given", f"onnx{{path={model}, module_map={file}}}")
+    given = {
+        "map": Variant("given", str(model), module_map=str(file)),
+        "adapter": Variant("given", str(model), adapter=file),
+        "policy": Variant("given", f"onnx{{path={model}, module_map={file}}}"),
+    }[by]
+    passes = recipe.parse("eliminate-redundant")
     asked = make(
-        variants=(
-            given,
-            replace(given, name="small", passes=recipe.parse("eliminate-redundant")),
-        ),
+        variants=(given, replace(given, name="small", passes=passes)),
         conditions=(IDEAL,),
         routes=ROUTES[:1],
         baseline="given",
@@ -305,11 +285,11 @@ def test_state_and_plan_are_those_of_the_variant(
         timing=Timing(2),
     )
 
-    found = run_study(asked, tmp_path / "study", Here())
+    result = run_study(asked, tmp_path / "study", Here())
 
-    assert all(each.latency_ms[50].value for each in found.variants)
-    assert found.variants[1].fidelity.plan_mean.value == 0.0
-    assert [len(each.routes) for each in found.drives] == [1, 1]
+    assert all(variant.latency_ms[50].value for variant in result.variants)
+    assert result.variants[1].fidelity.plan_mean.value == 0.0
+    assert [len(drive.routes) for drive in result.drives] == [1, 1]
 
 
 @pytest.mark.usefixtures("short")
@@ -319,16 +299,16 @@ def test_a_plan_that_is_no_number_is_told(make: Make, tmp_path: Path) -> None:
     variants = (make().variants[1], lost)
     asked = make(variants=variants, conditions=(IDEAL,), routes=ROUTES[:1])
 
-    found = run_study(asked, tmp_path / "study", Here())
+    result = run_study(asked, tmp_path / "study", Here())
 
-    assert found.variants[1].fidelity.plan_mean.reason == "its plan is not finite"
+    assert result.variants[1].fidelity.plan_mean.reason == "its plan is not finite"
 
 
 # Records of finished drives: what they keep, and which are not taken.
 
 
 @pytest.fixture
-def record(found: StudyResult, folder: Path) -> Path:
+def record(result: StudyResult, folder: Path) -> Path:
     """The record of one drive."""
     return folder / "records" / "blind.slow.jsonl"
 
@@ -337,7 +317,7 @@ def test_a_record_keeps_what_the_tables_need(record: Path, tmp_path: Path) -> No
     read = DriveRecord.load(record)
     read.save(tmp_path / "again.jsonl")
 
-    assert [each.route for each in read.routes] == [each.id for each in ROUTES]
+    assert [route.route for route in read.routes] == [each.id for each in ROUTES]
     assert read.routes[0].latency_us == (500_000,) * 4
     assert read.made_by["set_size"] == 220
     assert record.stat().st_size < 2_000
@@ -370,10 +350,8 @@ def summary(route: str, scenario: str, score: float) -> RouteSummary:
 
 
 def drive(variant: str, condition: str, scores: Sequence[float]) -> DriveRecord:
-    routes = tuple(
-        summary(f"r{n}", f"type{n // 2}", score) for n, score in enumerate(scores)
-    )
-    return DriveRecord(variant, condition, routes)
+    routes = (summary(f"r{n}", f"type{n // 2}", own) for n, own in enumerate(scores))
+    return DriveRecord(variant, condition, tuple(routes))
 
 
 DRIVES = (

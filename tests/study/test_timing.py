@@ -28,7 +28,7 @@ HERE = in_turn_text(1)
 def clock_of(study: Study, folder: Path, listener: Listener = SILENT) -> Clock:
     place = Workspace(folder)
     prepared = [
-        prepare_variant(study, each, place, listener) for each in study.variants
+        prepare_variant(study, variant, place, listener) for variant in study.variants
     ]
     return time_all(study, prepared, place, listener)
 
@@ -38,18 +38,13 @@ def paced(monkeypatch: pytest.MonkeyPatch) -> list[list[str]]:
     """The clock is ours: everything takes twice as long on every further day."""
     days = list[list[str]]()
 
-    def measured(
-        models: Mapping[str, Path], *_: object, **__: object
-    ) -> dict[str, LatencyTrace]:
+    def record(models: Mapping[str, Path], *_: object, **__: object) -> object:
         days.append(list(models))
-        factor = 2 ** (len(days) - 1)
-        samples = tuple(factor * each for each in SAMPLES)
-        return {
-            name: LatencyTrace(sha256_of(path), HERE, samples)
-            for name, path in models.items()
-        }
+        samples = tuple(2 ** (len(days) - 1) * sample for sample in SAMPLES)
+        digests = {name: sha256_of(path) for name, path in models.items()}
+        return {name: LatencyTrace(own, HERE, samples) for name, own in digests.items()}
 
-    monkeypatch.setattr(outcome, "record_traces", measured)
+    monkeypatch.setattr(outcome, "record_traces", record)
     return days
 
 
@@ -160,11 +155,9 @@ def test_a_trace_that_is_given_is_taken(
 ) -> None:
     LatencyTrace("0" * 64, "an Orin", (70_000, 80_000)).save(tmp_path / "orin.json")
     given = Variant("slow", str(models / "slow.onnx"), trace=tmp_path / "orin.json")
-    asked = make(
-        variants=(given,), conditions=(DEVICE,), timing=Timing(), held_out=None
-    )
+    own = make(variants=(given,), conditions=(DEVICE,), timing=Timing(), held_out=None)
 
-    clock = clock_of(asked, tmp_path)
+    clock = clock_of(own, tmp_path)
 
     assert paced == []
     assert (clock.scale, clock.latency("slow", 50).value) == (1.0, 70.0)
@@ -174,14 +167,13 @@ def test_a_trace_that_is_given_is_taken(
 def test_a_baseline_without_latency_sets_no_scale(make: Make, tmp_path: Path) -> None:
     asked = make(variants=(BLIND,), baseline="blind")
 
-    with pytest.raises(
-        EvaluationError, match=r"median of 0\.2 s of blind, and there is"
-    ):
+    words = r"median of 0\.2 s of blind, and there is"
+    with pytest.raises(EvaluationError, match=words):
         clock_of(asked, tmp_path)
 
 
 def test_a_real_clock(make: Make, tmp_path: Path) -> None:
     clock = clock_of(make(timing=Timing(12)), tmp_path)
 
-    assert [len(each.samples_us) for each in clock.traces.values()] == [12, 12, 12]
+    assert [len(value.samples_us) for value in clock.traces.values()] == [12, 12, 12]
     assert "in turn" in clock.traces["slow"].machine
