@@ -62,10 +62,10 @@ class Operator(abc.ABC):
     def output_shape(
         self, shapes: Sequence[Dims | None], attributes: Attributes
     ) -> Dims | None:
-        """Return the output's shape in the own form, None for what is not known."""
+        """Return the output's shape in the own form; unknown sizes are None."""
         letters = set(self.output.split())
         pairs = zip(self.own.operands, shapes, strict=False)
-        if not any(shape and letters & set(each.letters) for each, shape in pairs):
+        if not any(shape and letters & set(one.letters) for one, shape in pairs):
             return None
         return self._sizes(self.output, shapes, attributes)
 
@@ -77,7 +77,7 @@ class Operator(abc.ABC):
     def _sizes(
         self, dims: str, shapes: Sequence[Dims | None], attributes: Attributes
     ) -> Dims:
-        """Return numbers for letters of operands, names of attributes and numbers."""
+        """Replace letters of operands and names of attributes by their sizes."""
         known = {k: value for k, value in attributes.items() if isinstance(value, int)}
         for operand, shape in zip(self.own.operands, shapes, strict=False):
             if shape is not None and operand.rank == len(shape):
@@ -157,18 +157,12 @@ def find(node: ir.Node) -> tuple[Operator, Dialect] | None:
 
 def dialect_of(operator: Operator, name: str) -> Dialect | None:
     """Return an operator's dialect of this name, if there is one."""
-    return next((each for each in operator.all_dialects() if each.name == name), None)
+    return next((d for d in operator.all_dialects() if d.name == name), None)
 
 
 def dialect_names() -> tuple[str, ...]:
     """Return the names of all dialects, in the order of the operators."""
-    return tuple(
-        dict.fromkeys(
-            dialect.name
-            for operator in operators()
-            for dialect in operator.all_dialects()
-        )
-    )
+    return tuple(dict.fromkeys(dialect.name for _, dialect in _calls()))
 
 
 @functools.cache
@@ -180,12 +174,7 @@ def operators() -> tuple[Operator, ...]:
 @functools.cache
 def op_types(name: str) -> frozenset[str]:
     """Return the node types of an operator in every dialect."""
-    return frozenset(
-        dialect.op_type
-        for operator in operators()
-        for dialect in operator.all_dialects()
-        if operator.name == name
-    )
+    return frozenset(dialect.op_type for o, dialect in _calls() if o.name == name)
 
 
 @functools.cache
@@ -213,9 +202,9 @@ def score_inputs() -> Mapping[str, int]:
 
 
 def int8_inputs(node: ir.Node) -> tuple[int, ...]:
-    """Return the inputs of a fused node that may be int8."""
-    plugin = find(node) if node.op_type in int8_op_types() else None
-    return () if plugin is None else plugin[0].int8_inputs
+    """Return the indices of the inputs of a fused node that may be int8."""
+    call = find(node) if node.op_type in int8_op_types() else None
+    return () if call is None else call[0].int8_inputs
 
 
 @functools.cache
@@ -226,12 +215,16 @@ def int8_op_types() -> frozenset[str]:
     )
 
 
+def _calls() -> list[tuple[Operator, Dialect]]:
+    return [(each, dialect) for each in operators() for dialect in each.all_dialects()]
+
+
 @functools.cache
 def _rows() -> dict[str, list[tuple[Operator, Dialect]]]:
+    """Return operators and dialects by op_type."""
     rows: dict[str, list[tuple[Operator, Dialect]]] = {}
-    for operator in operators():
-        for dialect in operator.all_dialects():
-            rows.setdefault(dialect.op_type, []).append((operator, dialect))
+    for operator, dialect in _calls():
+        rows.setdefault(dialect.op_type, []).append((operator, dialect))
     return rows
 
 

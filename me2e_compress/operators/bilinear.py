@@ -62,10 +62,7 @@ def sample_levels(
     elif known is None or first is None or call.opset < GRID_SAMPLE_OPSET:
         result = _by_gather(call, value, sizes, starts, locations, weights)
     else:
-        maps = [
-            (int(height), int(width), int(start))
-            for (height, width), start in zip(known, first, strict=True)
-        ]
+        maps = np.column_stack((known, first)).tolist()
         result = _by_grid_sample(call, value, maps, locations, weights)
     return call.cast(result, kind) if kind is not None else result
 
@@ -77,6 +74,7 @@ def _by_grid_sample(
     locations: ir.Value,
     weights: ir.Value,
 ) -> ir.Value:
+    """Sample with GridSample; ``maps`` are the height, width and first row of each."""
     # One image per head, or all heads as channels if they share
     batch, heads, width = (call.size(value, axis) for axis in (0, 2, 3))
     queries, points = call.size(locations, 1), call.size(locations, 4)

@@ -1,5 +1,7 @@
-"""Rewrite one fused node: access its operands and insert nodes before it."""
+"""Write nodes before one fused node, and put one of them in its place."""
 
+import functools
+import math
 from collections.abc import Mapping, Sequence
 from typing import TypeAlias
 
@@ -24,12 +26,12 @@ Size: TypeAlias = int | ir.Value
 
 
 class FusedCall:
-    """Inserts the nodes of a body or conversion before one fused node.
+    """Inserts nodes before one fused node: its body, or its form in another dialect.
 
-    New nodes inherit its module and origins, and their shape and type are inferred at
-    once. ``names`` of all values of the model grow; None collects them from the whole
-    graph, which is slow for many nodes. ``compiled`` allows calls of compiled kernels.
-    ``sources`` are the nodes that the next new one stands for: at first this one.
+    New nodes inherit the module and origins of ``sources``, at first the fused node;
+    their shape and type are inferred at once. ``names`` are those of all values of the
+    model, to which new ones are added; None collects them from the whole graph, which
+    is slow for many nodes. ``compiled`` allows calls of compiled kernels.
     """
 
     def __init__(
@@ -83,7 +85,7 @@ class FusedCall:
         return made.outputs[0]
 
     def put(self, result: ir.Value) -> None:
-        """Let a value take the place and the name of the node's, which is removed."""
+        """Replace the fused node by a value, which gets the name of its output."""
         node, old = self.node, self.node.outputs[0]
         if result.producer() is None or result in node.inputs:
             result = self.add("Identity", [result])  # an output needs a node of its own
@@ -163,34 +165,27 @@ class FusedCall:
 
     def product(self, *sizes: Size) -> Size:
         """Multiply sizes."""
-        number, computed = 1, None
-        for size in sizes:
-            if isinstance(size, int):
-                number *= size
-            else:
-                computed = (
-                    size if computed is None else self.add("Mul", [computed, size])
-                )
-        if computed is None:
+        number = math.prod(size for size in sizes if isinstance(size, int))
+        values = [size for size in sizes if not isinstance(size, int)]
+        if not values:
             return number
+        product = functools.reduce(lambda a, b: self.add("Mul", [a, b]), values)
         if number == 1:
-            return computed
-        return self.add("Mul", [computed, self.integers([number])])
+            return product
+        return self.add("Mul", [product, self.integers([number])])
 
     def reshape(self, value: ir.Value, sizes: Sequence[Size]) -> ir.Value:
         """Reshape to sizes, some possibly known only at run time; -1 is allowed."""
-        given = [size for size in sizes if isinstance(size, int)]
+        known = [size for size in sizes if isinstance(size, int)]
+        unknown = len(sizes) - len(known)
         # One size known only at run time may be left to -1
-        if len(given) == len(sizes):
-            shape = self.integers(given)
-        elif len(given) == len(sizes) - 1 and 0 not in given and -1 not in given:
-            free = (size if isinstance(size, int) else -1 for size in sizes)
-            shape = self.integers(list(free))
+        if not unknown or (unknown == 1 and 0 not in known and -1 not in known):
+            dims = [size if isinstance(size, int) else -1 for size in sizes]
+            shape = self.integers(dims)
         else:
-            parts = [self.value_of(size) for size in sizes]
-            shape = self.add("Concat", parts, {"axis": 0})
+            shape = self.concat([self.value_of(size) for size in sizes], 0)
         # A literal 0 needs allowzero
-        zero = 0 in given and -1 not in given and self.opset >= _ALLOWZERO_OPSET
+        zero = 0 in known and -1 not in known and self.opset >= _ALLOWZERO_OPSET
         result = self.add("Reshape", [value, shape], {"allowzero": 1} if zero else None)
         if result.shape is None:
             result.shape = _shape(sizes)
@@ -233,7 +228,7 @@ class FusedCall:
         return result
 
     def split_last(self, value: ir.Value, count: int) -> tuple[ir.Value, ...]:
-        """Return the few components of the last axis separately."""
+        """Return the components of the last axis as values of their own."""
         return tuple(
             self.add("Gather", [value, self.integers(index)], {"axis": -1})
             for index in range(count)
@@ -254,20 +249,19 @@ _ALLOWZERO_OPSET = 14
 
 
 def _shape(sizes: Sequence[Size]) -> ir.Shape:
-    dims = (size if isinstance(size, int) and size >= 0 else None for size in sizes)
-    return ir.Shape(list(dims))
+    return ir.Shape([n if isinstance(n, int) and n >= 0 else None for n in sizes])
 
 
 def names_in(where: ir.Graph | ir.Function) -> set[str]:
     """Return the names of all values of a graph or function."""
     if isinstance(where, ir.Graph):
         return value_names(where)
-    values = (value.name or "" for node in where for value in node.outputs)
-    return {*values, *(value.name or "" for value in where.inputs)}
+    values = (value for node in where for value in node.outputs)
+    return {value.name or "" for value in (*where.inputs, *values)}
 
 
-def _whole(value: ir.Value) -> Array | None:
-    """Return the integers of a constant: axes, sizes and shapes."""
+def _integers(value: ir.Value) -> Array | None:
+    """Return the int64 numbers of a constant: axes, sizes and shapes."""
     return array_of(value) if value.dtype == ir.DataType.INT64 else None
 
 
@@ -279,7 +273,7 @@ def _infer(node: ir.Node, opset: int) -> None:
             value.type = ir.TensorType(ir.DataType.from_numpy(known.dtype))
             value.shape = ir.Shape(known.shape)
     try:
-        inferred = infer_node(node, opset, known=_whole)
+        inferred = infer_node(node, opset, known=_integers)
     except REFUSALS:
         return
     for value, known_of in inferred.items():

@@ -1,6 +1,7 @@
 """Deformable feature aggregation (Sparse4D, arXiv 2211.10581; SparseDrive)."""
 
 import dataclasses
+import functools
 from collections.abc import Sequence
 from typing import ClassVar
 
@@ -13,6 +14,7 @@ from me2e_compress.operators.bilinear import sample_levels, sample_levels_array
 from me2e_compress.operators.call import Attributes, FusedCall
 from me2e_compress.operators.dialect import (
     FLOAT32,
+    FLOATS,
     INT8_TOO,
     INT32,
     INTEGERS,
@@ -62,7 +64,8 @@ class ScaledFeature(Dialect):
         return super().output_type(inputs[5:] if scaled else inputs)
 
 
-_SPARSE_DRIVE, _OP = "SparseDrive", "DeformableAggregation"
+_OP, _PLUGIN_OP = "DeformableAggregation", "DeformableAttentionAggrPlugin"
+_PLUGIN = _operands(INT32, FLOATS)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -81,16 +84,14 @@ class DeformableAggregation(Operator):
     work: ClassVar[str] = "4 N A P V L C"
     int8_inputs: ClassVar[tuple[int, ...]] = (0,)
     own: ClassVar[Dialect] = Dialect(
-        "me2e", _OP, OWN_DOMAIN, _operands(INTEGERS, (*FLOAT32, ir.DataType.FLOAT16)),
-        "me2e",
-    )  # fmt: skip
+        "me2e", _OP, OWN_DOMAIN, _operands(INTEGERS, FLOATS), "me2e"
+    )
     dialects: ClassVar[tuple[Dialect, ...]] = (
-        Dialect(
-            "sparsedrive", _OP, "SparseDrive",
-            _operands(INT32, (*FLOAT32, ir.DataType.FLOAT16)), _SPARSE_DRIVE,
-        ),
+        Dialect("sparsedrive", _OP, "SparseDrive", _PLUGIN, "SparseDrive"),
         ScaledFeature(
-            "sparsedrive-v2", _OP, "sparsedrivev2",
+            "sparsedrive-v2",
+            _OP,
+            "sparsedrivev2",
             (
                 *_operands(INT32, INT8_TOO),
                 Operand("feat_scale", "C", FLOAT32, optional=True),
@@ -98,11 +99,8 @@ class DeformableAggregation(Operator):
             "SparseDriveV2",
             int8_scale=5,
         ),
-        Dialect(
-            "sparseend2end", "DeformableAttentionAggrPlugin", "custom",
-            _operands(INT32, (*FLOAT32, ir.DataType.FLOAT16)), "SparseEnd2End",
-        ),
-    )  # fmt: skip
+        Dialect("sparseend2end", _PLUGIN_OP, "custom", _PLUGIN, "SparseEnd2End"),
+    )
 
     def body(self, call: FusedCall, inputs: Values, attributes: Attributes) -> ir.Value:
         """Write it as deformable attention whose heads are the channel groups."""
@@ -119,9 +117,8 @@ class DeformableAggregation(Operator):
         maps = call.product(cameras, levels)
         places = call.transpose(at, (0, 1, 3, 2, 4))  # [N, A, V, P, 2]
         places = call.unsqueeze(places, (2, 4))  # [N, A, 1, V, 1, P, 2]
-        shape = (batch, anchors, 1, cameras, levels, points, 2)
-        shown = call.sizes(shape)
-        places = call.add("Expand", [places, shown])
+        shape = call.sizes((batch, anchors, 1, cameras, levels, points, 2))
+        places = call.add("Expand", [places, shape])
         places = call.reshape(places, (batch, anchors, 1, maps, points, 2))
         # Positions outside of an image have no weight
         weights = self._inside(call, at, weights)
@@ -142,10 +139,8 @@ class DeformableAggregation(Operator):
         for axis in call.split_last(at, 2):
             above = call.add("Greater", [axis, call.numbers(0.0, axis)])
             sides += [above, call.add("Less", [axis, call.numbers(1.0, axis)])]
-        first, *others = sides
-        for side in others:
-            first = call.add("And", [first, side])
-        inside = call.unsqueeze(first, (4, 5))
+        both = functools.reduce(lambda one, two: call.add("And", [one, two]), sides)
+        inside = call.unsqueeze(both, (4, 5))
         return call.add("Where", [inside, weights, call.numbers(0.0, weights)])
 
     def reference(self, inputs: Arrays, attributes: Attributes) -> NdArray:

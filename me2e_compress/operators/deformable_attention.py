@@ -2,7 +2,7 @@
 
 import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import ClassVar
 
 import numpy as np
@@ -29,8 +29,6 @@ from me2e_compress.operators.dialect import (
     present,
 )
 from me2e_compress.operators.raw_attention import raw_own_form
-
-# Two layouts of deformable attention that differ from TensorRT OSS's.
 
 
 @dataclasses.dataclass(frozen=True)
@@ -218,16 +216,14 @@ def _keeps_rows(node: ir.Node, row: int) -> bool:
     if node.op_type not in ("Expand", "Transpose"):
         return True
     # A row consists of the last axes of the input
-    kept = next(
-        (at for at in range(len(read) + 1) if math.prod(read[len(read) - at :]) == row),
-        None,
-    )
-    if kept is None:
+    rank = len(read)
+    kept = next((n for n in range(rank + 1) if math.prod(read[rank - n :]) == row), -1)
+    if kept < 0:
         return False
     if node.op_type == "Expand":
-        return read[len(read) - kept :] == made[len(made) - kept :]
+        return read[rank - kept :] == made[len(made) - kept :]
     order = permutation_of(node) or []
-    return order[len(read) - kept :] == list(range(len(read) - kept, len(read)))
+    return order[rank - kept :] == list(range(rank - kept, rank))
 
 
 def _operands(integers: tuple[ir.DataType, ...]) -> tuple[Operand, ...]:
@@ -240,15 +236,19 @@ def _operands(integers: tuple[ir.DataType, ...]) -> tuple[Operand, ...]:
     )
 
 
-_RAW = (
-    Operand("value", "N S M D", INT8_TOO),
-    Operand("spatial_shapes", "L 2", INT32),
-    Operand("reference_points", "N Q 1 *", INT8_TOO, positions=True),
-    Operand("sampling_offsets", "N Q M *", INT8_TOO, positions=True),
-    Operand("attention_weights", "N Q M *", INT8_TOO, scores=True),
-)
+def _raw_operands(integer: ir.DataType) -> tuple[Operand, ...]:
+    return (
+        Operand("value", "N S M D", INT8_TOO),
+        Operand("spatial_shapes", "L 2", (integer,)),
+        Operand("reference_points", "N Q 1 *", INT8_TOO, positions=True),
+        Operand("sampling_offsets", "N Q M *", INT8_TOO, positions=True),
+        Operand("attention_weights", "N Q M *", INT8_TOO, scores=True),
+    )
 
 
+_PLUGIN, _RAW = _operands(INT32), _raw_operands(ir.DataType.INT32)
+_RAW_INT64 = _raw_operands(ir.DataType.INT64)
+_IM2COL = Attribute("im2col_step", 64, required=False, own="")
 _OSS, _DL4AGX, _DERRYHUB = "TensorRT OSS", "DL4AGX", "BEVFormer_tensorrt"
 _ATTENTION = "MultiscaleDeformableAttnPlugin_TRT"
 _DERRYHUB_NAME = "MultiScaleDeformableAttnTRT"
@@ -276,30 +276,20 @@ class DeformableAttention(Operator):
         "me2e", "MultiScaleDeformableAttention", OWN_DOMAIN, _operands(INTEGERS), "me2e"
     )
     dialects: ClassVar[tuple[Dialect, ...]] = (
-        Dialect("tensorrt", _ATTENTION, "trt.plugins", _operands(INT32), _OSS),
-        Dialect(
-            "tensorrt-v2", _ATTENTION, "trt.plugins", _operands(INT32), _OSS, (), "2"
-        ),
-        Dialect("far3d", _ATTENTION, "trt", _operands(INT32), "DL4AGX far3d"),
-        JoinedHeads("dl4agx", _JOINED, "custom_op", _operands(INT32), _DL4AGX),
-        JoinedHeads("autoware", _JOINED, "", _operands(INT32), "Autoware"),
-        JoinedHeads(
-            "mmdeploy", _MMCV, "mmdeploy", _operands(INT32), "mmdeploy",
-            (Attribute("im2col_step", 64, required=False, own=""),),
-        ),
+        Dialect("tensorrt", _ATTENTION, "trt.plugins", _PLUGIN, _OSS),
+        Dialect("tensorrt-v2", _ATTENTION, "trt.plugins", _PLUGIN, _OSS, (), "2"),
+        Dialect("far3d", _ATTENTION, "trt", _PLUGIN, "DL4AGX far3d"),
+        JoinedHeads("dl4agx", _JOINED, "custom_op", _PLUGIN, _DL4AGX),
+        JoinedHeads("autoware", _JOINED, "", _PLUGIN, "Autoware"),
+        JoinedHeads("mmdeploy", _MMCV, "mmdeploy", _PLUGIN, "mmdeploy", (_IM2COL,)),
         RawAttention("derryhub", _DERRYHUB_NAME, "", _RAW, _DERRYHUB),
         RawAttention("derryhub-trt2", f"{_DERRYHUB_NAME}2", "", _RAW, _DERRYHUB),
         RawAttention(
-            "dl4agx-uniad", _DERRYHUB_NAME, "",
-            tuple(
-                dataclasses.replace(each, types=(ir.DataType.INT64,))
-                if each.types == INT32 else each for each in _RAW
-            ),
-            "DL4AGX uniad-trt",
+            "dl4agx-uniad", _DERRYHUB_NAME, "", _RAW_INT64, "DL4AGX uniad-trt"
         ),
-        Dialect("msda-plugin", "MSDAPlugin", "", _operands(INT32), _DL4AGX),
+        Dialect("msda-plugin", "MSDAPlugin", "", _PLUGIN, _DL4AGX),
         raw_own_form(),
-    )  # fmt: skip
+    )
 
     def body(self, call: FusedCall, inputs: Values, attributes: Attributes) -> ir.Value:
         """Sample every level, with GridSample where sizes are constant, else Gather."""
@@ -307,12 +297,6 @@ class DeformableAttention(Operator):
 
     def reference(self, inputs: Arrays, attributes: Attributes) -> NdArray:
         """Compute it in numpy, [N, Q, M, D] float64."""
-        given = (np.asarray(each) for each in inputs)
-        value, shapes, starts, locations, weights = given
-        return sample_levels_array(
-            value.astype(np.float64),
-            shapes.astype(np.int64),
-            starts.astype(np.int64),
-            locations.astype(np.float64),
-            weights.astype(np.float64),
-        )
+        kinds = (np.float64, np.int64, np.int64, np.float64, np.float64)
+        arrays: Iterable[NdArray] = map(np.asarray, inputs, kinds)
+        return sample_levels_array(*arrays)

@@ -142,12 +142,12 @@ class Dialect:
 
     def options_to_own(self, attributes: Attributes) -> Attributes:
         """Convert this dialect's attributes to the own form's."""
-        known = [each for each in self.attributes if each.name in attributes]
-        return {e.own_name: attributes[e.name] for e in known if e.own_name}
+        known = [a for a in self.attributes if a.name in attributes and a.own_name]
+        return {a.own_name: attributes[a.name] for a in known}
 
     def options_from_own(self, attributes: Attributes) -> Attributes:
         """Convert the own form's attributes to this dialect's."""
-        return {e.name: attributes.get(e.own_name, e.default) for e in self.attributes}
+        return {a.name: attributes.get(a.own_name, a.default) for a in self.attributes}
 
     def result_to_own(self, call: FusedCall, result: ir.Value, own: Values) -> ir.Value:
         """Write the conversion of this dialect's output to the own form's."""
@@ -173,21 +173,26 @@ class Dialect:
 
     def in_types(self, call: FusedCall, inputs: Values) -> Values:
         """Cast integer operands to a type that this dialect accepts."""
-        cast = list[ir.Value | None]()
-        for operand, value in zip(self.operands, inputs, strict=False):
-            kind = None if value is None else value.dtype
-            if value is not None and kind in INTEGERS and kind not in operand.types:
-                value = call.cast(value, operand.types[0])
-            cast.append(value)
+        cast = list(inputs[: len(self.operands)])
         while cast and cast[-1] is None:
             cast.pop()
+        for index, (operand, value) in enumerate(
+            zip(self.operands, cast, strict=False)
+        ):
+            kind = None if value is None else value.dtype
+            if value is not None and kind in INTEGERS and kind not in operand.types:
+                cast[index] = call.cast(value, operand.types[0])
         return tuple(cast)
 
     def attributes_of(self, node: ir.Node) -> dict[str, AttributeValue]:
-        """Return a node's attributes with defaults; unknown ones are refused."""
+        """Return a node's attributes, completed by defaults.
+
+        Raises:
+            PreconditionError: an attribute is unknown, or has a value it cannot have.
+        """
         known = {each.name: each for each in self.attributes}
-        attributes: dict[str, AttributeValue] = {n: e.default for n, e in known.items()}
-        # Names and values must be known
+        attributes: dict[str, AttributeValue] = {n: a.default for n, a in known.items()}
+        # Both name and value must be allowed
         for name, written in node.attributes.items():
             if name in PLUGIN_ATTRIBUTES:
                 continue
@@ -207,7 +212,7 @@ class Dialect:
         return attributes
 
     def check(self, node: ir.Node) -> None:
-        """Refuse a node whose number, types or shapes of inputs do not fit."""
+        """Raise a PreconditionError where the inputs of a node do not fit."""
         # The number of inputs
         least = sum(not each.optional for each in self.operands)
         count = len(node.inputs)
@@ -249,7 +254,7 @@ class Dialect:
             known = int(letter) if letter.isdigit() else sizes.setdefault(letter, size)
             fits = fits and known == size
         if not fits:
-            # Show the sizes found so far
+            # Show the sizes known so far
             spelt = {letter: f"{letter}={size}" for letter, size in sizes.items()}
             form = ", ".join(spelt.get(letter, letter) for letter in wanted)
             raise PreconditionError(

@@ -26,9 +26,6 @@ from me2e_compress.operators.dialect import (
     present,
 )
 
-# ``grid_sample`` in any number of dimensions, in numpy.
-
-
 _BILINEAR, _NEAREST, _BICUBIC = range(3)
 _ZEROS, _BORDER, _REFLECTION = range(3)
 BILINEAR = {"interpolation_mode": _BILINEAR, "padding_mode": _ZEROS, "align_corners": 0}
@@ -45,12 +42,12 @@ def grid_sample_array(inputs: Arrays, attributes: Attributes) -> NdArray:
     rows = image.reshape(batch, channels, -1)
     # Neighbours along each axis
     axes = [
-        _nearby(grid[..., axis], size, attributes)
+        _neighbours(grid[..., axis], size, attributes)
         for axis, size in enumerate(reversed(sizes))
     ]
     total = np.zeros((batch, channels, *grid.shape[1:-1]))
     first = np.arange(batch).reshape(batch, *(1 for _ in sizes))
-    # Add all combinations of around
+    # Add all combinations of neighbours
     for near in itertools.product(*axes):
         index = np.zeros(grid.shape[:-1], np.int64)
         share, step = np.ones(grid.shape[:-1]), 1
@@ -61,14 +58,15 @@ def grid_sample_array(inputs: Arrays, attributes: Attributes) -> NdArray:
     return total
 
 
-def _nearby(
+def _neighbours(
     at: NdArray, size: int, options: Attributes
 ) -> list[tuple[NdArray, NdArray]]:
+    """Return the pixels around positions on one axis, and their shares."""
     aligned, mode = bool(options["align_corners"]), options["interpolation_mode"]
     # Position in pixels, padded unless bicubic
     pixel = (at + 1) / 2 * (size - 1) if aligned else ((at + 1) * size - 1) / 2
     if mode != _BICUBIC:
-        pixel = _looked_up(pixel, size, options)
+        pixel = _padded(pixel, size, options)
     low = np.floor(pixel)
     part = pixel - low
     # Neighbours and their shares
@@ -78,10 +76,10 @@ def _nearby(
         around = [(low, 1 - part), (low + 1, part)]
     else:
         around = [(low + step, _cubic(np.abs(part - step))) for step in (-1, 0, 1, 2)]
-    # Bicubic around are padded one by one
+    # Neighbours of bicubic samples are padded one by one
     result = []
     for place, share in around:
-        edge = _looked_up(place, size, options) if mode == _BICUBIC else place
+        edge = _padded(place, size, options) if mode == _BICUBIC else place
         kept = edge.clip(0, size - 1)
         result.append((kept.astype(np.int64), np.where(kept == edge, share, 0)))
     return result
@@ -93,7 +91,7 @@ def _cubic(distance: NdArray) -> NdArray:
     return np.where(distance <= 1, near, far)
 
 
-def _looked_up(pixel: NdArray, size: int, options: Attributes) -> NdArray:
+def _padded(pixel: NdArray, size: int, options: Attributes) -> NdArray:
     padding, aligned = options["padding_mode"], bool(options["align_corners"])
     if padding == _REFLECTION:
         low, span = (0.0, size - 1) if aligned else (-0.5, size)
@@ -172,14 +170,14 @@ def _scaled(dims: int) -> tuple[Dialect, ...]:
         ScaledGrid("derryhub", op_type, "", operands, source, _OWN),
         ScaledGrid("derryhub-trt2", f"{op_type}2", "", operands, source, _OWN),
         ScaledGrid(
-            "dl4agx",
-            "GridSamplePlugin",
-            "custom_op",
-            _operands(dims, FLOATS, first=True),
-            "DL4AGX",
+            "dl4agx", "GridSamplePlugin", "custom_op",
+            _operands(dims, FLOATS, first=True), "DL4AGX",
             _options("mode", required=False),
         ),
-    )
+    )  # fmt: skip
+
+
+_MMDEPLOY = _operands(2, FLOAT32)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -198,14 +196,7 @@ class GridSampler2D(Operator):
     own: ClassVar[Dialect] = _own(2)
     dialects: ClassVar[tuple[Dialect, ...]] = (
         *_scaled(2),
-        Dialect(
-            "mmdeploy",
-            "grid_sampler",
-            "mmdeploy",
-            _operands(2, FLOAT32),
-            "mmdeploy",
-            _OWN,
-        ),
+        Dialect("mmdeploy", "grid_sampler", "mmdeploy", _MMDEPLOY, "mmdeploy", _OWN),
     )
     opset: ClassVar[int] = 16
 
@@ -228,14 +219,12 @@ class GridSampler2D(Operator):
         return grid_sample_array(inputs, attributes)
 
     def macs(self, shapes: Sequence[Dims | None], attributes: Attributes) -> int | None:
-        """Count the around of each element: 2, 1 or 4 along each axis."""
+        """Count the neighbours of each element: 2 or 4 along each axis, or none."""
         mode = number(attributes, "interpolation_mode")
-        whole = super().macs(shapes, attributes)
-        if whole is None:
-            return None
-        along = (2, 0, 4)[mode]  # nearest moves data only
-        each: int = along ** len(self.output.split()[2:])
-        return whole * each
+        elements, axes = super().macs(shapes, attributes), len(self.output.split()) - 2
+        # Nearest samples only move data
+        factor = {_BILINEAR: 2**axes, _NEAREST: 0, _BICUBIC: 4**axes}[mode]
+        return None if elements is None else elements * int(factor)
 
 
 _MODES, _NEW_MODES = ("bilinear", "nearest", "bicubic"), ("linear", "nearest", "cubic")

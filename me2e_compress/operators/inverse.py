@@ -26,12 +26,10 @@ from me2e_compress.operators.dialect import (
 _LARGEST = 16
 """Largest n: the n * n minors of (n - 1) x (n - 1) numbers take n^5 work."""
 
-_DERRYHUB = "BEVFormer_tensorrt"
-_ANY, _BATCHES = Operand("matrix", None, FLOAT32, positions=True), "B C n n"
-
-
-def _plugin(name: str, op_type: str, domain: str, source: str) -> Dialect:
-    return Dialect(name, op_type, domain, (_ANY,), source)
+_ANY, _EITHER = (
+    (Operand("matrix", None, types, positions=True),) for types in (FLOAT32, FLOATS)
+)
+_BATCHES = (Operand("matrix", "B C n n", FLOAT32, positions=True),)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -44,21 +42,15 @@ class Inverse(Operator):
     """
 
     name: ClassVar[str] = "inverse"
-    own: ClassVar[Dialect] = _plugin("me2e", "Inverse", OWN_DOMAIN, "me2e")
+    own: ClassVar[Dialect] = Dialect("me2e", "Inverse", OWN_DOMAIN, _ANY, "me2e")
     dialects: ClassVar[tuple[Dialect, ...]] = (
         *(
-            Dialect(
-                name, "InverseTRT", "",
-                (Operand("matrix", _BATCHES, FLOAT32, positions=True),), _DERRYHUB,
-            )
+            Dialect(name, "InverseTRT", "", _BATCHES, "BEVFormer_tensorrt")
             for name in ("derryhub", "derryhub-trt2", "dl4agx-uniad")
         ),
-        _plugin("dl4agx", "InversePlugin", "custom_op", "DL4AGX"),
-        Dialect(
-            "onnxruntime", "Inverse", "com.microsoft",
-            (Operand("matrix", None, FLOATS, positions=True),), "onnxruntime",
-        ),
-    )  # fmt: skip
+        Dialect("dl4agx", "InversePlugin", "custom_op", _ANY, "DL4AGX"),
+        Dialect("onnxruntime", "Inverse", "com.microsoft", _EITHER, "onnxruntime"),
+    )
 
     def body(self, call: FusedCall, inputs: Values, attributes: Attributes) -> ir.Value:
         """Write the adjugate over the determinant; the size must be known and small."""
@@ -105,7 +97,7 @@ def _minors(size: int) -> NdArray:
     """Return the indices of each adjugate element's minor, [n, n, n - 1, n - 1]."""
     # Rows and columns without the i-th
     kept = np.array([[j for j in range(size) if j != i] for i in range(size)])
-    # element (i, j) of the adjugate is the minor without row j and column i
+    # Element (i, j) of the adjugate is the minor without row j and column i
     rows, columns = kept[None, :, :, None], kept[:, None, None, :]
     index: NdArray = rows * size + columns
     return index

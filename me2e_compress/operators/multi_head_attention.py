@@ -89,14 +89,13 @@ class FusedMultiHeadAttention(Operator):
             return _joined(call, result, query)
         if heads == 1:
             return _written(call, query, call.transpose(key, (0, 2, 1)), value)
-        query_rows, key_rows, value_rows = (
-            call.transpose(_split(call, each, heads), order)
-            for each, order in (
-                (query, (0, 2, 1, 3)), (key, (0, 2, 3, 1)), (value, (0, 2, 1, 3))
-            )
-        )  # fmt: skip
-        result = _written(call, query_rows, key_rows, value_rows)
-        return _joined(call, call.transpose(result, (0, 2, 1, 3)), query)
+        # Put the heads into the batch, and take them out again
+        swap = (0, 2, 1, 3)
+        query_rows = call.transpose(_split(call, query, heads), swap)
+        turned_key = call.transpose(_split(call, key, heads), (0, 2, 3, 1))
+        value_rows = call.transpose(_split(call, value, heads), swap)
+        result = _written(call, query_rows, turned_key, value_rows)
+        return _joined(call, call.transpose(result, swap), query)
 
     def reference(self, inputs: Arrays, attributes: Attributes) -> NdArray:
         """Compute it in numpy, [B, Q, C] float64."""

@@ -1,5 +1,6 @@
 """Replace a fused node by its body, or by the same call in another dialect."""
 
+import contextlib
 import dataclasses
 from collections.abc import Iterable
 
@@ -24,7 +25,7 @@ from me2e_compress.operators.dialect import (
 
 @dataclasses.dataclass(frozen=True)
 class FusedNode:
-    """A fused node of a model, with the standard opset and all names around it."""
+    """A fused node of a model; ``names`` are those of all values around it."""
 
     node: ir.Node
     operator: Operator
@@ -51,7 +52,9 @@ def fused_nodes(model: ir.Model) -> list[FusedNode]:
 def raise_for_bodies(
     model: ir.Model, nodes: Iterable[ir.Node], by: str
 ) -> tuple[str, ...]:
-    """Write a graph in the opset that the bodies of fused nodes need; say so if it is.
+    """Raise a graph to the opset that the bodies of fused nodes need.
+
+    Returns notes for the report: one if the opset changed, else none.
 
     Raises:
         PreconditionError: the graph cannot be written in it; nothing changed.
@@ -71,18 +74,17 @@ def raise_for_bodies(
 
 
 def import_domains(model: ir.Model) -> None:
-    """Import the used domains only; constants of functions become Constant nodes."""
+    """Import exactly the used domains; constants of functions become Constant nodes."""
     bodies: list[ir.Graph | ir.Function] = [model.graph, *model.functions.values()]
     for body in bodies:
         # Drop unused imports and add missing ones
         used = {node.domain for node in nodes_in(body)}
-        for domain in [each for each in body.opset_imports if each not in STANDARD]:
-            if domain not in used:
-                del body.opset_imports[domain]
+        for domain in body.opset_imports.keys() - used - {*STANDARD}:
+            del body.opset_imports[domain]
         for domain in sorted(used - {*STANDARD, *body.opset_imports}):
             body.opset_imports[domain] = 1
     for function in model.functions.values():
-        hold_constants(function)
+        write_constant_nodes(function)
 
 
 def expand(
@@ -110,7 +112,7 @@ def expand(
         PreconditionError: attributes or inputs that do not fit the dialect.
         GraphError: the node is not a fused operator.
     """
-    operator, dialect = _found(node, known)
+    operator, dialect = _operator_of(node, known)
     if opset < operator.opset:
         raise PreconditionError(
             f"{by} needs opset {operator.opset} or later; the graph is of {opset}"
@@ -144,7 +146,7 @@ def translate(
     that cannot express the call is a PreconditionError.
     """
     # Bring the call into the own form
-    operator, dialect = _found(node, known)
+    operator, dialect = _operator_of(node, known)
     call = FusedCall(node, opset=opset, by=by, names=names)
     own, attributes = _own_call(call, dialect)
     # Write it in the new dialect
@@ -184,7 +186,7 @@ def set_output(node: ir.Node, operator: Operator, dialect: Dialect) -> bool:
     return known
 
 
-def hold_constants(function: ir.Function) -> None:
+def write_constant_nodes(function: ir.Function) -> None:
     """Replace a function's initializers, which no file can hold, by Constant nodes."""
     graph = function.graph
     for name, value in list(graph.initializers.items()):
@@ -198,10 +200,10 @@ def hold_constants(function: ir.Function) -> None:
         graph.insert_before(graph[0], made)
 
 
-def _found(
+def _operator_of(
     node: ir.Node, known: tuple[Operator, Dialect] | None
 ) -> tuple[Operator, Dialect]:
-    operator = find(node) if known is None else known
+    operator = known or find(node)
     if operator is None:
         raise GraphError(f"node {node.name}: {node.op_type} is no fused operator")
     if read := [value.name for value in node.outputs[1:] if is_read(value)]:
@@ -224,21 +226,16 @@ class DialectKnowledge:
 
     def infer(self, node: ir.Node) -> bool:
         """Write the type and shape of a node's output; return whether any is new."""
-        operator = find(node)
-        try:
-            if operator is not None:
-                operator[1].check(node)
-                return set_output(node, *operator)
-        except PreconditionError:
-            pass
+        call = find(node)
+        with contextlib.suppress(PreconditionError):
+            if call is not None:
+                call[1].check(node)
+                return set_output(node, *call)
         return False
 
     def macs(self, node: ir.Node) -> int | None:
         """Count a node's multiply-accumulates, if known."""
-        operator = find(node)
-        try:
-            return (
-                None if operator is None else operator[0].cost(node, operator[1]).macs
-            )
-        except PreconditionError:
-            return None
+        call = find(node)
+        with contextlib.suppress(PreconditionError):
+            return None if call is None else call[0].cost(node, call[1]).macs
+        return None

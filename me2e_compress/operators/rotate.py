@@ -105,19 +105,17 @@ class Rotate(Operator):
             middles.append((call.add("Sub", [half, at]), at))
         (across, x), (down, y) = middles
         down = call.unsqueeze(down, (1,))
-
-        # Rotate, and move back
-        def turned(how: str, one: ir.Value, two: ir.Value) -> ir.Value:
-            products = [call.add("Mul", [one, across]), call.add("Mul", [two, down])]
-            return call.add(how, products)
-
-        ends = turned("Sub", cosine, sine), turned("Add", sine, cosine)
+        # Rotate: x cos - y sin, x sin + y cos
+        ends = []
+        for op_type, one, two in (("Sub", cosine, sine), ("Add", sine, cosine)):
+            terms = [call.add("Mul", [one, across]), call.add("Mul", [two, down])]
+            ends.append(call.add(op_type, terms))
+        # Move back, to pixel positions
         half = call.numbers(0.5, angle)
-        one, two = (
-            call.add("Add", [end, call.add("Sub", [start, half])])
-            for end, start in zip(ends, (x, y), strict=True)
+        return (
+            call.add("Add", [ends[0], call.add("Sub", [x, half])]),
+            call.add("Add", [ends[1], call.add("Sub", [y, half])]),
         )
-        return one, two
 
     def reference(self, inputs: Arrays, attributes: Attributes) -> NdArray:
         """Compute it in numpy, [C, H, W] float64."""
@@ -127,13 +125,9 @@ class Rotate(Operator):
         turn = -np.deg2rad(angle.item())
         y, x = np.mgrid[:height, :width] + 0.5
         x, y = x - center[0], y - center[1]
-        at = np.stack(
-            [
-                np.cos(turn) * x + np.sin(turn) * y + center[0],
-                -np.sin(turn) * x + np.cos(turn) * y + center[1],
-            ],
-            axis=-1,
-        )
+        across = np.cos(turn) * x + np.sin(turn) * y + center[0]
+        down = -np.sin(turn) * x + np.cos(turn) * y + center[1]
+        at = np.stack([across, down], axis=-1)
         # Sample, rounded to pixel centres for nearest
         if attributes["interpolation"] == 1:
             at = np.round(at - 0.5) + 0.5

@@ -12,7 +12,6 @@ from me2e_compress.graph.shapes import Dims, open_shape, product
 from me2e_compress.operators.base import Operator
 from me2e_compress.operators.call import Attributes, FusedCall
 from me2e_compress.operators.dialect import (
-    FLOATS,
     OWN_DOMAIN,
     Arrays,
     Attribute,
@@ -46,17 +45,10 @@ class WinogradConvolution(Operator):
 
     name: ClassVar[str] = "winograd-convolution"
     own: ClassVar[Dialect] = Dialect(
-        "me2e",
-        "WinogradConvolution",
-        OWN_DOMAIN,
-        (
-            Operand("X", "N C H W", FLOATS),
-            Operand("W", "K C 3 3", FLOATS),
-            Operand("B", "K", FLOATS),
-        ),
-        "me2e",
+        "me2e", "WinogradConvolution", OWN_DOMAIN,
+        (Operand("X", "N C H W"), Operand("W", "K C 3 3"), Operand("B", "K")), "me2e",
         (Attribute("pads", (0, 0, 0, 0)), Attribute("relu", 0, choices=(0, 1))),
-    )
+    )  # fmt: skip
     dialects: ClassVar[tuple[Dialect, ...]] = ()
 
     def output_shape(
@@ -82,15 +74,12 @@ class WinogradConvolution(Operator):
         image, weight, bias = present(inputs)
         pads, relu = numbers(attributes, "pads"), number(attributes, "relu")
         if call.compiled and image.dtype in (None, ir.DataType.FLOAT):
-            return self._by_kernel(call, (image, weight, bias), attributes)
+            return self._call_kernel(call, (image, weight, bias), attributes)
         result = call.add("Conv", [image, weight, bias], {"pads": list(pads)})
         return call.add("Relu", [result]) if relu else result
 
-    def _by_kernel(
-        self,
-        call: FusedCall,
-        inputs: tuple[ir.Value, ir.Value, ir.Value],
-        attributes: Attributes,
+    def _call_kernel(
+        self, call: FusedCall, inputs: Sequence[ir.Value], attributes: Attributes
     ) -> ir.Value:
         image, weight, bias = inputs
         # The kernel reads filters beside each other: [3, 3, C, K]

@@ -12,7 +12,7 @@ from me2e_compress.graph import rewrite
 from me2e_compress.graph.nodes import Array
 from me2e_compress.graph.shapes import Dims, open_shape
 from me2e_compress.graph.validity import ORIGINAL_DOMAIN
-from me2e_compress.operators.replace import FusedNode, hold_constants
+from me2e_compress.operators.replace import FusedNode, write_constant_nodes
 from me2e_compress.passes.base import Context, Pass, PassResult
 
 LARGEST_TABLE = 256
@@ -94,7 +94,7 @@ class AttachBodies(Pass):
                 constant = rewrite.add_constant(function.graph, known, name)
                 value.replace_all_uses_with(constant)
         operators.expand(node, opset=first.opset, by=self.name)
-        hold_constants(function)
+        write_constant_nodes(function)
         return function
 
 

@@ -1,17 +1,15 @@
-"""The kernel of attention, whose scores are never all in memory.
+"""The kernel of attention, which never stores all scores.
 
-Scores are computed for a block of keys at a time, and the softmax goes along (Dao et
-al., FlashAttention, arXiv 2205.14135, algorithm 1). Everything is turned: rows are keys
-or channels, and columns are queries, so that the softmax runs over vectors, and keys
-and values are read where they lie.
+Scores are computed for one block of keys at a time (Dao et al., FlashAttention, arXiv
+2205.14135, algorithm 1). All matrices are transposed: rows are keys or channels, and
+columns are queries, so that the softmax runs over vectors, and keys and values need no
+copy.
 
-One step of a softmax whose scores come in blocks, over vectors of queries.
-
-Milakov and Gimelshein, Online normalizer calculation for softmax, arXiv 1805.02867,
-algorithm 3: the largest score and the sum of powers so far are kept, and what was
-summed before is corrected where a block has a larger score. Powers are of 2: callers
-multiply scores by log2(e). It is written as LLVM instructions, since a call of C's
-``exp2f`` is not vectorized.
+The softmax is updated block by block (Milakov and Gimelshein, Online normalizer
+calculation for softmax, arXiv 1805.02867, algorithm 3): it keeps the largest score and
+the sum of powers so far, and corrects the sums where a block has a larger score. Powers
+are of 2: callers multiply scores by log2(e). It is written as LLVM instructions, since
+a call of C's ``exp2f`` is not vectorized.
 """
 
 import dataclasses
@@ -31,10 +29,10 @@ from me2e_compress.operators.kernels.intrinsics import (
     address_of,
     call,
     compiled,
+    create_output,
+    error_status,
     floats,
-    made,
-    read,
-    refused,
+    read_input,
     stack,
     words,
 )
@@ -61,7 +59,7 @@ def softmax_step(vectors: int, lanes: int) -> Any:
 
 
 class _Step:
-    """Writes a loop that finds the largest scores, and one that computes powers."""
+    """Writes the loops of a step: largest scores, corrected sums, powers."""
 
     def __init__(
         self, simd: Vectors, vectors: int, scores: Any, count: Any, *others: Any
@@ -230,19 +228,19 @@ def _compute(state: int, context: int) -> Word:
     t, x, a = words(state), _inputs(), _words()
     # Read the inputs and check their sizes
     for i in range(3):
-        if read(t, context, i, address_of(x) + 8 * EACH * i) != RANK:
-            return refused(t, RANK_WRONG)
+        if read_input(t, context, i, address_of(x) + 8 * EACH * i) != RANK:
+            return error_status(t, RANK_WRONG)
         a[i] = x[EACH * i + ADDRESS]
     for i in range(RANK):
         if x[EACH + i] != x[2 * EACH + i] or (i != 1 and x[EACH + i] != x[i]):
-            return refused(t, SIZE_WRONG)
+            return error_status(t, SIZE_WRONG)
     a[N], a[Q], a[M], a[D], a[K] = x[0], x[1], x[2], x[3], x[EACH + 1]
     if a[K] == 0:
-        return refused(t, SIZE_WRONG)
+        return error_status(t, SIZE_WRONG)
     if a[D] > WIDEST_HEAD:
-        return refused(t, TOO_WIDE)
+        return error_status(t, TOO_WIDE)
     # Create the output
-    status = made(t, context, x, RANK, address_of(a) + 8 * OUT)
+    status = create_output(t, context, x, RANK, address_of(a) + 8 * OUT)
     if status != 0 or a[N] * a[Q] * a[M] * a[D] == 0:
         return status
     # Run the blocks on the session's threads

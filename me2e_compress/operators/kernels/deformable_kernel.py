@@ -18,11 +18,11 @@ from me2e_compress.operators.kernels.intrinsics import (
     address_of,
     call,
     compiled,
+    create_output,
+    error_status,
     floats,
     ints,
-    made,
-    read,
-    refused,
+    read_input,
     signed_bytes,
     stack,
     unsigned_bytes,
@@ -42,7 +42,7 @@ OTHERS = 16
 corner_weights = stack(types.float32, 6 * CAPACITY)
 """Weights of four corners; then width and height of each point's level."""
 corner_offsets = stack(types.int32, 8 * CAPACITY)
-"""Offsets of four corners; then what :func:`tables` writes."""
+"""Offsets of four corners; then what :func:`write_tables` writes."""
 
 
 @compiled
@@ -53,7 +53,7 @@ def _whole(address: int, index: int, wide: int) -> Word:
 
 
 @compiled
-def beyond(a: Any) -> Word:
+def is_beyond_rows(a: Any) -> Word:
     """Return whether a level lies outside of the rows of value."""
     s = a[S]
     for k in range(a[L]):
@@ -62,7 +62,7 @@ def beyond(a: Any) -> Word:
         first = _whole(a[STARTS], k, a[WIDE_STARTS])
         if height < 0 or width < 0 or first < 0:
             return 1
-        # each alone first: products of absurd numbers would overflow
+        # Compare each alone first: products of huge numbers would overflow
         large = height > s or width > s or first > s or first + height * width > s
         if height > 0 and width > 0 and large:
             return 1
@@ -70,8 +70,8 @@ def beyond(a: Any) -> Word:
 
 
 @compiled
-def scaled(a: Any, x: Any, scale: int) -> Word:
-    """Take scale and zero point, inputs ``scale`` and the next; return if they fit."""
+def take_scale(a: Any, x: Any, scale: int) -> Word:
+    """Read scale and zero point, inputs ``scale`` and the next; return if they fit."""
     a[SCALES] = x[EACH * scale]
     if (a[SCALES] != 1 and a[SCALES] != a[M] * a[D]) or x[EACH * (scale + 1)] != 1:
         return 0
@@ -84,7 +84,7 @@ def scaled(a: Any, x: Any, scale: int) -> Word:
 
 
 @compiled
-def tables(a: Any, w: Any, o: Any, heads: int, together: int) -> None:
+def write_tables(a: Any, w: Any, o: Any, heads: int, together: int) -> None:
     """Write the constants of every point of a query: sizes and offsets of its level.
 
     ``together`` levels stand beside each other, then heads: [levels / together, heads,
@@ -111,7 +111,7 @@ def tables(a: Any, w: Any, o: Any, heads: int, together: int) -> None:
 
 
 @compiled
-def corners(
+def write_corners(
     w: Any, o: Any, places: Any, shares: Any, start: int, count: int, row: int
 ) -> None:
     """Write the weights and offsets of the four corners of every point.
@@ -158,8 +158,8 @@ def corners(
 
 
 @compiled
-def share_of(w: Any, first: int, last: int) -> Any:
-    """Return the sum of all corners' weights, which the zero point is worth."""
+def sum_of_weights(w: Any, first: int, last: int) -> Any:
+    """Return the sum of all corners' weights, the factor of the zero point."""
     shares = F(0)
     for j in range(first, last):
         left = w[j] + w[2 * CAPACITY + j]
@@ -169,8 +169,8 @@ def share_of(w: Any, first: int, last: int) -> Any:
 
 
 @compiled
-def to_real(a: Any, out: int, head: int, shares: Any) -> None:
-    """Turn the sums of one head over integers into those over the numbers meant."""
+def dequantize_sums(a: Any, out: int, head: int, shares: Any) -> None:
+    """Turn sums of one head's int8 values into sums of the numbers they stand for."""
     numbers, scales = floats(out), floats(a[SCALE])
     zero = F(a[ZERO]) * shares
     if a[SCALES] == 1:
@@ -179,9 +179,6 @@ def to_real(a: Any, out: int, head: int, shares: Any) -> None:
     else:
         for d in range(a[D]):
             numbers[d] = (numbers[d] - zero) * scales[head * a[D] + d]
-
-
-# A call: its inputs are checked, its blocks run on the session's threads.
 
 
 RANK_WRONG, SIZE_WRONG, NOT_WHOLE, BEYOND, TOO_LARGE, TOO_MANY, SCALE_WRONG = range(7)
@@ -231,9 +228,9 @@ def _compute(
         for i in range(EACH * (scale + 2)):
             x[i] = 0
         for i in range(inputs):
-            rank = read(t, context, i, address_of(x) + 8 * EACH * i)
+            rank = read_input(t, context, i, address_of(x) + 8 * EACH * i)
             if rank != ranks[i] and not (rank == 0 and i >= scale):
-                return refused(t, RANK_WRONG)
+                return error_status(t, RANK_WRONG)
             if rank == 0:
                 x[EACH * i] = 1
         # Addresses, sizes and flags for the blocks
@@ -242,18 +239,18 @@ def _compute(
         a[N], a[S], a[M], a[D], a[L] = x[0], x[1], x[2], x[3], x[EACH]
         a[WIDE_SHAPES] = x[EACH + TYPE] == abi.INT64
         a[WIDE_STARTS] = x[2 * EACH + TYPE] == abi.INT64
-        misfit = _misfit(a, x) if take(a, x) else SIZE_WRONG
+        misfit = _message_of_sizes(a, x) if take(a, x) else SIZE_WRONG
         if misfit >= 0:
-            return refused(t, misfit)
+            return error_status(t, misfit)
         a[SCALES] = 0
         if quantized:
             a[SCALE] = x[EACH * scale + ADDRESS]
             a[ZERO] = x[EACH * (scale + 1) + ADDRESS]
-            if not scaled(a, x, scale):
-                return refused(t, SCALE_WRONG)
+            if not take_scale(a, x, scale):
+                return error_status(t, SCALE_WRONG)
         # Create the output
         x[0], x[1], x[2], x[3] = a[N], a[Q], a[M], a[D]
-        status = made(t, context, x, 4, address_of(a) + 8 * OUT)
+        status = create_output(t, context, x, 4, address_of(a) + 8 * OUT)
         if status != 0:
             return status
         # Run the blocks on the session's threads
@@ -266,7 +263,7 @@ def _compute(
 
 
 @compiled
-def _misfit(a: Any, x: Any) -> Word:
+def _message_of_sizes(a: Any, x: Any) -> Word:
     """Return the index of the message for unfit levels or sizes; -1 if they fit."""
     if x[EACH + 1] != 2 or x[2 * EACH] != a[L]:
         return SIZE_WRONG
@@ -277,7 +274,7 @@ def _misfit(a: Any, x: Any) -> Word:
         return TOO_LARGE
     if a[L] * a[P] > CAPACITY:
         return TOO_MANY
-    return BEYOND if beyond(a) else -1
+    return BEYOND if is_beyond_rows(a) else -1
 
 
 QUERIES = 128
@@ -305,7 +302,7 @@ def _block(kind: Any) -> Callable[[int, int], Word]:
             at_once = 1  # one head after the other looks at the same places
         # Tables are the same for all queries
         w, o = corner_weights(), corner_offsets()
-        tables(a, w, o, at_once, a[L])
+        write_tables(a, w, o, at_once, a[L])
         offsets, weights = address_of(o), address_of(w)
         for q in range(from_query, to_query):
             m = 0
@@ -316,14 +313,14 @@ def _block(kind: Any) -> Callable[[int, int], Word]:
                 looked_at = n * a[Q] + q if a[SHARED] else first
                 places = floats(a[PLACES] + looked_at * points * 8)
                 shares = floats(a[SHARES] + first * points * 4)
-                corners(w, o, places, shares, 0, heads * points, row)
+                write_corners(w, o, places, shares, 0, heads * points, row)
                 rows = a[VALUE] + (n * a[S] * row + m * a[D]) * bytes_each
                 out = a[OUT] + first * a[D] * 4
                 for k in range(heads):
                     begin, end, to = k * points, (k + 1) * points, out + k * a[D] * 4
                     sum_rows((rows, offsets, weights, begin, end, to, a[D]))
                     if quantized:
-                        to_real(a, to, m + k, share_of(w, begin, end))
+                        dequantize_sums(a, to, m + k, sum_of_weights(w, begin, end))
                 m += at_once
         return 0
 

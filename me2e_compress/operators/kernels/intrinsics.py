@@ -1,8 +1,7 @@
-"""What kernels are written with: addresses, calls through them, memory on the stack.
+"""Functions that kernels call: addresses, C functions, memory, inputs and outputs.
 
-And what a kernel asks of its call: its inputs, its output, and memory of the session's
-arena. ``KernelContext_GetScratchBuffer`` is no such thing: on the CPU, nothing ever
-frees it.
+Memory is that of the stack or of the session's arena. It is not that of
+``KernelContext_GetScratchBuffer``, which nothing ever frees on the CPU.
 """
 
 from collections.abc import Callable
@@ -110,14 +109,14 @@ _slot = stack(types.int64, 1)
 
 
 @compiled
-def refused(t: Any, message: int) -> Word:
-    """Return the status with a kernel's message, by index."""
+def error_status(t: Any, message: int) -> Word:
+    """Return the error status with a message of the kernel, by index."""
     create, text = t[abi.CREATE_STATUS], t[abi.MESSAGES + message]
     return call(create, abi.INVALID_ARGUMENT, text, 0, 0, 0)
 
 
 @compiled
-def read(t: Any, context: int, index: int, to: int) -> Word:
+def read_input(t: Any, context: int, index: int, to: int) -> Word:
     """Read an input into ten words (dimensions, address, type) and return its rank.
 
     More than eight dimensions are not read.
@@ -139,7 +138,7 @@ def read(t: Any, context: int, index: int, to: int) -> Word:
 
 
 @compiled
-def made(t: Any, context: int, dims: Any, rank: int, to: int) -> Word:
+def create_output(t: Any, context: int, dims: Any, rank: int, to: int) -> Word:
     """Create the output, write its address to ``to`` and return the status."""
     slot = _slot()
     at = address_of(slot)
@@ -156,10 +155,10 @@ _slots = stack(types.int64, 2)
 
 
 @compiled
-def borrow(t: Any, context: int, size: int, to: Any) -> Word:
-    """Take memory and return the status; it begins at ``to[0]``.
+def allocate_memory(t: Any, context: int, size: int, to: Any) -> Word:
+    """Allocate memory of the arena, write its address to ``to[0]``; return the status.
 
-    ``to`` are three words, which :func:`give_back` needs.
+    ``to`` are three words, which :func:`free_memory` needs.
     """
     slots = _slots()
     at = address_of(slots)
@@ -176,7 +175,7 @@ def borrow(t: Any, context: int, size: int, to: Any) -> Word:
 
 
 @compiled
-def give_back(t: Any, held: Any) -> None:
-    """Return what :func:`borrow` took."""
-    call(t[abi.FREE], held[1], held[2], 0, 0, 0)
-    call(t[abi.RELEASE_ALLOCATOR], held[1], 0, 0, 0, 0)
+def free_memory(t: Any, memory: Any) -> None:
+    """Free the three words of memory that :func:`allocate_memory` wrote."""
+    call(t[abi.FREE], memory[1], memory[2], 0, 0, 0)
+    call(t[abi.RELEASE_ALLOCATOR], memory[1], 0, 0, 0, 0)

@@ -116,14 +116,14 @@ class _Product:
         wanted = builder.icmp_signed("!=", self.add, WORD(0))
         builder.cbranch(wanted, adding, zeros)
         builder.position_at_end(adding)
-        held = [self.simd.load(place, mask) for place in places]
+        loaded = [self.simd.load(place, mask) for place in places]
         builder.branch(head)
         builder.position_at_end(zeros)
         builder.branch(head)
         builder.position_at_end(head)
         step = self._from(WORD(0), WORD(0), zeros, adding)
         nothing = self.simd.spread(0.0)
-        sums = [self._from(nothing, each, zeros, adding) for each in held]
+        sums = [self._from(nothing, each, zeros, adding) for each in loaded]
         builder.cbranch(builder.icmp_signed("<", step, self.k), body, after)
         # Each step multiplies a row of B by one number of A for each row of C
         builder.position_at_end(body)

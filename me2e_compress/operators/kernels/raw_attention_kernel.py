@@ -25,11 +25,11 @@ from me2e_compress.operators.kernels.deformable_kernel import (
     S,
     corner_offsets,
     corner_weights,
-    corners,
+    dequantize_sums,
     functions_of,
-    share_of,
-    tables,
-    to_real,
+    sum_of_weights,
+    write_corners,
+    write_tables,
 )
 from me2e_compress.operators.kernels.intrinsics import (
     Word,
@@ -59,11 +59,8 @@ def _softmax_of(size: int) -> Any:
     def write(simd: Vectors, scores: Any, weights: Any) -> None:
         def over_row(x: Any, join: Callable[[Any, Any], Any]) -> Any:
             # Each step joins lanes twice as far apart, within a row
-            step = 1
-            while step < size:
-                other = simd.choose(x, x, [lane ^ step for lane in range(LANES)])
-                x = join(x, other)
-                step *= 2
+            for step in [1, 2, 4, 8][: size.bit_length() - 1]:
+                x = join(x, simd.choose(x, x, [n ^ step for n in range(LANES)]))
             return x
 
         x = simd.load(simd.pointer(scores))
@@ -90,18 +87,14 @@ def softmax(scores: Any, weights: Any, rows: int, size: int) -> None:
     done, count = 0, rows * size
     source, target = address_of(scores), address_of(weights)
     # The usual sizes, several rows at a time
-    if size == 4:
-        while done + LANES <= count:
+    while (size == 4 or size == 8 or size == 16) and done + LANES <= count:
+        if size == 4:
             _by_4((source + 4 * done, target + 4 * done))
-            done += LANES
-    elif size == 8:
-        while done + LANES <= count:
+        elif size == 8:
             _by_8((source + 4 * done, target + 4 * done))
-            done += LANES
-    elif size == 16:
-        while done + LANES <= count:
+        else:
             _by_16((source + 4 * done, target + 4 * done))
-            done += LANES
+        done += LANES
     # Other sizes, and what is left, row by row
     while done < count:
         most = scores[done]
@@ -121,7 +114,7 @@ QUERIES = 64
 """Queries per block of work: cells that cameras see are together, so fewer than in
 :mod:`deformable_kernel` to balance the threads."""
 
-# an operand's words: its address, its steps along batch, queries and heads, and how
+# An operand's words: its address, its steps along batch, queries and heads, and how
 # many levels and points it has
 STEP_N, STEP_Q, STEP_M, LEVELS, POINTS, OPERAND = range(1, 7)
 REFERENCE, OFFSETS, SCORES, MASK, WORDS = range(OTHERS, OTHERS + 5 * OPERAND, OPERAND)
@@ -221,7 +214,7 @@ def _block(kind: Any) -> Callable[[int, int], Word]:
         # Tables are the same for all queries
         at_once = min(a[M], CAPACITY // max(a[L] * a[P], 1))
         w, o = corner_weights(), corner_offsets()
-        tables(a, w, o, at_once, together)
+        write_tables(a, w, o, at_once, together)
         offsets, weights = address_of(o), address_of(w)
         soft, shares, at, total = _numbers(), _numbers(), _pairs(), _numbers()
         for q in range(from_query, to_query):
@@ -249,16 +242,16 @@ def _block(kind: Any) -> Callable[[int, int], Word]:
                     _places(a, at, near, away, group, heads)
                     _shares(a, shares, soft, mask, group, heads)
                     start = group * at_once * each
-                    corners(w, o, at, shares, start, heads * each, row)
+                    write_corners(w, o, at, shares, start, heads * each, row)
                     for k in range(heads):
                         begin, end = k * each, (k + 1) * each
                         to = out + k * a[D] * 4
                         add_rows((rows, offsets, weights, begin, end, to, a[D]))
                         if quantized:
-                            total[k] += share_of(w, begin, end)
+                            total[k] += sum_of_weights(w, begin, end)
                 if quantized:
                     for k in range(heads):
-                        to_real(a, out + k * a[D] * 4, m + k, total[k])
+                        dequantize_sums(a, out + k * a[D] * 4, m + k, total[k])
         return 0
 
     return block

@@ -29,14 +29,14 @@ from me2e_compress.operators.kernels.intrinsics import (
     WORD,
     Word,
     address_of,
-    borrow,
+    allocate_memory,
     call,
     compiled,
+    create_output,
+    error_status,
     floats,
-    give_back,
-    made,
-    read,
-    refused,
+    free_memory,
+    read_input,
     stack,
     words,
 )
@@ -345,7 +345,7 @@ NUMBERS = 5
 
 _words = stack(types.int64, WORDS)
 _inputs = stack(types.int64, EACH * len(RANKS))
-_held = stack(types.int64, 3)
+_memory = stack(types.int64, 3)
 
 
 @compiled
@@ -425,7 +425,7 @@ def _sizes(a: Any, x: Any) -> Word:
 def _run(t: Any, context: int, a: Any) -> Word:
     """Run both stages on the session's threads."""
     # Filters are read again for each block, inputs for each group
-    panels, held = part(a[K], LANES), _held()
+    panels, memory = part(a[K], LANES), _memory()
     filters = PRODUCTS * filter_plane(a[C], panels) * 4
     inputs = PRODUCTS * input_plane(a[C]) * 4
     a[BY_BLOCK] = 2 * filters <= a[BLOCKS] * inputs
@@ -436,10 +436,10 @@ def _run(t: Any, context: int, a: Any) -> Word:
         pieces = part(a[K], GROUP)
     a[PARTS] = min(pieces, STRIPS)
     a[STRIDE] = own + (PRODUCTS * PRODUCT_PLANE + LANES) * 4
-    status = borrow(t, context, shared + a[PARTS] * a[STRIDE], held)
+    status = allocate_memory(t, context, shared + a[PARTS] * a[STRIDE], memory)
     if status != 0:
         return status
-    a[SHARED], a[OWN] = held[0], held[0] + shared
+    a[SHARED], a[OWN] = memory[0], memory[0] + shared
     # Run
     run, code, user = t[abi.PARALLEL_FOR], t[abi.BLOCK], address_of(a)
     a[FIRST_STAGE] = 1
@@ -447,7 +447,7 @@ def _run(t: Any, context: int, a: Any) -> Word:
     a[FIRST_STAGE] = 0
     if status == 0:
         status = call(run, context, code, a[PARTS], 0, user)
-    give_back(t, held)
+    free_memory(t, memory)
     return status
 
 
@@ -455,16 +455,16 @@ def _compute(state: int, context: int) -> Word:
     t, x, a = words(state), _inputs(), _words()
     # Read the inputs
     for i in range(len(RANKS)):
-        rank = read(t, context, i, address_of(x) + 8 * EACH * i)
+        rank = read_input(t, context, i, address_of(x) + 8 * EACH * i)
         if rank != RANKS[i]:
-            return refused(t, RANK_WRONG)
+            return error_status(t, RANK_WRONG)
         a[i] = x[EACH * i + ADDRESS]
     misfit = _sizes(a, x)
     if misfit >= 0:
-        return refused(t, misfit)
+        return error_status(t, misfit)
     # Create the output
     x[0], x[1], x[2], x[3] = a[N], a[K], a[HIGH], a[WIDE]
-    status = made(t, context, x, 4, address_of(a) + 8 * Y)
+    status = create_output(t, context, x, 4, address_of(a) + 8 * Y)
     if status != 0 or a[BLOCKS] * a[K] == 0:
         return status
     return _run(t, context, a)
