@@ -38,7 +38,7 @@ def _record_shapes(model: ir.Model) -> None:
         sweep = Sweep(
             graph.opset_of(copy), set(), set(), through_compute=False, trust_shapes=True
         )
-        sweep.run(copy.graph)
+        sweep.visit_nodes(copy.graph)
         left = _unshaped(copy)
     # write the shapes back, by name
     known = {value.name: value for node in copy.graph for value in node.outputs}

@@ -21,25 +21,25 @@ def digest(model: ir.Model) -> str:
     hasher = hashlib.blake2b(digest_size=16)
     hasher.update(repr(sorted(model.opset_imports.items())).encode())
     hasher.update(repr(sorted(model.metadata_props.items())).encode())
-    _graph(hasher, model.graph)
+    _hash_graph(hasher, model.graph)
     for key in sorted(model.functions, key=str):
         function = model.functions[key]
         hasher.update(repr((key, sorted(function.opset_imports.items()))).encode())
-        _nodes(hasher, function)
+        _hash_nodes(hasher, function)
     return hasher.hexdigest()
 
 
-def _graph(hasher: "hashlib.blake2b", graph: ir.Graph) -> None:
+def _hash_graph(hasher: "hashlib.blake2b", graph: ir.Graph) -> None:
     for value in (*graph.inputs, *graph.outputs):
         hasher.update(f"{value.name}:{value.type}:{value.shape}\n".encode())
     for name in sorted(graph.initializers):
         hasher.update(f"={name}\n".encode())
         tensor = graph.initializers[name].const_value
         hasher.update(b"?" if tensor is None else digest_of_tensor(tensor))
-    _nodes(hasher, graph)
+    _hash_nodes(hasher, graph)
 
 
-def _nodes(hasher: "hashlib.blake2b", nodes: Iterable[ir.Node]) -> None:
+def _hash_nodes(hasher: "hashlib.blake2b", nodes: Iterable[ir.Node]) -> None:
     for node in nodes:
         head = (
             node.domain,
@@ -51,18 +51,18 @@ def _nodes(hasher: "hashlib.blake2b", nodes: Iterable[ir.Node]) -> None:
         )
         hasher.update(repr(head).encode())
         for name in sorted(node.attributes):
-            _attribute(hasher, node.attributes[name])
+            _hash_attribute(hasher, node.attributes[name])
 
 
-def _attribute(hasher: "hashlib.blake2b", attribute: ir.Attr) -> None:
+def _hash_attribute(hasher: "hashlib.blake2b", attribute: ir.Attr) -> None:
     hasher.update(f"{attribute.name}/{attribute.type}/".encode())
     if attribute.is_ref():
         hasher.update(f"@{attribute.ref_attr_name}".encode())
     elif attribute.type == ir.AttributeType.GRAPH:
-        _graph(hasher, attribute.as_graph())
+        _hash_graph(hasher, attribute.as_graph())
     elif attribute.type == ir.AttributeType.GRAPHS:
         for graph in attribute.as_graphs():
-            _graph(hasher, graph)
+            _hash_graph(hasher, graph)
     elif attribute.type == ir.AttributeType.TENSOR:
         tensor = attribute.value  # as_tensor() checks a protocol: slow
         hasher.update(digest_of_tensor(tensor))

@@ -16,8 +16,8 @@ from google.protobuf.message import DecodeError
 from me2e_compress.display import error_line, join_names
 from me2e_compress.errors import GraphError
 from me2e_compress.graph import provenance, structure
-from me2e_compress.graph.nodes import STANDARD, nodes_of
-from me2e_compress.graph.opset import fit, note_change
+from me2e_compress.graph.nodes import STANDARD, bodies, nodes_of
+from me2e_compress.graph.opset import fit_runtime, note_change
 from me2e_compress.graph.recurrence import recurrent_inputs
 from me2e_compress.graph.summary import weight_bytes
 from me2e_compress.graph.validity import PLAIN_INITIALIZERS_SINCE_IR
@@ -37,14 +37,14 @@ def load(path: str | Path) -> ir.Model:
 
     Initializers that the exporter also listed as inputs
     (``keep_initializers_as_inputs``) stop being inputs, which is valid from IR version
-    4 on: older models are raised to that. A graph in an
-    opset in which onnxruntime cannot run it is written in another
-    (:func:`~me2e_compress.graph.opset.read_as` says so).
+    4 on: older models are raised to that. A graph in an opset in which onnxruntime
+    cannot run it is converted (:func:`~me2e_compress.graph.opset.read_as` says to
+    which).
 
     Raises:
         GraphError: no such file, not an ONNX model, cut short, or its data file is
             missing, shorter than the model says or not in the model's folder; or it
-            is newer than onnxruntime and cannot be written as an older one.
+            is newer than onnxruntime and cannot be converted to an older opset.
     """
     path = Path(path)
     if not path.is_file():
@@ -62,14 +62,14 @@ def load(path: str | Path) -> ir.Model:
         ) from error
     try:
         in_order = structure.check(proto)
-        model = _built(proto, in_order)
+        model = _build_model(proto, in_order)
         provenance.unpack(model)
     except GraphError as error:
         raise GraphError(f"{path}: {error}") from error
     ir.external_data.set_base_dir(model.graph, path.parent)
     _name_standard(model)
-    settle(model, path)
-    fit(model, path)
+    read_small_weights(model, path)
+    fit_runtime(model, path)
     _freeze_defaults(model)
     model.ir_version = max(model.ir_version, PLAIN_INITIALIZERS_SINCE_IR)
     return model
@@ -78,25 +78,25 @@ def load(path: str | Path) -> ir.Model:
 def _freeze_defaults(model: ir.Model) -> None:
     """Make constants of inputs that have initializers, and note that in the model.
 
-    Before IR version 4 every initializer had to be an input: nobody fed those. A state
-    stays an input: it is fed back, and begins as zeros.
+    Before IR version 4 every initializer had to be an input. A recurrent input stays an
+    input, and begins as zeros.
     """
     weights = model.graph.initializers
-    if any(each.is_initializer() for each in model.graph.inputs):
+    if any(value.is_initializer() for value in model.graph.inputs):
         for name in filter(weights.__contains__, recurrent_inputs(model)):
             state = weights.pop(name)
             if state.const_value is not None and state.const_value.numpy().any():
                 note_change(model, f"state {name} held a value, and begins as zeros")
             state.const_value = None
-    names = [str(each.name) for each in model.graph.inputs if each.is_initializer()]
+    names = [str(value.name) for value in model.graph.inputs if value.is_initializer()]
     common.RemoveInitializersFromInputsPass()(model)
     if names and model.ir_version >= PLAIN_INITIALIZERS_SINCE_IR:
-        held = f"{join_names(names)} held a value: no input any more, but a constant"
+        change = f"{join_names(names)} held a value: no input any more, but a constant"
         way = "what is to stay one, take out of the initializers"
-        note_change(model, f"{held}; {way}")
+        note_change(model, f"{change}; {way}")
 
 
-def _built(proto: onnx.ModelProto, in_order: bool) -> ir.Model:
+def _build_model(proto: onnx.ModelProto, in_order: bool) -> ir.Model:
     """Build the graph of a message, its nodes in order."""
     proto.graph.name = proto.graph.name or "graph"  # ONNX's checker wants one
     try:
@@ -115,8 +115,7 @@ def _built(proto: onnx.ModelProto, in_order: bool) -> ir.Model:
 
 def _name_standard(model: ir.Model) -> None:
     """Write the standard domain, which may be called ``ai.onnx``, as the empty name."""
-    bodies: list[ir.Graph | ir.Function] = [model.graph, *model.functions.values()]
-    for body in bodies:
+    for body, _ in bodies(model):
         for domain in STANDARD[1:]:
             if domain in body.opset_imports:
                 body.opset_imports.setdefault("", body.opset_imports.pop(domain))
@@ -142,14 +141,14 @@ def save(model: ir.Model, path: str | Path, *, external: bool | None = None) -> 
     if not path.parent.is_dir():
         raise GraphError(f"{path}: no such folder {path.parent}")
     stored = external_tensors(model)
-    names, own = data_names(path), {os.path.realpath(each.path) for each in stored}
+    names, own = data_names(path), {os.path.realpath(tensor.path) for tensor in stored}
     for data in names:
         if os.path.realpath(data) in own:
             raise GraphError(f"{data}: holds the weights of the model being saved")
     # The model that is replaced names one data file, if any; the last may be old
     there = path.is_file()
-    earlier = [each for each in names if there and _holds(path, each.name.encode())][:1]
-    data = next(each for each in names if each not in earlier)
+    earlier = [n for n in names if there and _contains(path, n.name.encode())][:1]
+    data = next(name for name in names if name not in earlier)
     if external is None:
         external = bool(stored) or weight_bytes(model) > INLINE_LIMIT_BYTES
     with (
@@ -157,7 +156,7 @@ def save(model: ir.Model, path: str | Path, *, external: bool | None = None) -> 
         tempfile.TemporaryDirectory(dir=path.parent, prefix=".saving-") as folder,
     ):
         draft = Path(folder) / path.name
-        with _ours(model), provenance.packed(model):
+        with _named_producer(model), provenance.packed(model):
             whole = inlined(model) if stored and not external else model
             where = data.name if external else None
             ir.save(whole, draft, format="protobuf", external_data=where)
@@ -173,8 +172,8 @@ def save(model: ir.Model, path: str | Path, *, external: bool | None = None) -> 
 
 
 @contextlib.contextmanager
-def _ours(model: ir.Model) -> Iterator[None]:
-    """Let a model name us as its producer while it is written."""
+def _named_producer(model: ir.Model) -> Iterator[None]:
+    """Name this toolkit as a model's producer while it is written."""
     before = model.producer_name, model.producer_version
     model.producer_name, model.producer_version = drafts.PRODUCER, None
     try:
@@ -196,7 +195,7 @@ def file_bytes(path: Path) -> int:
 def sha256_of(path: Path) -> str:
     """Hash a file, and with it the external data it names, as lower-case hex."""
     hasher = hashlib.sha256()
-    if _holds(path, _LOCATION, hasher):
+    if _contains(path, _LOCATION, hasher):
         for file in _external_files(path):
             for block in _blocks(file):
                 hasher.update(block)
@@ -206,27 +205,27 @@ def sha256_of(path: Path) -> str:
 def _external_files(path: Path) -> list[Path]:
     """List the data files that a model names, in the order of its weights."""
     # Parsing hundreds of MB takes as long as hashing them: look first.
-    if not _holds(path, _LOCATION):
+    if not _contains(path, _LOCATION):
         return []
     model = ir.load(path, format="protobuf")
     files = [data_file(path, tensor) for tensor in external_tensors(model)]
     return list(dict.fromkeys(files))
 
 
-def _holds(path: Path, words: bytes, hasher: "hashlib._Hash | None" = None) -> bool:
-    """Return whether a file holds some bytes; hash it on the way.
+def _contains(path: Path, words: bytes, hasher: "hashlib._Hash | None" = None) -> bool:
+    """Return whether a file contains some bytes; hash it on the way.
 
     It is read block by block: a mapped file would count as memory of this process.
     """
-    held, tail = False, b""
+    contains, tail = False, b""
     for block in _blocks(path):
         if hasher is not None:
             hasher.update(block)
-        seen = tail + block
-        held, tail = held or words in seen, seen[-len(words) :]
-        if held and hasher is None:
+        window = tail + block
+        contains, tail = contains or words in window, window[-len(words) :]
+        if contains and hasher is None:
             break
-    return held
+    return contains
 
 
 def _blocks(path: Path) -> Iterator[bytes]:
@@ -243,11 +242,6 @@ def inlined(model: ir.Model) -> ir.Model:
     return copy
 
 
-# Weights on disk: in files of their own, of which some are read at once and the others
-# mapped, or in the file of the graph. That is written one weight at a time: `onnx.save`
-# holds them three times, in the graph, in the message and in its bytes. Here they are
-# held once; the bytes of the file are the same.
-
 SMALL_BYTES = 1024
 """Weights up to this size are read at once: shapes and axes are among them, and
 ONNX's checker would look for their file in the working directory."""
@@ -258,12 +252,11 @@ def external_tensors(model: ir.Model) -> list[ir.ExternalTensor]:
     return [tensor for tensor, _ in _places(model)]
 
 
-def settle(model: ir.Model, path: Path) -> None:
-    """Check where external weights lie, and read those that must not stay on disk.
+def read_small_weights(model: ir.Model, path: Path) -> None:
+    """Check the files of external weights, and read those that must not stay on disk.
 
-    The large initializers of the main graph stay, mapped from a path that holds in
-    any working directory. Read are small ones, those of subgraphs and tensors in
-    attributes.
+    Large initializers of the main graph stay, mapped from an absolute path. Small ones,
+    those of subgraphs and tensors of attributes are read.
 
     Raises:
         GraphError: a tensor's file is missing, too short, or outside the model's
@@ -300,7 +293,7 @@ def data_file(model: Path, tensor: ir.ExternalTensor) -> Path:
         )
     resolved = Path(os.path.realpath(model.parent / location))
     homes = (os.path.realpath(model.parent), Path(os.path.realpath(model)).parent)
-    if not any(resolved.is_relative_to(each) for each in homes):
+    if not any(resolved.is_relative_to(home) for home in homes):
         raise GraphError(
             f"{model}: the data of {tensor.name} lie at {location!r} = {resolved},"
             " outside the model's folder: not read"
@@ -337,7 +330,7 @@ def _put(node: ir.Node, name: str, at: int | None, tensor: ir.TensorProtocol) ->
 
 
 def _anchored(tensor: ir.ExternalTensor, path: Path) -> ir.ExternalTensor:
-    """Return a tensor whose file is there, long enough and named absolutely."""
+    """Return a tensor with an absolute path; check that its file holds it."""
     data = data_file(path, tensor)
     if not data.is_file():
         missing = path.parent / str(tensor.location)

@@ -1,4 +1,4 @@
-"""Facts about nodes and values: who makes, who reads, and what constants hold."""
+"""Facts about nodes and values: makers, readers, and the arrays of constants."""
 
 import functools
 from collections.abc import Iterable, Iterator, Sequence
@@ -58,15 +58,15 @@ def opset_of(imports: ir.Model | ir.Graph | ir.Function) -> int:
 
 
 def bodies(model: ir.Model) -> Iterator[tuple[ir.Graph | ir.Function, int]]:
-    """List the graph and the functions, each with its opset."""
+    """Yield the graph and the functions, with their opsets."""
     main = opset_of(model)
     yield model.graph, main
     for function in model.functions.values():
         yield function, opset_of(function) or main
 
 
-def written(own: int, before: int, wanted: int) -> int:
-    """Return the opset of a body once the newest of its graph is another."""
+def converted_opset(own: int, before: int, wanted: int) -> int:
+    """Return a body's opset after the newest one of its model changed to ``wanted``."""
     return min(own, wanted) if wanted < before else max(own, wanted)
 
 
@@ -78,7 +78,7 @@ def nodes_of(model: ir.Model) -> Iterator[ir.Node]:
 
 
 def nodes_in(graph: ir.Graph | ir.Function) -> Iterator[ir.Node]:
-    """Walk the nodes of a graph, those of its bodies behind the node that has them."""
+    """Walk the nodes of a graph; a node's bodies follow that node."""
     for node in graph:
         yield node
         yield from nodes_inside(node)
@@ -91,7 +91,7 @@ def nodes_inside(node: ir.Node) -> Iterator[ir.Node]:
 
 
 def reads_of(node: ir.Node) -> Iterator[ir.Value]:
-    """Walk what a node reads of its own graph, by its bodies too."""
+    """Yield the values of its own graph that a node, or a body of it, reads."""
     yield from filter(None, node.inputs)
     for inner in nodes_inside(node):
         reads = (value for value in inner.inputs if value is not None)
@@ -99,7 +99,7 @@ def reads_of(node: ir.Node) -> Iterator[ir.Value]:
 
 
 _WITH_BODIES = frozenset({"If", "Loop", "Scan", "SequenceMap"})
-"""The operators of ONNX that have bodies; to look for them in others takes time."""
+"""The operators of ONNX that have bodies: only these are searched, to save time."""
 
 
 def bodies_of(node: ir.Node) -> Sequence[ir.Graph]:
@@ -117,16 +117,14 @@ def bodies_of(node: ir.Node) -> Sequence[ir.Graph]:
 
 def attribute_values(node: ir.Node) -> tuple[bytes, ...]:
     """Return a node's attributes, serialized: equal ones compare equal."""
-    return tuple(
-        ir.serde.serialize_attribute(node.attributes[name]).SerializeToString(
-            deterministic=True
-        )
-        for name in sorted(node.attributes)
+    protos = (
+        ir.serde.serialize_attribute(a) for _, a in sorted(node.attributes.items())
     )
+    return tuple(proto.SerializeToString(deterministic=True) for proto in protos)
 
 
 def makers_of(values: Iterable[ir.Value | None]) -> dict[ir.Node, None]:
-    """Find the nodes that compute some values, by what their bodies read too."""
+    """Return all nodes that some values depend on, through bodies of nodes too."""
     makers: dict[ir.Node, None] = {}
     waiting = list(values)
     while waiting:
@@ -143,9 +141,9 @@ def input_at(node: ir.Node, index: int) -> ir.Value | None:
 
 
 def draws(node: ir.Node) -> bool:
-    """Return whether a node draws numbers: one of random, or a Dropout that may train.
+    """Return whether a node draws random numbers, as a Dropout in training does.
 
-    Those that name a seed draw the same in every session.
+    Nodes with a seed draw the same numbers in every session.
     """
     training = input_at(node, 2) if node.op_type == "Dropout" else None
     known = array_of(training)
@@ -154,7 +152,7 @@ def draws(node: ir.Node) -> bool:
 
 
 def grid_of(node: ir.Node) -> ir.Value | None:
-    """Return where GridSample, or a plugin of it, samples; None of other nodes."""
+    """Return the grid of a GridSample or a plugin of it; None of other nodes."""
     samples = node.op_type.startswith(("GridSample", "grid_sampler"))
     return input_at(node, 1) if samples else None
 
@@ -205,10 +203,9 @@ NATIVE = FLOATS | {
 
 def maker(value: ir.Value | None, *op_types: str) -> ir.Node | None:
     """Return the node that makes a value, if it is one of these standard operators."""
-    node = None if value is None else value.producer()
-    if node is None or not is_standard(node) or node.op_type not in op_types:
-        return None
-    return node
+    node = producer_of(value)
+    fits = node is not None and is_standard(node) and node.op_type in op_types
+    return node if fits else None
 
 
 def unrenamed(value: ir.Value) -> ir.Value:
@@ -219,7 +216,7 @@ def unrenamed(value: ir.Value) -> ir.Value:
 
 
 def sole_maker(value: ir.Value | None, *op_types: str) -> ir.Node | None:
-    """Return the maker of a value that one node reads, of the same graph."""
+    """Return :func:`maker` of a first output that only one node of its graph reads."""
     node = maker(value, *op_types)
     if node is None or value is None or sole_reader(value) is None:
         return None
@@ -227,10 +224,10 @@ def sole_maker(value: ir.Value | None, *op_types: str) -> ir.Node | None:
 
 
 def sole_reader(value: ir.Value) -> ir.Node | None:
-    """Return the one node that reads a value, once; None if others do, or outputs.
+    """Return the one node that reads a value, once; None if it is an output too.
 
-    None too if it is in another graph than the value's maker, in the body of an If or
-    Loop: that runs seldom, or often, and what it makes stays inside.
+    None also if the reader is in another graph than the value's maker: the body of an
+    If or Loop may run never, or often.
     """
     uses = value.uses()
     if len(uses) != 1 or value.is_graph_output():
@@ -240,7 +237,7 @@ def sole_reader(value: ir.Value) -> ir.Node | None:
 
 
 def is_read(value: ir.Value) -> bool:
-    """Return whether anything needs a value: a node, or the outside."""
+    """Return whether a node reads a value, or it is a graph output."""
     return bool(value.uses()) or value.is_graph_output()
 
 
@@ -270,13 +267,13 @@ def integers_of(value: ir.Value | None) -> list[int] | None:
 
 
 def integers_at(node: ir.Node, name: str, index: int) -> list[int] | None:
-    """Return a list that newer opsets moved from an attribute to a constant input."""
+    """Return integers of an attribute, or of the input that replaced it later."""
     written = node.attributes.get_ints(name)
     return integers_of(input_at(node, index)) if written is None else list(written)
 
 
 def permutation_of(node: ir.Node) -> list[int] | None:
-    """Return the order of a Transpose; None if its rank decides and is not known."""
+    """Return the order of a Transpose; None if it has none and its rank is unknown."""
     written, data = node.attributes.get_ints("perm"), node.inputs[0]
     if written is not None:
         return list(written)
@@ -291,19 +288,15 @@ def overflow(numbers: Numbers, stored: Array) -> bool:
 
 
 def constant_values(model: ir.Model) -> frozenset[ir.Value]:
-    """Find the initializers and everything computed from them alone.
+    """Return the initializers and all values computed only from them.
 
-    Nodes with a body, calls of functions and operators of other domains count as
-    computed. One look at each node: the graph must be in topological order.
+    Nodes with a body, calls of functions and operators of other domains count as not
+    constant. The graph must be in topological order.
     """
     weights = model.graph.initializers.values()
     constants = {value for value in weights if not value.is_graph_input()}
     for node in model.graph:
-        if (
-            is_standard(node)
-            and not draws(node)
-            and not has_subgraph(node)
-            and all(each is None or each in constants for each in node.inputs)
-        ):
+        plain = is_standard(node) and not draws(node) and not has_subgraph(node)
+        if plain and constants.issuperset(filter(None, node.inputs)):
             constants.update(node.outputs)
     return frozenset(constants)

@@ -1,4 +1,4 @@
-"""Graphs in an opset in which onnxruntime cannot run them: written in another."""
+"""Convert graphs to an opset in which onnxruntime can run them."""
 
 from pathlib import Path
 
@@ -6,7 +6,7 @@ import onnx
 import onnx_ir as ir
 
 from me2e_compress.errors import GraphError
-from me2e_compress.graph.nodes import bodies, is_standard, opset_of, written
+from me2e_compress.graph.nodes import bodies, converted_opset, is_standard, opset_of
 from me2e_compress.graph.rewrite.raise_opset import OLDEST_OPSET, write_in
 from me2e_compress.graph.runtime_operators import (
     ADDED,
@@ -24,15 +24,15 @@ _ON_DISK = "me2e.on_disk"
 _NO_NEWER = "onnxruntime reads no newer"
 
 
-def fit(model: ir.Model, path: Path) -> None:
-    """Write a graph in an opset and IR version in which onnxruntime can run it.
+def fit_runtime(model: ir.Model, path: Path) -> None:
+    """Convert a graph to an opset and IR version in which onnxruntime can run it.
 
-    One that is newer than onnxruntime is written in the newest that it reads. Where
-    it has an operator of the graph in other opsets alone (RoiAlign before 22,
-    RMSNormalization from 23 on), the graph is written in the nearest older one in which
-    it has all of them, or else in a newer one. Operators that did not change stay as
-    they are, others are converted by ONNX's version converter, one by one, so that
-    names and metadata stay. :func:`read_as` says what changed.
+    A graph newer than onnxruntime is converted to the newest opset that it reads. If it
+    has an operator of the graph only in other opsets (RoiAlign before 22,
+    RMSNormalization from 23 on), the graph is converted to the nearest older opset in
+    which it has all operators, or else to a newer one. Operators that did not change
+    stay; others are converted by ONNX's version converter, one by one, so that names
+    and metadata stay. :func:`read_as` says what changed.
 
     Raises:
         GraphError: the graph is newer than onnxruntime, and its opset is unknown or an
@@ -51,7 +51,7 @@ def fit(model: ir.Model, path: Path) -> None:
 
 
 def read_as(model: ir.Model) -> str:
-    """Say what was changed when a graph was read, and why; empty if nothing was."""
+    """Return what was changed when a graph was read, and why; empty if nothing was."""
     return str(model.meta.get(_CHANGES, ""))
 
 
@@ -67,7 +67,7 @@ def on_disk(model: ir.Model) -> tuple[int, int]:
 
 
 def _fit_opset(model: ir.Model, path: Path) -> str:
-    """Write a graph in another opset if it needs one; return what changed and why."""
+    """Convert a graph to another opset if it needs one; return what changed and why."""
     opset, newest = max(opset for _, opset in bodies(model)), newest_opset()
     lacking, why = _lacking(model, opset, opset), _NO_NEWER
     if opset <= newest and not lacking:
@@ -77,7 +77,7 @@ def _fit_opset(model: ir.Model, path: Path) -> str:
             f"{path}: opset {opset}: onnxruntime reads up to {newest}, and onnx"
             f" {onnx.__version__} converts from {known} at most"
         )
-    if lacking := lacking or [each for each in ADDED if not has_operator(each, opset)]:
+    if lacking := lacking or [name for name in ADDED if not has_operator(name, opset)]:
         why = f"onnxruntime has no {' and no '.join(lacking)} in {opset}"
     older = range(min(opset, newest), OLDEST_OPSET - 1, -1)
     nearest = (*older, *range(opset + 1, newest + 1))
@@ -96,10 +96,10 @@ def _fit_opset(model: ir.Model, path: Path) -> str:
 
 
 def _lacking(model: ir.Model, before: int, wanted: int) -> list[str]:
-    """List the operators that onnxruntime has, but not once a graph is rewritten."""
+    """List the operators that onnxruntime has, but not in the opset ``wanted``."""
     opsets = range(OLDEST_OPSET, newest_opset() + 1)
     used = {
-        (node.op_type, written(opset, before, wanted))
+        (node.op_type, converted_opset(opset, before, wanted))
         for body, opset in bodies(model)
         for node in body.all_nodes()
         if is_standard(node)
@@ -108,5 +108,5 @@ def _lacking(model: ir.Model, before: int, wanted: int) -> list[str]:
         op_type
         for op_type, opset in sorted(used)
         if not has_operator(op_type, opset)
-        and any(has_operator(op_type, each) for each in opsets)
+        and any(has_operator(op_type, other) for other in opsets)
     ]

@@ -1,8 +1,9 @@
-"""Where a node comes from: its module, its source nodes, the passes that made it.
+"""The provenance of a node: its module, its source nodes, and the passes that made it.
 
-Stored in the node's ONNX metadata, so that it survives every tool that keeps metadata;
-in a file, origins and passes stand compressed in the model's, as does a module that all
-nodes share. The manager refuses a pass that loses it.
+It is stored in the node's ONNX metadata, so that it survives every tool that keeps
+metadata. In a file, origins that differ from the node's name are stored compressed in
+the model's metadata, a module that all nodes share once, and passes not at all. The
+manager refuses a pass that loses it.
 """
 
 import base64
@@ -44,7 +45,7 @@ def read(node: ir.Node) -> Provenance | None:
     """Read a node's provenance; None if it has none.
 
     Raises:
-        GraphError: what stands there is not what :func:`stamp` wrote.
+        GraphError: the metadata are not of the form that :func:`stamp` writes.
     """
     data = node.metadata_props
     if MODULE not in data or ORIGINS not in data:
@@ -81,8 +82,8 @@ def stamp(node: ir.Node, past: Provenance) -> None:
 def inherit(node: ir.Node, sources: Iterable[ir.Node], *, by: str) -> None:
     """Write the provenance of a new or changed node: that of the nodes it replaces.
 
-    Origins are united in order; the module is the first source's, the rule being
-    that the node whose value lives on is named first. ``by`` is the pass's name.
+    Origins are united in order; the module is that of the first source, so name the
+    node whose value remains first. ``by`` is the pass's name.
     """
     pasts = [past for source in sources if (past := read(source)) is not None]
     if not pasts:
@@ -119,9 +120,8 @@ def sign(before: ir.Model, after: ir.Model, by: str) -> None:
 def unstamped(before: ir.Model, after: ir.Model, by: str) -> list[str]:
     """List the nodes that a pass made or changed without adding its name.
 
-    A node is changed where its operator or an attribute is another; reading another
-    value of the same meaning is no change of its own. Empty where the graph before
-    says nothing of its nodes: they may have no names yet to be known by.
+    A node is changed if its operator or an attribute differs, but not if it only reads
+    another value. The list is empty if the graph before has no provenance.
     """
     if missing(before):
         return []
@@ -148,7 +148,7 @@ def foreign(before: ir.Model, after: ir.Model) -> list[str]:
 def _unsigned(before: ir.Model, after: ir.Model, by: str) -> list[ir.Node]:
     known: dict[str | None, ir.Node] = {}
     for node in nodes_in(before.graph):
-        known.setdefault(node.name, node)  # where two bear a name, the first keeps it
+        known.setdefault(node.name, node)  # of two with one name, the first counts
     return [
         node
         for node in nodes_in(after.graph)
@@ -158,21 +158,17 @@ def _unsigned(before: ir.Model, after: ir.Model, by: str) -> list[ir.Node]:
 
 
 def is_same(old: ir.Node | None, new: ir.Node) -> bool:
-    """Return whether two nodes compute the same from what they read."""
+    """Return whether two nodes compute the same from their inputs."""
     if old is None or (old.domain, old.op_type) != (new.domain, new.op_type):
         return False
     if list(old.attributes) != list(new.attributes):
         return False
-    return all(
-        mine is theirs or mine.type in _BODIES or repr(mine) == repr(theirs)
-        for mine, theirs in zip(
-            old.attributes.values(), new.attributes.values(), strict=True
-        )
-    )
+    pairs = zip(old.attributes.values(), new.attributes.values(), strict=True)
+    return all(a is b or a.type in _BODIES or repr(a) == repr(b) for a, b in pairs)
 
 
 _BODIES = (ir.AttributeType.GRAPH, ir.AttributeType.GRAPHS)
-"""Kinds of attributes whose nodes are looked at one by one."""
+"""Types of attributes whose nodes are compared one by one."""
 
 
 def compressed(text: str) -> str:
@@ -181,7 +177,7 @@ def compressed(text: str) -> str:
 
 
 def decompressed(text: str) -> str:
-    """Read what :func:`compressed` wrote; JSON is returned as it stands.
+    """Read a text of :func:`compressed`; JSON is returned as it is.
 
     Raises:
         MalformedError: it is neither, or holds more than 256 MiB.
@@ -234,7 +230,7 @@ def unpack(model: ir.Model) -> None:
     """Give the nodes of a model that was read their modules and origins again.
 
     Raises:
-        GraphError: what stands there is not what :func:`packed` wrote.
+        GraphError: the metadata are not of the form that :func:`packed` writes.
     """
     text = model.metadata_props.pop(ORIGINS, "{}")
     try:

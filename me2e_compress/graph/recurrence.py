@@ -131,7 +131,7 @@ def recurrent_inputs(model: ir.Model) -> dict[str, str]:
 def sides(model: ir.Model) -> tuple[dict[str, SessionPort], dict[str, SessionPort]]:
     """Return the inputs and the outputs of known rank of a graph in memory."""
     inputs, outputs = (
-        {str(each.name): port_of(each) for each in values if each.shape is not None}
+        {str(value.name): port_of(value) for value in values if value.shape is not None}
         for values in (model.graph.inputs, model.graph.outputs)
     )
     return inputs, outputs

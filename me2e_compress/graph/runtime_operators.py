@@ -52,7 +52,9 @@ def has_operator(op_type: str, opset: int) -> bool:
     schema: Any = onnx.defs.get_schema(op_type, opset, "")  # stubs lack functions
     if op_type == "Constant":  # which becomes a weight
         return True
-    if any(serves(each, schema.since_version) for each in kernels().get(op_type, ())):
+    if any(
+        serves(kernel, schema.since_version) for kernel in kernels().get(op_type, ())
+    ):
         return True
     if not schema.has_function:
         return bool(schema.has_context_dependent_function)
@@ -85,7 +87,7 @@ def newest_opset() -> int:
         opset
         for opset in range(known, 0, -1)
         if opset <= SURE_OPSET
-        or (all(has_operator(each, opset) for each in ADDED) and reads(opset))
+        or (all(has_operator(name, opset) for name in ADDED) and reads(opset))
     )
 
 

@@ -1,8 +1,8 @@
-"""Shapes: of values, of layers and products; inference of those not known.
+"""Shapes of values, layers and products, and their inference.
 
-ONNX's inference takes every vector for a shape and carries its values along; a vector
-of a billion elements takes it minutes and all memory: thirty Concats, each of the one
-before twice, make one of a scalar. So there is a bound on them before it begins.
+ONNX's inference may treat every vector as a shape and propagate its elements; for a
+vector of a billion elements that takes minutes and all memory. Thirty Concats, each of
+the one before twice, make such a vector of a scalar. So the elements are counted first.
 """
 
 import dataclasses
@@ -25,28 +25,30 @@ from me2e_compress.graph.nodes import (
 )
 
 MOST_CARRIED = 1 << 24
-"""Elements that are carried along in all: about 3 s."""
+"""Elements that ONNX may propagate in all: about 3 s."""
 
 _CARRY = frozenset(
     {"Add", "Cast", "Concat", "Gather", "Mul", "Slice", "Squeeze", "Sub", "Unsqueeze"}
 )
-"""Operators that ONNX follows values through, but for those that read shapes alone."""
+"""Operators through which ONNX propagates elements, without those that read shapes."""
 _FILL = frozenset({"ConstantOfShape", "Expand", "Range", "Tile"})
-"""Operators that make vectors as long as a number says."""
+"""Operators that make vectors whose length is a constant operand."""
 
 
-def can_carry(graph: ir.Graph) -> bool:
-    """Return whether ONNX can carry the values of a graph along in bounded time."""
+def can_propagate(graph: ir.Graph) -> bool:
+    """Return whether ONNX can propagate the elements of a graph in bounded time."""
     longest: dict[ir.Value, int] = {}
     total = 0
     for node in nodes_in(graph):
         if node.op_type in _FILL:  # the elements that constants ask for, at most
             arrays = map(array_of, node.inputs)
-            counts = [each for each in arrays if each is not None]
-            whole = [each for each in counts if each.dtype.kind == "i"]
+            counts = [array for array in arrays if array is not None]
+            whole = [count for count in counts if count.dtype.kind == "i"]
             size = math.prod(int(n.max(initial=1)) for n in whole if n.size < 64)
         elif node.op_type in _CARRY and node.attributes.get_int("axis", 0) in (0, -1):
-            read = [longest.get(each, _length(each)) for each in node.inputs if each]
+            read = [
+                longest.get(value, _length(value)) for value in node.inputs if value
+            ]
             size = sum(read) if node.op_type == "Concat" else max(read, default=0)
             total += size
         else:
@@ -58,33 +60,30 @@ def can_carry(graph: ir.Graph) -> bool:
 
 
 def _length(value: ir.Value) -> int:
-    """Return the elements of a vector; 1 where nothing says what it is."""
+    """Return the length of a vector; 1 if it or its shape is unknown."""
     if value.shape is None or not len(value.shape):
         return 1
     size = value.shape[0] if len(value.shape) == 1 else 0
     return size if isinstance(size, int) else 1
 
 
-# What is known of operators that ONNX does not have: plugins and fused operators.
-
-
 class PluginKnowledge(Protocol):
-    """Answers for the nodes that it knows."""
+    """Shapes and costs of plugins and fused operators, which ONNX does not know."""
 
     def infer(self, node: ir.Node) -> bool:
-        """Write type and shape of what a node gives; return whether anything is new."""
+        """Write type and shape of a node's output; return whether anything is new."""
         ...
 
     def macs(self, node: ir.Node) -> int | None:
-        """Count a node's multiply-accumulates; None where they are not known."""
+        """Count a node's multiply-accumulates; None if they are unknown."""
         ...
 
 
 def knowledge() -> PluginKnowledge:
-    """Return what the room of the fused operators says.
+    """Return the knowledge of :mod:`me2e_compress.operators`.
 
-    That room stands above this one, and is plugins by its name, as registries find
-    their entries; a graph without plugins never imports it.
+    This package may not import that one, so it is resolved by name, and only for a
+    graph with plugins.
     """
     plugins: PluginKnowledge = pkgutil.resolve_name(
         "me2e_compress.operators.replace:DialectKnowledge"
@@ -93,7 +92,7 @@ def knowledge() -> PluginKnowledge:
 
 
 INLINE_BYTES = 1024
-"""Weights up to this size are shown to ONNX's inference: shapes and axes are."""
+"""Weights up to this size, as shapes and axes are, are passed to ONNX's inference."""
 
 
 def static_shape(value: ir.Value | None) -> tuple[int, ...] | None:
@@ -116,23 +115,22 @@ def open_shape(value: ir.Value | None) -> tuple[int | None, ...] | None:
 
 
 def rank_of(value: ir.Value | None) -> int | None:
-    """Return how many dimensions a value has; None if that is not known."""
+    """Return the number of dimensions of a value; None if it is unknown."""
     return None if value is None or value.shape is None else len(value.shape)
 
 
 def infer_shapes(
     model: ir.Model, *, strict: bool = False, written: onnx.ModelProto | None = None
 ) -> None:
-    """Infer types and shapes by ONNX, in place, data propagation included if it can be.
+    """Infer types and shapes with ONNX, in place, with data propagation if possible.
 
-    Plugins of known dialects tell what they give (:mod:`me2e_compress.operators`). One
-    that nobody knows stops nothing: what it gives keeps the shape that the file
-    records, or none. A graph that ONNX cannot infer at all stays as it is, and
-    so do the inputs and the order of the initializers in any case. Of the outputs,
-    dimensions that the file leaves open become numbers: an exporter's symbol
-    (``Gathery_dim_0``) hides what is known, and shape arithmetic behind it would stay.
-    ``strict`` refuses shapes that contradict each other; ``written`` is this very graph
-    by :func:`without_weights`, None writes it.
+    Plugins of known dialects are inferred too (:mod:`me2e_compress.operators`); outputs
+    of unknown ones keep the shape that the file records, or none. A graph that ONNX
+    cannot infer at all stays as it is. Inputs, and the order of initializers, never
+    change. Open dimensions of outputs become numbers where these are inferred: behind
+    an exporter's symbol (``Gathery_dim_0``), shape arithmetic could not be folded.
+    ``strict`` refuses shapes that contradict each other; ``written`` is this graph by
+    :func:`without_weights`, None writes it.
 
     Raises:
         onnx.shape_inference.InferenceError: strict, and shapes contradict each other.
@@ -145,16 +143,16 @@ def infer_shapes(
         ]
         if not bare or not any([knowledge().infer(node) for node in bare]):
             return
-        written = None  # what is behind a plugin is known now, up to the next one
+        written = None  # shapes behind a plugin are known now, up to the next plugin
 
 
 def _infer_once(model: ir.Model, strict: bool, written: onnx.ModelProto | None) -> bool:
-    """Let ONNX infer what it can; return whether it took the graph."""
+    """Infer shapes with ONNX once; return whether it could read the graph."""
     try:
         proto = onnx.shape_inference.infer_shapes(
             without_weights(model) if written is None else written,
             strict_mode=strict,
-            data_prop=can_carry(model.graph),
+            data_prop=can_propagate(model.graph),
         )
     except (
         onnx.checker.ValidationError,
@@ -171,10 +169,10 @@ def _infer_once(model: ir.Model, strict: bool, written: onnx.ModelProto | None) 
 def _adopt(
     graph: ir.Graph, inferred: onnx.GraphProto, interface: set[ir.Value]
 ) -> None:
-    """Copy what was inferred onto the values of a graph and of the graphs in it.
+    """Copy inferred types and shapes to the values of a graph and its subgraphs.
 
-    Only types and shapes are read: building the whole graph anew from its message
-    would take as long as the inference.
+    Only these are read: deserializing the whole graph would take as long as the
+    inference.
     """
     known = {info.name: info for info in (*inferred.value_info, *inferred.output)}
     for node, written in zip(graph, inferred.node, strict=True):
@@ -226,9 +224,9 @@ def without_inferable_shapes(model: ir.Model) -> ir.Model:
 
 
 def unshaped_plugins(model: ir.Model) -> list[ir.Node]:
-    """List the plugins that give something whose shape the graph does not record.
+    """List the plugins with an output of unknown shape, which nothing can infer.
 
-    Nothing can infer it. ``value_info`` of the file is where it is to be written.
+    It must be written into ``value_info`` of the file.
     """
     return [
         node
@@ -240,9 +238,9 @@ def unshaped_plugins(model: ir.Model) -> list[ir.Node]:
 
 
 def refined(declared: ir.Shape | None, inferred: ir.Shape | None) -> ir.Shape | None:
-    """Return a declared shape, its open dimensions numbers where those are inferred.
+    """Return a declared shape with open dimensions replaced by inferred numbers.
 
-    Nothing declared leaves what is inferred.
+    Without a declared shape, return the inferred one.
     """
     if declared is None:
         return inferred
@@ -275,7 +273,7 @@ def without_weights(model: ir.Model) -> onnx.ModelProto:
 
 
 REFUSALS = (onnx.shape_inference.InferenceError, onnx.checker.ValidationError)
-"""What :func:`infer_node` raises where a node does not take what it reads."""
+"""The exceptions of :func:`infer_node` where a node does not accept its inputs."""
 
 NOTHING: Mapping[ir.Value, ir.Value] = {}
 
@@ -295,13 +293,14 @@ def infer_node(
     known: Callable[[ir.Value], Array | None] = small_array,
     instead: Mapping[ir.Value, ir.Value] = NOTHING,
 ) -> dict[ir.Value, tuple[ir.TypeProtocol | None, ir.Shape | None]]:
-    """Infer what a node of ONNX's own gives; return types and shapes of its outputs.
+    """Infer types and shapes of the outputs of one standard node.
 
-    That is nothing where an input has no type, or ONNX has no such operator. ``known``
-    tells what an input holds; ``instead`` are values to be read in the place of inputs.
+    The result is empty if an input has no type, or ONNX has no such operator. ``known``
+    returns the array of an input, or None; ``instead`` maps inputs to values that are
+    read in their place.
 
     Raises:
-        InferenceError: the node does not take what it reads.
+        InferenceError: the node does not accept its inputs.
         ValidationError: likewise.
     """
     if not is_standard(node) or not onnx.defs.has(node.op_type, opset):
@@ -351,15 +350,11 @@ def channel_axis(node: ir.Node) -> int:
     Conv [M, C/g, ...]: 0. ConvTranspose [C, M/g, ...]: 1. MatMul [..., K, N]: the last.
     Gemm [K, N]: 1, or 0 where it is transposed.
     """
-    if node.op_type == "Conv":
-        return 0
-    if node.op_type == "ConvTranspose":
-        return 1
+    if node.op_type in CONVOLUTIONS:
+        return CONVOLUTIONS.index(node.op_type)
     if node.op_type == "Gemm":
         return 0 if node.attributes.get_int("transB", 0) else 1
-    weight = node.inputs[1]
-    rank = 2 if weight is None or weight.shape is None else len(weight.shape)
-    return rank - 1
+    return (rank_of(node.inputs[1]) or 2) - 1
 
 
 @dataclasses.dataclass(frozen=True)
@@ -393,13 +388,11 @@ def extent(node: ir.Node, *, weight: bool) -> Extent:
     """
     left, right = open_shape(node.inputs[0]), open_shape(node.inputs[1])
     if node.op_type == "Gemm":
-        flip_left, flip_right = (
-            bool(node.attributes.get_int(name, 0)) for name in ("transA", "transB")
-        )
-        columns, depth = (None, None) if right is None else right[:2]
-        if not flip_right:
-            columns, depth = depth, columns
-        return Extent(None if left is None else left[int(flip_left)], columns, depth)
+        depth, columns = (None, None) if right is None else right[:2]
+        if node.attributes.get_int("transB", 0):
+            depth, columns = columns, depth
+        axis = 1 if node.attributes.get_int("transA", 0) else 0
+        return Extent(None if left is None else left[axis], columns, depth)
     # A vector on the right is one column
     columns, depth = None, None
     if right is not None:
@@ -413,10 +406,9 @@ def extent(node: ir.Node, *, weight: bool) -> Extent:
 
 
 def is_one_matrix(product: ir.Node) -> bool:
-    """Return whether a MatMul multiplies every row by one and the same matrix.
+    """Return whether a MatMul multiplies every row by the same matrix.
 
-    Its right operand is [K, N] then, or [1, ..., K, N] of no more dimensions than the
-    left one has: without the leading ones it gives the same.
+    Its right operand is [K, N], or [1, ..., K, N] of at most the left operand's rank.
     """
     left, right = product.inputs[0], static_shape(product.inputs[1])
     if right is None or len(right) < 2:

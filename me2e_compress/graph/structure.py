@@ -1,8 +1,8 @@
-"""What a file must hold to be a graph: checked once, when it is read.
+"""Check once, when a file is read, that it is a valid graph.
 
-ONNX's own checker knows neither plugins in the default domain nor weights on disk, and
-what runs later (shape inference, cloning, passes) trusts what it is given. So all that
-they trust is checked here, and nowhere else.
+ONNX's own checker knows neither plugins in the default domain nor weights on disk.
+Shape inference, cloning and passes rely on what is checked here, and check nothing
+again.
 """
 
 import functools
@@ -38,10 +38,10 @@ def _check_text(where: str, texts: Iterable[str]) -> None:
 
 
 def _check_port(port: onnx.ValueInfoProto, *, typed: bool) -> None:
-    """Check a type; a size below 0 becomes an open one, a type of nothing none.
+    """Check a type: a size below 0 becomes open, an undefined type is removed.
 
-    ``typed`` ports must say what they are, as the inputs of a graph must. Only tensors,
-    sequences and optionals are read.
+    ``typed`` ports must have a type, as inputs of a graph must. Only tensors, sequences
+    and optionals are supported.
     """
     kind, about = port.type.WhichOneof("value"), port.type.tensor_type
     if kind in ("map_type", "sparse_tensor_type") or (kind is None and typed):
@@ -99,10 +99,10 @@ def _check_tensor(tensor: TensorProto, what: str) -> None:
 
 
 def _check_signature(node: onnx.NodeProto, version: int) -> None:
-    """Check a node of ONNX's own against its operator, by ONNX's checker.
+    """Check a standard node against its operator's schema, by ONNX's checker.
 
-    One that nobody knows, as plugins are, takes anything, and so does an operator that
-    ONNX gave up: runtimes may have it still.
+    Unknown operators, as plugins are, and deprecated ones are not checked: runtimes may
+    have them.
     """
     if node.domain not in STANDARD or not onnx.defs.has(node.op_type, version, ""):
         return
@@ -112,10 +112,10 @@ def _check_signature(node: onnx.NodeProto, version: int) -> None:
         onnx.checker.check_node(_without_contents(node), _context(version))
     except onnx.checker.ValidationError as error:
         reason = " ".join(str(error).split("==> Context")[0].split())
-        raise GraphError(f"{_called(node)}: {reason}") from error
+        raise GraphError(f"{_label(node)}: {reason}") from error
     for each in node.attribute if node.op_type == "Transpose" else ():
         if each.name == "perm" and sorted(each.ints) != list(range(len(each.ints))):
-            raise GraphError(f"{_called(node)}: perm {list(each.ints)} is none")
+            raise GraphError(f"{_label(node)}: perm {list(each.ints)} is none")
 
 
 @functools.cache
@@ -126,19 +126,21 @@ def _context(version: int) -> CheckerContext:
 
 
 def _without_contents(node: onnx.NodeProto) -> onnx.NodeProto:
-    """Return a node with empty tensors and graphs: those are checked apart."""
+    """Return a node with empty tensors and graphs, which are checked separately."""
     contents = {onnx.AttributeProto.TENSOR, onnx.AttributeProto.GRAPH}
-    if not node.domain and contents.isdisjoint(each.type for each in node.attribute):
+    if not node.domain and contents.isdisjoint(
+        attribute.type for attribute in node.attribute
+    ):
         return node
     bare = onnx.NodeProto(
         name=node.name, op_type=node.op_type, input=node.input, output=node.output
     )
-    for each in node.attribute:
-        if each.type not in contents or each.ref_attr_name:
-            bare.attribute.append(each)
+    for attribute in node.attribute:
+        if attribute.type not in contents or attribute.ref_attr_name:
+            bare.attribute.append(attribute)
             continue
-        empty = bare.attribute.add(name=each.name, type=each.type)
-        if each.type == onnx.AttributeProto.TENSOR:
+        empty = bare.attribute.add(name=attribute.name, type=attribute.type)
+        if attribute.type == onnx.AttributeProto.TENSOR:
             empty.t.CopyFrom(TensorProto(data_type=TensorProto.FLOAT, dims=[0]))
         else:
             empty.g.name = "body"
@@ -148,22 +150,21 @@ def _without_contents(node: onnx.NodeProto) -> onnx.NodeProto:
 def _check_attributes(node: onnx.NodeProto, *, in_function: bool) -> None:
     """Check that each attribute has a name and a value, or refers to a function's."""
     names = set[str]()
-    for each in node.attribute:
-        name = each.name
+    for attribute in node.attribute:
+        name, where = attribute.name, f"{_label(node)}: attribute {attribute.name}"
         if type(name) is not str or not name or name in names:
-            raise GraphError(f"{_called(node)}: attribute {name!r} twice, or nameless")
+            raise GraphError(f"{_label(node)}: attribute {name!r} twice, or nameless")
         names.add(name)
-        field = _FIELD.get(each.type)
-        if each.ref_attr_name:
+        field = _FIELD.get(attribute.type)
+        if attribute.ref_attr_name:
             if not in_function:
                 raise GraphError(
-                    f"{_called(node)}: attribute {name} refers to one of a function,"
-                    " and stands in none"
+                    f"{where} refers to one of a function, and stands in none"
                 )
-        elif each.type not in _ATTRIBUTE_TYPES:
-            raise GraphError(f"{_called(node)}: attribute {name} is of no known type")
-        elif field is not None and not each.HasField(field):
-            raise GraphError(f"{_called(node)}: attribute {name} has no value")
+        elif attribute.type not in _ATTRIBUTE_TYPES:
+            raise GraphError(f"{where} is of no known type")
+        elif field is not None and not attribute.HasField(field):
+            raise GraphError(f"{where} has no value")
 
 
 _ATTRIBUTE_TYPES = frozenset(onnx.AttributeProto.AttributeType.values()) - {0}
@@ -171,7 +172,7 @@ _FIELD = {onnx.AttributeProto.TENSOR: "t", onnx.AttributeProto.GRAPH: "g"}
 """The field of an attribute that has no value of its own where it is left out."""
 
 
-def _called(node: onnx.NodeProto) -> str:
+def _label(node: onnx.NodeProto) -> str:
     return f"node {node.name!r} ({node.op_type})"
 
 
@@ -187,11 +188,11 @@ Names = Collection[str]
 
 
 def check(model: onnx.ModelProto) -> bool:
-    """Check a model as it was read, weights apart.
+    """Check a model as it was read, without its weights on disk.
 
     Returns:
-        Whether every node comes after those that make its inputs; if not, the nodes
-        have an order all the same, or sorting them finds a cycle.
+        Whether every node comes after the makers of its inputs; if not, the nodes must
+        be sorted, which finds cycles.
 
     Raises:
         GraphError: names what is missing, doubled, unknown or of another kind, without
@@ -203,11 +204,13 @@ def check(model: onnx.ModelProto) -> bool:
     if not 1 <= model.ir_version <= LARGEST_VERSION:
         raise GraphError(f"IR version {model.ir_version} is none")
     for imports in (model.opset_import, *(f.opset_import for f in model.functions)):
-        _check_text("opset", (each.domain for each in imports))
-        for each in imports:
-            if not 1 <= each.version <= LARGEST_VERSION:
-                raise GraphError(f"opset {each.version} of {each.domain or 'ai.onnx'}")
-        if len({each.domain for each in imports}) < len(imports):
+        _check_text("opset", (entry.domain for entry in imports))
+        for entry in imports:
+            if not 1 <= entry.version <= LARGEST_VERSION:
+                raise GraphError(
+                    f"opset {entry.version} of {entry.domain or 'ai.onnx'}"
+                )
+        if len({entry.domain for entry in imports}) < len(imports):
             raise GraphError("two opsets of one domain")
     # What the model says of itself
     if not model.graph.output:
@@ -219,11 +222,11 @@ def check(model: onnx.ModelProto) -> bool:
     if len(functions) < len(model.functions):
         raise GraphError("two of its functions have one name")
     _check_calls(model.graph, functions)
-    versions = {each.domain: each.version for each in model.opset_import}
+    versions = {imported.domain: imported.version for imported in model.opset_import}
     walk = _Walk(versions, functions)
-    walk.main(model.graph)
+    walk.check_main_graph(model.graph)
     for function in model.functions:
-        walk.function(function)
+        walk.check_function(function)
     return walk.in_order
 
 
@@ -233,18 +236,14 @@ Function = tuple[str, str, str]
 def _check_calls(
     graph: onnx.GraphProto, functions: dict[Function, onnx.FunctionProto]
 ) -> None:
-    """Refuse functions that nothing can inline: in a circle, too deep or too many."""
+    """Refuse functions that cannot be inlined: in a circle, too deep or too many."""
 
     def size(nodes: Iterable[onnx.NodeProto]) -> int:
         return sum(sizes.get(_key(node), 1) for node in _all_nodes(nodes))
 
     sizes: dict[Function, int] = {}
     calls = {
-        name: {
-            key
-            for node in _all_nodes(function.node)
-            if (key := _key(node)) in functions
-        }
+        name: functions.keys() & set(map(_key, _all_nodes(function.node)))
         for name, function in functions.items()
     }
     for depth in itertools.count():
@@ -279,7 +278,7 @@ def _all_nodes(nodes: Iterable[onnx.NodeProto]) -> Iterable[onnx.NodeProto]:
 
 
 class _Walk:
-    """Goes through the graphs of a model, or a function, with the names known there."""
+    """Checks the graphs of a model or function, with the names visible in each."""
 
     def __init__(
         self,
@@ -291,31 +290,34 @@ class _Walk:
         self.in_function, self.in_order = in_function, True
         self.opset = versions.get("", versions.get("ai.onnx", 0))
 
-    def main(self, body: onnx.GraphProto) -> None:
-        """Check the graph itself: its inputs say what they are."""
-        given = {each.name for each in body.initializer}
-        for each in body.input:
-            if each.name not in given:
-                _check_port(each, typed=True)
+    def check_main_graph(self, body: onnx.GraphProto) -> None:
+        """Check the graph of a model, whose inputs must have types."""
+        given = {tensor.name for tensor in body.initializer}
+        for port in body.input:
+            if port.name not in given:
+                _check_port(port, typed=True)
         for each in (*body.output, *body.value_info):
             _check_port(each, typed=False)
-        self.graph(body, frozenset(), 0)
+        self._check_graph(body, frozenset(), 0)
 
-    def function(self, function: onnx.FunctionProto) -> None:
+    def check_function(self, function: onnx.FunctionProto) -> None:
         """Check a function."""
         where = f"function {function.name}"
         _check_text("function", (function.name, function.domain, function.doc_string))
         if not function.name or not function.output or not function.node:
             raise GraphError(f"{where} has no name, no output or no node")
-        _unique(f"{where}: input", function.input)
-        local = {each.domain: each.version for each in function.opset_import}
+        _check_unique(f"{where}: input", function.input)
+        local = {
+            imported.domain: imported.version for imported in function.opset_import
+        }
         inside = _Walk({**self.versions, **local}, self.functions, in_function=True)
-        known = inside.nodes(where, function.node, function.input, frozenset(), 0)
-        _made(f"{where}: output", function.output, known)
+        none = frozenset[str]()
+        known = inside._check_nodes(where, function.node, function.input, none, 0)
+        _check_made(f"{where}: output", function.output, known)
         self.in_order = self.in_order and inside.in_order
 
-    def graph(self, body: onnx.GraphProto, outside: Names, depth: int) -> None:
-        """Check a graph, in which the names of the graphs around it are known."""
+    def _check_graph(self, body: onnx.GraphProto, outside: Names, depth: int) -> None:
+        """Check a graph that can read the names of the graphs around it."""
         if depth > DEEPEST:
             raise GraphError(f"graphs are nested more than {DEEPEST} deep")
         where = f"graph {body.name!r}" if depth else "graph"
@@ -323,18 +325,19 @@ class _Walk:
             name = body.sparse_initializer[0].values.name
             raise GraphError(f"initializer {name!r} is sparse: write it as a dense one")
         _check_text(where, (body.name, body.doc_string))
-        names = [each.name for each in body.initializer]
-        ports = [each.name for each in body.input]
-        _unique(f"{where}: input", ports)
-        _unique(f"{where}: initializer", names)
+        names = [tensor.name for tensor in body.initializer]
+        ports = [port.name for port in body.input]
+        outputs = [port.name for port in body.output]
+        _check_unique(f"{where}: input", ports)
+        _check_unique(f"{where}: initializer", names)
         for tensor in body.initializer:
             _check_tensor(tensor, f"initializer {tensor.name!r}")
-        begin = (*ports, *(name for name in names if name not in set(ports)))
-        known = self.nodes(where, body.node, begin, outside, depth)
-        _unique(f"{where}: output", [each.name for each in body.output])
-        _made(f"{where}: output", (each.name for each in body.output), known)
+        begin = tuple(dict.fromkeys((*ports, *names)))
+        known = self._check_nodes(where, body.node, begin, outside, depth)
+        _check_unique(f"{where}: output", outputs)
+        _check_made(f"{where}: output", outputs, known)
 
-    def nodes(
+    def _check_nodes(
         self,
         where: str,
         nodes: Sequence[onnx.NodeProto],
@@ -342,7 +345,7 @@ class _Walk:
         outside: Names,
         depth: int,
     ) -> Names:
-        """Check nodes; return every name that is known behind the last."""
+        """Check nodes; return every name that is known after the last."""
         made = dict.fromkeys(begin, "an input or initializer")
         for node in nodes:
             _check_text("node", (node.name, node.op_type, node.domain, node.doc_string))
@@ -361,11 +364,11 @@ class _Walk:
         reachable = made.keys() | outside
         before = {*begin, *outside}
         for node in nodes:
-            self._node(node, reachable, before, depth)
+            self._check_node(node, reachable, before, depth)
             before.update(node.output)
         return made.keys()
 
-    def _node(
+    def _check_node(
         self, node: onnx.NodeProto, reachable: Names, before: Names, depth: int
     ) -> None:
         for name in filter(None, node.input):
@@ -384,22 +387,22 @@ class _Walk:
             for what, (given, most) in zip(("inputs", "outputs"), pairs, strict=True):
                 if len(given) > len(most):
                     raise GraphError(
-                        f"{_called(node)} has {len(given)} {what}, at most {len(most)}"
+                        f"{_label(node)} has {len(given)} {what}, at most {len(most)}"
                         " may be"
                     )
-        # What it holds
-        for each in node.metadata_props:
-            _check_text("metadata of a node", (each.key, each.value))
+        # Metadata, tensors and bodies
+        for entry in node.metadata_props:
+            _check_text("metadata of a node", (entry.key, entry.value))
         for attribute in node.attribute:
             tensors = (attribute.t,) if attribute.HasField("t") else ()
             for tensor in (*tensors, *attribute.tensors):
                 _check_tensor(tensor, f"the tensor of node {node.name!r}")
             bodies = (attribute.g,) if attribute.HasField("g") else ()
             for body in (*bodies, *attribute.graphs):
-                self.graph(body, reachable, depth + 1)
+                self._check_graph(body, reachable, depth + 1)
 
 
-def _unique(what: str, names: Iterable[str]) -> None:
+def _check_unique(what: str, names: Iterable[str]) -> None:
     listed = list(names)
     _check_text(what, listed)
     if "" in listed:
@@ -409,7 +412,7 @@ def _unique(what: str, names: Iterable[str]) -> None:
         raise GraphError(f"{what} {twice!r} is there twice")
 
 
-def _made(what: str, names: Iterable[str], known: Names) -> None:
+def _check_made(what: str, names: Iterable[str], known: Names) -> None:
     for name in names:
         if name not in known:
             raise GraphError(f"{what} {name!r}: nothing makes it")

@@ -1,8 +1,9 @@
-"""What a graph takes, gives, weighs and costs: ports, nodes, bytes, MACs."""
+"""Measure a graph: its inputs and outputs, nodes, bytes and MACs."""
 
 import dataclasses
 import math
 from collections.abc import Callable, Iterable
+from typing import TypeVar
 
 import onnx_ir as ir
 
@@ -10,6 +11,7 @@ from me2e_compress.graph.nodes import input_at, is_plugin, nodes_in, nodes_insid
 from me2e_compress.graph.shapes import knowledge, static_shape
 
 Counter = Callable[[ir.Node], int | None]
+Count = TypeVar("Count")
 
 _UNCOUNTED = frozenset(
     {
@@ -29,13 +31,12 @@ def macs(node: ir.Node) -> int | None:
     channels per group. Gemm and MatMul: rows x columns x inner dimension x batch.
     Einsum of two operands: the product of all its dimensions. LSTM, GRU and RNN: steps
     x batch x elements of both weights, which hold all gates and directions. Attention:
-    queries x keys x what is multiplied for each pair. Integer forms likewise. Plugins
-    of known dialects: what their operator counts.
+    queries x keys x (channels of query + channels of value). Integer forms likewise.
+    Plugins of known dialects: the count of their operator.
 
     Returns:
-        The count; None where it is not known: of an unknown plugin, a local function,
-        an operator that no rule counts, a loop around one that multiplies, or a shape
-        that is open.
+        The count; None where it is unknown: of an unknown plugin, a local function, an
+        operator without a rule, a loop around one that multiplies, or an open shape.
     """
     if is_plugin(node):
         return knowledge().macs(node)
@@ -51,38 +52,47 @@ def macs(node: ir.Node) -> int | None:
 def macs_counter(model: ir.Model) -> Counter:
     """Return :func:`macs` for the nodes of a model: calls of its functions count too.
 
-    A call is worth what the nodes of its body are; shapes inside are seldom known, so
-    that a function that multiplies matrices is mostly None.
+    A call counts as all nodes of its body; shapes inside are seldom known, so that a
+    function that multiplies matrices is mostly None.
     """
-    bodies: dict[ir.OperatorIdentifier, int | None] = {}
 
-    def count(node: ir.Node) -> int | None:
+    def total(counts: Iterable[int | None]) -> int | None:
+        known, unknown = total_macs(counts)
+        return known if not unknown else None
+
+    return _with_calls(model, macs, total)
+
+
+def _with_calls(
+    model: ir.Model,
+    count: Callable[[ir.Node], Count],
+    total: Callable[[Iterable[Count]], Count],
+) -> Callable[[ir.Node], Count]:
+    """Return a counter of nodes; calls of functions are the total of their bodies."""
+    bodies: dict[ir.OperatorIdentifier, Count] = {}
+
+    def count_call(node: ir.Node) -> Count:
         key = node.op_identifier()
         function = model.functions.get(key)
         if function is None:
-            return macs(node)
+            return count(node)
         if key not in bodies:
-            total, unknown = total_macs(count(inner) for inner in function.all_nodes())
-            bodies[key] = total if not unknown else None
+            bodies[key] = total(count_call(inner) for inner in nodes_in(function))
         return bodies[key]
 
-    return count
+    return count_call
 
 
 def total_macs(counts: Iterable[int | None]) -> tuple[int | None, int]:
     """Add up the MACs of nodes.
 
     Returns:
-        The sum of those that are known, and how many are not: the sum is a lower bound
-        then. None instead of a sum of 0 where some are unknown: not measured is never
-        zero.
+        The sum of the known counts, and the number of unknown ones, with which the sum
+        is a lower bound. A sum of 0 is None if some are unknown.
     """
-    total, unknown = 0, 0
-    for count in counts:
-        if count is None:
-            unknown += 1
-        else:
-            total += count
+    listed = list(counts)
+    known = [count for count in listed if count is not None]
+    total, unknown = sum(known), len(listed) - len(known)
     return (total if total or not unknown else None), unknown
 
 
@@ -183,7 +193,7 @@ class Port:
 def interface(model: ir.Model) -> tuple[tuple[Port, ...], tuple[Port, ...]]:
     """List the inputs and the outputs: no pass may change these unasked."""
     inputs, outputs = (
-        tuple(Port(each.name or "", str(each.type), str(each.shape)) for each in values)
+        tuple(Port(v.name or "", str(v.type), str(v.shape)) for v in values)
         for values in (model.graph.inputs, model.graph.outputs)
     )
     return inputs, outputs
@@ -231,18 +241,8 @@ def size(model: ir.Model) -> Size:
 
 def node_count(model: ir.Model) -> int:
     """Count nodes as a runtime sees them: a function counts at every call."""
-    bodies: dict[ir.OperatorIdentifier, int] = {}
-
-    def count(node: ir.Node) -> int:
-        key = node.op_identifier()
-        function = model.functions.get(key)
-        if function is None:
-            return 1
-        if key not in bodies:
-            bodies[key] = sum(count(inner) for inner in nodes_in(function))
-        return bodies[key]
-
-    return sum(count(node) for node in nodes_in(model.graph))
+    count: Callable[[ir.Node], int] = _with_calls(model, lambda node: 1, sum)
+    return sum(map(count, nodes_in(model.graph)))
 
 
 def weight_bytes(model: ir.Model) -> int:
@@ -256,7 +256,7 @@ def weight_bytes(model: ir.Model) -> int:
 
 
 def value_bytes(value: ir.Value) -> int | None:
-    """Return the bytes of a value; None of open shapes or types, and computed text."""
+    """Return the bytes of a value; None if its shape or type is open, or it is text."""
     if value.const_value is not None:
         return int(value.const_value.nbytes)
     shape = static_shape(value)

@@ -1,9 +1,9 @@
 """Convert to onnx-graphsurgeon, and back without losing anything.
 
-``gs.Graph`` holds no metadata, so a graph that was out is restored from the one that
-it was made of. In graphsurgeon, call ``fold_constants(recurse_functions=False)`` and
+``gs.Graph`` has no metadata, so these are restored from the graph that was converted.
+In graphsurgeon, call ``fold_constants(recurse_functions=False)`` and
 ``cleanup(recurse_functions=False)``: with their defaults they rewrite function bodies
-as if these were graphs of their own, and the model is not valid any more (0.6.1).
+as if these were graphs, and the model becomes invalid (0.6.1).
 """
 
 from collections.abc import Iterable, Sequence
@@ -22,31 +22,33 @@ def restore(
 ) -> None:
     """Restore metadata and provenance in a graph that a tool has rewritten.
 
-    onnxsim and onnx-graphsurgeon drop what models say of themselves, and the metadata
-    of functions, nodes and values. Here a node is known again by the name of its first
-    output, then by its own name. One of the same operator gets all its metadata back;
-    one of another operator now inherits from that and from the nodes that vanished
-    above it; one that is new inherits from its nearest neighbour: the producer that
-    comes last in the graph, else the consumer that comes first. Linear in nodes.
+    onnxsim and onnx-graphsurgeon drop the metadata of models, functions, nodes and
+    values. A node is recognized by the name of its first output, then by its own name.
+    If its operator is the same, all its metadata are restored; if it is another, it
+    inherits from the old node and from removed nodes above that. A new node inherits
+    from its nearest neighbour: the producer that comes last in the graph, else the
+    consumer that comes first. The time is linear in nodes.
 
-    ``model`` is the tool's result, in graph order, and changed in place, ``like`` its
-    input; ``by`` is the pass to name in the provenance of new nodes. ``node_names``
-    restores the names of known nodes of the same operator too.
+    Args:
+        model: the tool's result, in graph order; changed in place.
+        like: the tool's input.
+        by: the pass to name in the provenance of new nodes.
+        node_names: restore the names of recognized nodes of the same operator too.
     """
-    # What the model says of itself
+    # Metadata of the model
     model.domain, model.doc_string = like.domain, like.doc_string
     model.model_version = like.model_version
-    _merge(model.metadata_props, like.metadata_props)
-    _merge(model.graph.metadata_props, like.graph.metadata_props)
+    _add_missing(model.metadata_props, like.metadata_props)
+    _add_missing(model.graph.metadata_props, like.graph.metadata_props)
     # Functions, and values by their names
     for key, function in model.functions.items():
         if key in like.functions:
-            _merge(function.metadata_props, like.functions[key].metadata_props)
+            _add_missing(function.metadata_props, like.functions[key].metadata_props)
             _match(list(function.all_nodes()), list(like.functions[key].all_nodes()))
     past = {value.name: value.metadata_props for value in _values(like)}
     for value in _values(model):
-        _merge(value.metadata_props, past.get(value.name, {}))
-    # Nodes that are known again, then those that are new
+        _add_missing(value.metadata_props, past.get(value.name, {}))
+    # Recognized nodes, then new ones
     nodes = list(model.graph.all_nodes())
     known = _match(nodes, list(like.graph.all_nodes()))
     if node_names:
@@ -59,9 +61,8 @@ def restore(
     _inherit_from_neighbours(nodes, known, by)
 
 
-def _merge(props: dict[str, str], past: dict[str, str]) -> None:
-    for key, text in past.items():
-        props.setdefault(key, text)
+def _add_missing(props: dict[str, str], past: dict[str, str]) -> None:
+    props.update({key: text for key, text in past.items() if key not in props})
 
 
 def _values(model: ir.Model) -> Iterable[ir.Value]:
@@ -84,7 +85,7 @@ def _match(nodes: Sequence[ir.Node], past: Sequence[ir.Node]) -> dict[ir.Node, i
         if known is not None:
             matches[node] = known
             if _alike(node, known):
-                _merge(node.metadata_props, known.metadata_props)
+                _add_missing(node.metadata_props, known.metadata_props)
     return matches
 
 
@@ -95,25 +96,23 @@ def _alike(one: ir.Node, other: ir.Node) -> bool:
 def _inherit_from_neighbours(
     nodes: Sequence[ir.Node], matches: dict[ir.Node, ir.Node], by: str
 ) -> None:
-    # One of another operator stands for what vanished above it, too
+    # A node of another operator also inherits from removed nodes above it
     alive = {value.name for node in nodes for value in node.outputs}
     claimed: set[ir.Node] = set()
     for node in nodes:
         if provenance.read(node) is None and (known := matches.get(node)) is not None:
             vanished = _vanished_above(known, alive, claimed)
             provenance.inherit(node, (known, *vanished), by=by)
-    # New ones: from producers down, then from consumers up
+    # New nodes inherit from producers, then from consumers
     place = {node: index for index, node in enumerate(nodes)}
     for node in nodes:
-        makers = [value.producer() for value in node.inputs if value is not None]
-        heard = [m for m in makers if m in place and provenance.read(m) is not None]
-        if provenance.read(node) is None and heard:
-            provenance.inherit(node, (max(heard, key=place.__getitem__),), by=by)
+        makers = [m for m in node.predecessors() if m in place and provenance.read(m)]
+        if provenance.read(node) is None and makers:
+            provenance.inherit(node, (max(makers, key=place.__getitem__),), by=by)
     for node in reversed(nodes):
-        readers = [reader for value in node.outputs for reader in value.consumers()]
-        heard = [r for r in readers if provenance.read(r) is not None]
-        if provenance.read(node) is None and heard:
-            provenance.inherit(node, (min(heard, key=place.__getitem__),), by=by)
+        readers = [reader for reader in node.successors() if provenance.read(reader)]
+        if provenance.read(node) is None and readers:
+            provenance.inherit(node, (min(readers, key=place.__getitem__),), by=by)
 
 
 def _vanished_above(

@@ -1,4 +1,4 @@
-"""Whether ONNX's own checker takes a graph."""
+"""Check a graph with ONNX's own checker."""
 
 import contextlib
 from collections.abc import Iterator
@@ -23,12 +23,11 @@ PLAIN_INITIALIZERS_SINCE_IR = 4
 def refusal(
     model: ir.Model, *, plugins: bool = False, written: onnx.ModelProto | None = None
 ) -> str | None:
-    """Return why ONNX's checker refuses a graph, in one line; None if it takes it.
+    """Return why ONNX's checker refuses a graph, in one line; None if it does not.
 
-    An output without a shape is let pass: exporters leave out what they do not know,
-    behind a plugin for one, and every runtime takes that. With ``plugins``, operators
-    of the default domain that ONNX does not have are taken for such, as TensorRT does.
-    ``written`` is this very graph by
+    Outputs without a shape are accepted: exporters leave out unknown shapes, as behind
+    plugins, and every runtime accepts that. With ``plugins``, unknown operators of the
+    default domain count as plugins, as in TensorRT. ``written`` is this graph by
     :func:`~me2e_compress.graph.shapes.without_weights`; None writes it.
     """
     try:
@@ -44,16 +43,13 @@ def refusal(
 
 @contextlib.contextmanager
 def _lenient(written: onnx.ModelProto) -> Iterator[None]:
-    """Give outputs without a shape an empty one as long as the checker looks.
+    """Give outputs without a shape an empty one while the checker runs.
 
-    Before IR version 4 every initializer had to be an input too: that is let pass.
+    The IR version becomes 4 at least: before, every initializer had to be an input too.
     """
     kinds = [value.type for value in written.graph.output]
-    bare = [
-        kind.tensor_type
-        for kind in kinds
-        if kind.HasField("tensor_type") and not kind.tensor_type.HasField("shape")
-    ]
+    tensors = [kind.tensor_type for kind in kinds if kind.HasField("tensor_type")]
+    bare = [tensor for tensor in tensors if not tensor.HasField("shape")]
     for tensor in bare:
         tensor.shape.SetInParent()
     version = written.ir_version

@@ -46,9 +46,9 @@ class AblateModules(Pass):
     result of one scope replaces that of another, repeated where the readers expect more
     queries (without motion, one track query for each of six modes). Every other value
     that leaves a dropped module becomes zeros of its shape or, with ``fill="means"``,
-    its mean over the context's frames. A node that only changes the layout of a value
-    of a module that stays (a cast that two modules share) moves to its reader. Dead
-    nodes are removed, in other modules too.
+    its mean over the context's frames. A node of a dropped module that only changes the
+    layout of a value from another module (a cast that two modules share) moves to the
+    module of its reader. Dead nodes are removed, in other modules too.
 
     With ``edges`` a part of the graph also reads another one directly::
 
@@ -103,34 +103,33 @@ class AblateModules(Pass):
             )
         for pattern in self.keep:
             result_of(model, Part(pattern))
-        if self.keep and not any(map(self._goes, model.graph)):
+        if self.keep and not any(map(self._is_dropped, model.graph)):
             raise PreconditionError(
                 f"{self.name}: keep={list(self.keep)} keeps all of"
                 f" {', '.join(self.drop)}: nothing is left to remove"
             )
-        before, seeing = graph.node_count(model), _seeing(model, context.modules)
+        before, seeing = (
+            graph.node_count(model),
+            _seeing_outputs(model, context.modules),
+        )
         # Separate the dropped modules from everything that stays
-        _hand_over(model, self._goes)
+        _move_layout_nodes(model, self._is_dropped)
         gone = self._cut_outputs(model)
         notes = [f"output removed: {name}" for name in gone]
         # Rewire readers to substitutes and along new edges
+        modules = context.modules
         if self.fill == "substitute":
-            for module in known:
-                notes += [
-                    self._substitute(model, each, context.modules)
-                    for each in module.substitutes
-                ]
-        notes += [
-            add_edge(model, edge, context.modules, self._goes, self.name)
-            for edge in self.edges
-        ]
+            wanted = [each for module in known for each in module.substitutes]
+            notes += [self._substitute(model, each, modules) for each in wanted]
+        for edge in self.edges:
+            notes.append(add_edge(model, edge, modules, self._is_dropped, self.name))
         # Fill what is left after the first sweep, then sweep again
         rewrite.sweep(model)
         notes += self._fill(model, context)
         rewrite.sweep(model)
         model.graph.sort()
         # The planner must still depend on the cameras
-        self._check_sight(model, context.modules, seeing)
+        self._check_sight(model, modules, seeing)
         removed = before - graph.node_count(model)
         verb = "removed" if removed >= 0 else "added"
         notes.append(f"{plural(abs(removed), 'node')} {verb}")
@@ -139,7 +138,7 @@ class AblateModules(Pass):
     def _check_sight(
         self, model: ir.Model, modules: ModuleMap, before: tuple[str, ...]
     ) -> None:
-        still = _seeing(model, modules)
+        still = _seeing_outputs(model, modules)
         if blind := [name for name in before if name not in still]:
             features = ", ".join(modules.names("feature"))
             how = f"without {', '.join(self.drop)}" if self.drop else "by these edges"
@@ -148,7 +147,7 @@ class AblateModules(Pass):
                 f" any more; keep a module, or add an edge to the {PLANNER}"
             )
 
-    def _goes(self, node: ir.Node | None) -> bool:
+    def _is_dropped(self, node: ir.Node | None) -> bool:
         if node is None or provenance.module_of(node) not in self.drop:
             return False
         return not any(within(node, pattern) for pattern in self.keep)
@@ -157,9 +156,9 @@ class AblateModules(Pass):
         exits = [
             value
             for node in model.graph
-            if self._goes(node)
+            if self._is_dropped(node)
             for value in node.outputs
-            if not all(self._goes(reader) for reader in value.consumers())
+            if not all(map(self._is_dropped, value.consumers()))
         ]
         if self.fill != "means":
             for value in exits:
@@ -172,15 +171,16 @@ class AblateModules(Pass):
         return [f"{value.name} reads as {how}" for value in exits]
 
     def _writer(self, model: ir.Model, value: ir.Value) -> FusedCall:
-        """Return what writes for the readers of a value, those that stay first."""
-        readers = sorted(value.consumers(), key=self._goes)
+        """Return a writer of nodes for the readers of a value."""
+        readers = sorted(value.consumers(), key=self._is_dropped)
         return writer_for(model, readers, self.name)
 
     def _cut_outputs(self, model: ir.Model) -> list[str]:
-        owned = [value for value in model.graph.outputs if self._goes(value.producer())]
+        outputs = model.graph.outputs
+        owned = [value for value in outputs if self._is_dropped(value.producer())]
         names = [str(value.name) for value in owned]
         who, what = ", ".join(self.drop), ", ".join(names)
-        if owned and len(owned) == len(model.graph.outputs) and self.drop_outputs:
+        if owned and len(owned) == len(outputs) and self.drop_outputs:
             raise PreconditionError(f"{who} makes every output: {what}")
         for value in owned:
             if module_of(value) == PLANNER:
@@ -192,7 +192,7 @@ class AblateModules(Pass):
                 f"{who} makes the outputs {what}: drop_outputs=true removes them too"
             )
         for value in owned:
-            model.graph.outputs.remove(value)
+            outputs.remove(value)
         return names
 
     def _substitute(
@@ -200,20 +200,20 @@ class AblateModules(Pass):
     ) -> str:
         if wanted.reader is not None and wanted.by is not None:
             reader = Part.of(wanted.reader, modules)
-            if all(self._goes(node) for node in model.graph if reader.holds(node)):
+            if all(self._is_dropped(n) for n in model.graph if reader.holds(n)):
                 return f"{wanted.reader} is not there: nothing is substituted for it"
             edge = Edge(wanted.by, reader.name, "replace", of=wanted.scope)
-            return add_edge(model, edge, modules, self._goes, self.name)
+            return add_edge(model, edge, modules, self._is_dropped, self.name)
         # Zeros take the place where the map names no substitute
         old = result_of(model, Part.of(wanted.scope, modules))
-        if self._goes(old.producer()):
+        if self._is_dropped(old.producer()):
             return f"{wanted.scope} is dropped itself: nothing is substituted"
         if wanted.by is None:
             replace_readers(old, zeros_like(self._writer(model, old), old))
             return f"{wanted.scope} reads as zeros"
         # A substitute must stay in the graph and not read the old result
         new = result_of(model, Part.of(wanted.by, modules), like=old)
-        if self._goes(new.producer()):
+        if self._is_dropped(new.producer()):
             raise PreconditionError(
                 f"{wanted.by} cannot substitute for {wanted.scope}: it is of module"
                 f" {module_of(new)}, which is dropped too"
@@ -227,7 +227,7 @@ class AblateModules(Pass):
         return f"{wanted.scope} replaced by {wanted.by}"
 
 
-def _hand_over(model: ir.Model, goes: Callable[[ir.Node], bool]) -> None:
+def _move_layout_nodes(model: ir.Model, is_dropped: Callable[[ir.Node], bool]) -> None:
     """Move layout nodes of dropped modules into their readers' modules.
 
     Exporters write an equal cast of two modules once, with the scope of the first.
@@ -235,22 +235,20 @@ def _hand_over(model: ir.Model, goes: Callable[[ir.Node], bool]) -> None:
     # Find layout nodes whose inputs all come from modules that stay
     carriers = dict[ir.Node, None]()
     for node in model.graph:
-        makers = [value.producer() for value in node.inputs if value is not None]
-        outside = all(
-            maker is None or maker in carriers or not goes(maker) for maker in makers
-        )
-        if node.op_type in _LAYOUT and goes(node) and outside:
+        others = [maker for maker in node.predecessors() if maker not in carriers]
+        outside = not any(map(is_dropped, others))
+        if node.op_type in _LAYOUT and is_dropped(node) and outside:
             carriers[node] = None
     # Stamp them with the module of their first remaining reader
     for node in reversed(carriers):
-        readers = [reader for reader in node.outputs[0].consumers() if not goes(reader)]
+        readers = [one for one in node.outputs[0].consumers() if not is_dropped(one)]
         past = provenance.read(node)
         if readers and past is not None:
             module = provenance.module_of(readers[0])
             provenance.stamp(node, dataclasses.replace(past, module=module))
 
 
-def _seeing(model: ir.Model, modules: ModuleMap) -> tuple[str, ...]:
+def _seeing_outputs(model: ir.Model, modules: ModuleMap) -> tuple[str, ...]:
     """Return the planner's outputs that depend on the feature extraction."""
     features = set(modules.names("feature"))
     return tuple(

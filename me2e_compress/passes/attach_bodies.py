@@ -1,6 +1,7 @@
 """Attach bodies of standard operators to fused operators."""
 
 import dataclasses
+import itertools
 from collections.abc import Sequence
 from typing import ClassVar
 
@@ -53,23 +54,21 @@ class AttachBodies(Pass):
         for call in operators.fused_nodes(model):
             if call.node in bare:
                 kinds.setdefault(call.node.op_identifier(), []).append(call)
-        made = 0
+        count = 0
         for calls in kinds.values():
-            op_type = calls[0].node.op_type
+            what = f"for {len(calls)} {calls[0].node.op_type}"
             if calls[0].node not in named:
-                notes.append(
-                    f"no body for {len(calls)} {op_type}: it has no domain of its own"
-                )
+                notes.append(f"no body {what}: it has no domain of its own")
                 continue
-            alike = _alike(calls)
-            for each in alike:
-                _overload(each, model)
-                function = self._body(each)
+            groups = _group_alike(calls)
+            for group in groups:
+                _set_overload(group, model)
+                function = self._body(group)
                 model.functions[function.identifier()] = function
-            made += len(alike)
-            bodies = "a body" if len(alike) == 1 else f"{len(alike)} bodies"
-            notes.append(f"{bodies} for {len(calls)} {op_type}")
-        return PassResult(model, made, tuple(notes))
+            count += len(groups)
+            bodies = "a body" if len(groups) == 1 else f"{len(groups)} bodies"
+            notes.append(f"{bodies} {what}")
+        return PassResult(model, count, tuple(notes))
 
     def _body(self, calls: Sequence[FusedNode]) -> ir.Function:
         first = calls[0]
@@ -102,7 +101,7 @@ def _has_domain(node: ir.Node) -> bool:
     return bool(node.domain) and ORIGINAL_DOMAIN not in node.metadata_props
 
 
-def _alike(calls: Sequence[FusedNode]) -> list[list[FusedNode]]:
+def _group_alike(calls: Sequence[FusedNode]) -> list[list[FusedNode]]:
     """Group calls that agree in attributes and number of inputs."""
     groups: dict[tuple[object, ...], list[FusedNode]] = {}
     for each in calls:
@@ -111,13 +110,12 @@ def _alike(calls: Sequence[FusedNode]) -> list[list[FusedNode]]:
     return list(groups.values())
 
 
-def _overload(calls: Sequence[FusedNode], model: ir.Model) -> None:
+def _set_overload(calls: Sequence[FusedNode], model: ir.Model) -> None:
     """Give calls an overload of their own where their name has a function already."""
     domain, op_type, overload = calls[0].node.op_identifier()
-    number = 1
+    numbers = itertools.count(2)
     while (domain, op_type, overload) in model.functions:
-        number += 1
-        overload = str(number)
+        overload = str(next(numbers))
     for each in calls:
         each.node.overload = overload
     if overload:
@@ -138,22 +136,14 @@ def _parameter(
     first = arrays[0]
     if first is None or first.size > LARGEST_TABLE:
         return value, None
-    same = all(
-        other is not None
-        and other.dtype == first.dtype
-        and np.array_equal(first, other)
-        for other in arrays
-    )
-    return value, first if same else None
+    same = (a is not None and a.dtype == first.dtype for a in arrays)
+    equal = all(same) and all(np.array_equal(first, a) for a in arrays if a is not None)
+    return value, first if equal else None
 
 
 def _agreed(shapes: Sequence[Dims | None]) -> ir.Shape | None:
     known = [shape for shape in shapes if shape is not None]
-    if len(known) < len(shapes) or len({len(shape) for shape in known}) != 1:
+    if len(known) < len(shapes) or len(set(map(len, known))) != 1:
         return None
-    return ir.Shape(
-        [
-            sizes[0] if len(set(sizes)) == 1 else None
-            for sizes in zip(*known, strict=True)
-        ]
-    )
+    sizes = [set(axis) for axis in zip(*known, strict=True)]
+    return ir.Shape([size.pop() if len(size) == 1 else None for size in sizes])

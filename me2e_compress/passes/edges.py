@@ -25,10 +25,10 @@ from me2e_compress.passes.parts import (
     writer_for,
 )
 
-# Propagate the size of an axis that grew through the rest of a graph.
 
-
-def carry(model: ir.Model, grown: ir.Value, old: ir.Value, what: str) -> None:
+def propagate_growth(
+    model: ir.Model, grown: ir.Value, old: ir.Value, what: str
+) -> None:
     """Infer the shapes behind a value that grew along one axis, in place.
 
     A Reshape gets a new constant shape. Raises PreconditionError where an operator or a
@@ -168,14 +168,9 @@ def add_edge(
         node.replace_input_with(index, joined)
     model.graph.sort()
     if edge.how == "append":
-        carry(model, joined, old, f"edge {edge.label}: {listed([new])}")
-    # How it reads now
-    before, after = listed([old]), listed([new])
-    if edge.how == "append":
-        return f"{edge.reader} reads {after} behind {before}"
-    if edge.how == "add":
-        return f"{edge.reader} reads {after} added to {before}"
-    return f"{edge.reader} reads {after} in the place of {before}"
+        propagate_growth(model, joined, old, f"edge {edge.label}: {listed([new])}")
+    how = {"append": "behind", "add": "added to", "replace": "in the place of"}
+    return f"{edge.reader} reads {listed([new])} {how[edge.how]} {listed([old])}"
 
 
 def _ends(
@@ -190,9 +185,9 @@ def _ends(
     # Both parts must exist and exchange values
     made_by = [node for node in model.graph if source.holds(node)]
     if all(map(goes, made_by)):
-        lacks = f"the graph has no {source.name}"
-        lacks = f"{source.name} is dropped too" if made_by else lacks
-        raise PreconditionError(f"edge {edge.label}: {lacks}")
+        dropped, lacking = "{} is dropped too", "the graph has no {}"
+        reason = (dropped if made_by else lacking).format(source.name)
+        raise PreconditionError(f"edge {edge.label}: {reason}")
     read = reader.entries(model)
     left = [v for v in source.exits(model) if not goes(v.producer())]
     if not read or not left:

@@ -1,4 +1,4 @@
-"""Products that are written as Einsum, or with the weight in front, as layers."""
+"""Rewrite products written as Einsum, or with the weight first, as layers."""
 
 import dataclasses
 import math
@@ -36,7 +36,11 @@ def write_products(model: ir.Model, by: str) -> int:
 
 @dataclasses.dataclass(frozen=True)
 class _Product:
-    """The labels of an Einsum: shared and kept, kept of either, and summed over."""
+    """The labels of an Einsum of two matrices.
+
+    ``batch`` labels are in both operands and the result, ``rows`` and ``columns`` in
+    one operand and the result, ``summed`` in both operands only.
+    """
 
     left: str
     right: str
@@ -70,37 +74,35 @@ def _write_einsum(node: ir.Node, opset: int, names: set[str], by: str) -> int:
     if product is None or None in node.inputs:
         return 0
     sizes = _sizes(node, product)
-    # rows may be several axes, if nothing is shared: MatMul broadcasts them
+    # Without a batch, rows may be several axes: MatMul broadcasts them
     groups = [product.columns, product.summed]
     groups += [product.rows] if product.batch else []
     flat = any(len(labels) > 1 for labels in groups)
     if flat and sizes is None:
         return 0
+    # Bring both operands to [*batch, rows, summed] and [*batch, summed, columns]
     call = FusedCall(node, opset=opset, by=by, names=names)
     batch, rows, columns = product.batch, product.rows, product.columns
-    ends = (
-        (product.left, batch + rows + product.summed),
-        (product.right, batch + product.summed + columns),
-    )
-    left, right = (
-        _turned(call, value, *labels)
-        for value, labels in zip(filter(None, node.inputs), ends, strict=True)
-    )
+    summed, (one, two) = product.summed, filter(None, node.inputs)
+    left = _transposed(call, one, product.left, batch + rows + summed)
+    right = _transposed(call, two, product.right, batch + summed + columns)
     if flat and sizes is not None:
-        size = {labels: math.prod(sizes[x] for x in labels) for labels in groups}
-        size[rows] = math.prod(sizes[x] for x in rows)
+        count, depth, width = (
+            math.prod(sizes[x] for x in labels) for labels in (rows, summed, columns)
+        )
         lead = [sizes[x] for x in batch]
-        left = call.reshape(left, [*lead, size[rows], size[product.summed]])
-        right = call.reshape(right, [*lead, size[product.summed], size[columns]])
+        left = call.reshape(left, [*lead, count, depth])
+        right = call.reshape(right, [*lead, depth, width])
+    # Multiply, and restore the axes
     result = call.add("MatMul", [left, right])
     if flat and sizes is not None:
         result = call.reshape(result, [sizes[x] for x in batch + rows + columns])
-    call.put(_turned(call, result, batch + rows + columns, product.out))
+    call.put(_transposed(call, result, batch + rows + columns, product.out))
     return 1
 
 
-def _turned(call: FusedCall, value: ir.Value, have: str, want: str) -> ir.Value:
-    """Transpose a value whose axes have labels, where their order is another."""
+def _transposed(call: FusedCall, value: ir.Value, have: str, want: str) -> ir.Value:
+    """Transpose a value from one order of labelled axes to another, if they differ."""
     if have == want:
         return value
     return call.transpose(value, [have.index(label) for label in want])

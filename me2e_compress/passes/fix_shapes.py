@@ -65,11 +65,8 @@ class FixShapes(Pass):
             )
         # Blame the sizes only if the graph was sound before
         sound = _refusal(model) is None
-        stated = {
-            value: value.shape
-            for node in model.graph.all_nodes()
-            for value in node.outputs
-        }
+        made = (value for node in model.graph.all_nodes() for value in node.outputs)
+        stated = {value: value.shape for value in made}
         for value, shape in stated.items():
             value.shape = _sized(shape, wanted, "")
         for body in model.graph.subgraphs():
@@ -77,10 +74,8 @@ class FixShapes(Pass):
                 value.shape = _sized(value.shape, wanted, "")
         count = 0
         for value in model.graph.inputs:
-            before, value.shape = (
-                value.shape,
-                _sized(value.shape, wanted, f"{value.name}"),
-            )
+            before = value.shape
+            value.shape = _sized(before, wanted, str(value.name))
             count += value.shape is not before
         if (reason := _refusal(model)) is not None:
             # what a file says of an output may be wrong, and runtimes take it

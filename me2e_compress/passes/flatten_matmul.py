@@ -1,4 +1,4 @@
-"""Multiply many rows by a matrix at once, not each of them on its own."""
+"""Multiply many rows by a matrix in one product instead of one product per row."""
 
 import dataclasses
 import math
@@ -81,9 +81,9 @@ class FlattenMatmul(Pass):
 class _Form:
     """A cheaper product: rows [*batch, R, K] times a matrix [*batch, K, C].
 
-    ``axes`` are those of the rows' operand, without those that are 1 in both, and
-    ``order`` brings the ``batch`` axes that stay to the front. ``turned`` says that the
-    matrix is the left operand, to be transposed.
+    ``axes`` are the sizes of the rows' operand, without axes that are 1 in both;
+    ``order`` moves the ``batch`` axes that remain to the front. ``turned`` is True if
+    the matrix is the left operand, which is then transposed.
     """
 
     rows: ir.Value
@@ -118,7 +118,7 @@ class _Form:
 
     @property
     def price(self) -> float:
-        """What its views, its transpositions and its products cost, in node starts."""
+        """The cost of its views, transpositions and products, in node starts."""
         starts = small_products(self.rows_shape, self.matrix_shape)
         price, moved = 3.0 + starts / SMALL_PRODUCTS_PER_NODE, 0.0
         if self.turned:
@@ -131,7 +131,7 @@ class _Form:
 
 
 def _flatten(call: FusedCall) -> ir.Node | None:
-    """Write the cheapest form of a product, and return its node; None if it has one."""
+    """Write a product in its cheapest form; return the new one, None if none pays."""
     product = call.node
     shapes, (left, right) = _shapes(product), product.inputs[:2]
     if shapes is None or left is None or right is None:
@@ -158,6 +158,10 @@ def _form(
     *,
     all_axes: bool,
 ) -> _Form | None:
+    """Return the form in which rows take all batch axes that can be rows, or the last.
+
+    None where no batch axis can become rows.
+    """
     rank = max(len(rows_shape), len(matrix_shape))
     *lead, count, width = _widened(rows_shape, rank)
     shared = _widened(matrix_shape, rank)[:-2]
@@ -175,7 +179,7 @@ def _form(
 
 
 def _view(call: FusedCall, value: ir.Value, shape: Shape) -> ir.Value:
-    """Return a value in another shape; a constant that is read here alone stays one."""
+    """Reshape a value; a constant that nothing else reads is stored in that shape."""
     owned = len(value.uses()) == 1 and not value.is_graph_output()
     if owned and static_shape(value) != shape:
         return call.reshape_table(value, shape)
@@ -184,7 +188,7 @@ def _view(call: FusedCall, value: ir.Value, shape: Shape) -> ir.Value:
 
 def _write(call: FusedCall, form: _Form) -> ir.Node:
     old, rows = call.node.outputs[0], form.rows
-    # Both operands as they are multiplied
+    # Write both operands as they are multiplied
     if form.moves:
         rows = call.transpose(_view(call, rows, form.axes), form.order)
     rows = _view(call, rows, form.rows_shape)
@@ -196,7 +200,7 @@ def _write(call: FusedCall, form: _Form) -> ir.Node:
     new = call.add("MatMul", [rows, matrix])
     node = new.producer()
     assert node is not None
-    # The product as it was
+    # Bring the product back to its old shape
     if form.moves:
         sizes = (*form.sorted_axes[form.batch : -1], form.shape[-1])
         new = call.view(new, (*form.shape[: form.batch], *sizes))
@@ -207,7 +211,7 @@ def _write(call: FusedCall, form: _Form) -> ir.Node:
 
 
 def _read_unrepeated(call: FusedCall) -> int:
-    """Read operands in front of their repetitions where the product broadcasts."""
+    """Bypass repetitions of operands that the product broadcasts; count them."""
     product, count = call.node, 0
     for index in (0, 1):
         shapes, value = _shapes(product), product.inputs[index]

@@ -91,7 +91,7 @@ class FreezeInputs(Pass):
 
 
 def advice(model: ir.Model) -> str:
-    """Say which inputs may become constants; empty where none decides anything."""
+    """Return a sentence that names inputs that may become constants, or ""."""
     names = ",".join(deciding_inputs(model))
     return names and (
         f"branches or projections hang on {names}: where all frames have one value,"
@@ -104,24 +104,21 @@ def deciding_inputs(model: ir.Model) -> tuple[str, ...]:
     """Name the inputs that alone decide a branch, or are matrices of a projection."""
     names, states = dict[str, None](), recurrent_inputs(model)
     for node in nodes_of(model):
-        if node.op_type == "If":
-            roots = _roots(model, node.inputs[0])
-            least = FLAGS
-        elif node.op_type == "MatMul":
-            near = (_roots(model, value) for value in node.inputs)
-            every = (root for some in near for root in some)
-            roots = [e for e in every if (static_shape(e) or ())[-2:] in MATRICES]
-            least = 16 * MOST_MATRICES
-        else:
+        if node.op_type not in ("If", "MatMul"):
             continue
+        roots = [root for value in node.inputs for root in _roots(model, value)]
+        largest = FLAGS
+        if node.op_type == "MatMul":
+            roots = [v for v in roots if (static_shape(v) or ())[-2:] in MATRICES]
+            largest = 16 * MOST_MATRICES
         sizes = [static_shape(root) for root in roots]
-        if all(size is not None and math.prod(size) <= least for size in sizes):
+        if all(size is not None and math.prod(size) <= largest for size in sizes):
             names |= dict.fromkeys(str(root.name) for root in roots)
     return tuple(name for name in names if name not in states)
 
 
 def _roots(model: ir.Model, value: ir.Value | None) -> list[ir.Value]:
-    """Return the inputs that a value is computed of, but those of known size alone."""
+    """Return the inputs whose numbers, not only their sizes, a value depends on."""
     seen, pending = set[ir.Value](), [value]
     while pending:
         value = pending.pop()

@@ -20,9 +20,6 @@ from me2e_compress.passes.einsum_products import write_products
 from me2e_compress.passes.sequences import unpack_sequences
 from me2e_compress.targets.quantized import PAIR
 
-# Remove float64 that leaked into a float32 graph (``torch.linspace`` in exporters).
-
-
 _TYPE_ATTRIBUTES = ("to", "dtype", "output_datatype")
 """Attributes of standard operators that name an element type: Cast; EyeLike, Random*,
 Bernoulli, Multinomial, SequenceEmpty; the window functions and MelWeightMatrix."""
@@ -32,21 +29,12 @@ _BY_WIDTH = ("BitCast",)
 
 
 def demote(model: ir.Model, by: str) -> tuple[int, str]:
-    """Turn float64 into float32 everywhere; return the changes, and what to say of it.
+    """Turn float64 into float32 everywhere; return the changes, and a note about them.
 
     Nothing changes where an input, output or unknown operator has doubles. Finite
     numbers beyond float32's range are clipped, so that a mask of ``-1.8e308`` stays
     finite.
     """
-    held = any(
-        value.type is not None and _is_double(value.type) for value in _values(model)
-    )
-    if not held and not any(
-        _names_double(node, attribute) or _holds_double(node, attribute)
-        for node in nodes_of(model)
-        for attribute in node.attributes.values()
-    ):
-        return 0, ""
     # Stop where the outside needs double
     if keeper := _keeper(model):
         return 0, f"float64 stays: {keeper} is double"
@@ -60,17 +48,20 @@ def demote(model: ir.Model, by: str) -> tuple[int, str]:
                 value.type = ir.TensorType(ir.DataType.FLOAT)
                 count += 1
     for node in nodes_of(model):
-        if changed := _demote_attributes(node):
+        attributes = [_demoted(node, each) for each in node.attributes.values()]
+        changed = [each for each in attributes if each is not None]
+        node.attributes.update({each.name: each for each in changed})
+        if changed:
             provenance.inherit(node, [node], by=by)
-            count += changed
-    nodes = dict[ir.Node, None]()
+        count += len(changed)
+    nodes = set[ir.Node | None]()
     for value in _values(model):
         if value.type is not None and _is_double(value.type):
             value.type = _single(value.type)
             count += 1
-            if (made := value.producer()) is not None:
-                nodes[made] = None
-    return count, f"float64 became float32: {plural(len(nodes), 'node')}"
+            nodes.add(value.producer())
+    note = f"float64 became float32: {plural(len(nodes - {None}), 'node')}"
+    return count, note if count else ""
 
 
 def _keeper(model: ir.Model) -> str:
@@ -92,38 +83,19 @@ def _keeper(model: ir.Model) -> str:
     return ""
 
 
-def _demote_attributes(node: ir.Node) -> int:
-    count = 0
-    for name, attribute in list(node.attributes.items()):
-        if _names_double(node, attribute):
-            node.attributes[name] = ir.AttrInt64(name, ir.DataType.FLOAT.value)
-        elif _holds_double(node, attribute):
-            tensor = attribute.as_tensor()
-            single = _as_float32(tensor, tensor.name)
-            node.attributes[name] = ir.AttrTensor(name, single)
-        else:
-            continue
-        count += 1
-    return count
-
-
-def _names_double(node: ir.Node, attribute: ir.Attr) -> bool:
-    return (
-        node.domain == ""
-        and attribute.name in _TYPE_ATTRIBUTES
-        and attribute.type == ir.AttributeType.INT
-        and not attribute.is_ref()
-        and attribute.as_int() == ir.DataType.DOUBLE.value
-    )
-
-
-def _holds_double(node: ir.Node, attribute: ir.Attr) -> bool:
-    return (
-        node.domain == ""
-        and attribute.type == ir.AttributeType.TENSOR
-        and not attribute.is_ref()
-        and attribute.value.dtype == ir.DataType.DOUBLE
-    )
+def _demoted(node: ir.Node, attribute: ir.Attr) -> ir.Attr | None:
+    """Return an attribute of a standard operator in float32; None if it stays."""
+    name, kind = attribute.name, attribute.type
+    if node.domain != "" or attribute.is_ref():
+        return None
+    if kind == ir.AttributeType.INT and name in _TYPE_ATTRIBUTES:
+        double = attribute.as_int() == ir.DataType.DOUBLE.value
+        return ir.AttrInt64(name, ir.DataType.FLOAT.value) if double else None
+    if kind == ir.AttributeType.TENSOR:
+        tensor = attribute.as_tensor()
+        if tensor.dtype == ir.DataType.DOUBLE:
+            return ir.AttrTensor(name, _as_float32(tensor, tensor.name))
+    return None
 
 
 def _as_float32(tensor: ir.TensorProtocol, name: str | None) -> ir.TensorProtocol:
@@ -138,13 +110,11 @@ def _is_double(kind: ir.TypeProtocol) -> bool:
 
 
 def _single(kind: ir.TypeProtocol) -> ir.TypeProtocol:
-    if isinstance(kind, ir.SequenceType):
-        return ir.SequenceType(_single(kind.elem_type))
-    if isinstance(kind, ir.OptionalType):
-        return ir.OptionalType(_single(kind.elem_type))
-    if isinstance(kind, ir.SparseTensorType):
-        return ir.SparseTensorType(ir.DataType.FLOAT)
-    return ir.TensorType(ir.DataType.FLOAT)
+    """Return a type of float32 instead of float64."""
+    if isinstance(kind, ir.SequenceType | ir.OptionalType):
+        return type(kind)(_single(kind.elem_type))
+    sparse = isinstance(kind, ir.SparseTensorType)
+    return (ir.SparseTensorType if sparse else ir.TensorType)(ir.DataType.FLOAT)
 
 
 def _values(model: ir.Model) -> Iterator[ir.Value]:
@@ -244,7 +214,7 @@ def _flatten_scales(model: ir.Model, by: str) -> int:
 def needs_import(model: ir.Model) -> bool:
     """Return whether nodes lack provenance, or plugins a domain of their own."""
     return bool(provenance.missing(model)) or any(
-        _bare_plugins(body, model) for body in _bodies(model)
+        _plugins_without_domain(body, model) for body in _bodies(model)
     )
 
 
@@ -311,7 +281,7 @@ def _isolate_plugins(model: ir.Model, by: str) -> int:
     """
     count = 0
     for body in _bodies(model):
-        moved = _bare_plugins(body, model)
+        moved = _plugins_without_domain(body, model)
         for node in moved:
             node.metadata_props.setdefault(ORIGINAL_DOMAIN, node.domain)
             node.domain = PLUGIN_DOMAIN
@@ -322,7 +292,9 @@ def _isolate_plugins(model: ir.Model, by: str) -> int:
     return count
 
 
-def _bare_plugins(body: ir.Graph | ir.Function, model: ir.Model) -> list[ir.Node]:
+def _plugins_without_domain(
+    body: ir.Graph | ir.Function, model: ir.Model
+) -> list[ir.Node]:
     return [
         node
         for node in nodes_in(body)

@@ -1,7 +1,6 @@
 """Parts of a graph (a module, or scopes), and what replaces their values."""
 
 import dataclasses
-import math
 from collections.abc import Sequence
 from typing import Self
 
@@ -73,29 +72,28 @@ def listed(values: tuple[ir.Value, ...] | list[ir.Value]) -> str:
 
 
 def stretched(have: tuple[int, ...], want: tuple[int, ...]) -> tuple[int, ...] | None:
-    """Return the shape from which ``have`` broadcasts to ``want``; None if none does.
+    """Return ``have`` with axes of size 1 inserted so that it broadcasts to ``want``.
 
     Whole queries are repeated: [1, 256] of an agent becomes [1, 1, 256] for six modes
-    [1, 6, 256], and [1, A, 256] of all agents [1, A, 1, 256] for [1, A, 6, 256].
+    [1, 6, 256], and [1, A, 256] of all agents [1, A, 1, 256] for [1, A, 6, 256]. None
+    where there is no such shape, or more than one.
     """
-    if have == want or bare(have) == bare(want):
+    if have == want or without_ones(have) == without_ones(want):
         return want
     if not have or not want or have[-1] != want[-1] or len(have) > len(want):
         return None
     padded = (1,) * (len(want) - len(have)) + have
     if all(one in (1, full) for one, full in zip(padded, want, strict=True)):
         return padded
-    places = _places(bare(have), want)
-    if len(places) != 1:  # none, or it could be meant in more ways than one
+    places = _places(without_ones(have), want)
+    if len(places) != 1:  # none, or several
         return None
     return tuple(size if axis in places[0] else 1 for axis, size in enumerate(want))
 
 
-def bare(shape: tuple[int, ...]) -> tuple[int, ...]:
-    """Drop dimensions of size 1: moving only these moves no element."""
-    if math.prod(shape) == 0:
-        return shape
-    return tuple(size for size in shape if size != 1)
+def without_ones(shape: tuple[int, ...]) -> tuple[int, ...]:
+    """Drop dimensions of size 1, unless the shape is empty: they move no element."""
+    return tuple(size for size in shape if size != 1 or 0 in shape)
 
 
 def fit(value: ir.Value, like: ir.Value) -> int:
@@ -110,6 +108,7 @@ def fit(value: ir.Value, like: ir.Value) -> int:
 def _places(
     sizes: tuple[int, ...], want: tuple[int, ...], start: int = 0
 ) -> list[tuple[int, ...]]:
+    """Return all axes of a shape that have these sizes, in this order."""
     if not sizes:
         return [()]
     return [
@@ -149,18 +148,15 @@ def result_of(model: ir.Model, part: Part, like: ir.Value | None = None) -> ir.V
 
 def is_shape_arithmetic(value: ir.Value) -> bool:
     """Return whether integers come only from shapes and constants, not from data."""
-    queue, seen = [value], {value}
-    while queue:
-        current = queue.pop()
+    waiting, seen = [value], set[ir.Value]()
+    while waiting:
+        current = waiting.pop()
         if current.is_graph_input() or current.dtype not in _INTEGERS:
             return False
+        seen.add(current)
         producer = current.producer()
-        if producer is None or producer.op_type in ("Shape", "Size"):
-            continue
-        for each in producer.inputs:
-            if each is not None and each not in seen:
-                seen.add(each)
-                queue.append(each)
+        if producer is not None and producer.op_type not in ("Shape", "Size"):
+            waiting += {v for v in producer.inputs if v is not None} - seen
     return True
 
 
@@ -189,9 +185,9 @@ def layout_of(value: ir.Value) -> tuple[tuple[int, ...], np.dtype[np.generic]]:
 
 
 def writer_for(model: ir.Model, readers: Sequence[ir.Node], by: str) -> FusedCall:
-    """Return what writes nodes for some readers; the graph is to be sorted then."""
-    there = [node for node in readers if node.graph is model.graph]
-    place = (there or [model.graph[-1]])[0]
+    """Return a writer of nodes for some readers; sort the graph after it was used."""
+    present = (node for node in readers if node.graph is model.graph)
+    place = next(present, model.graph[-1])
     call = FusedCall(place, opset=graph.opset_of(model), by=by)
     call.sources = tuple(readers)
     return call
@@ -213,9 +209,8 @@ def shaped_like(call: FusedCall, new: ir.Value, old: ir.Value) -> ir.Value:
     if not padded or not want:
         return new
     shaped = call.view(new, padded)
-    if padded == want:
-        return shaped
-    return call.add("Expand", [shaped, call.integers(want)])
+    same = padded == want
+    return shaped if same else call.add("Expand", [shaped, call.integers(want)])
 
 
 def means_of(
@@ -234,6 +229,5 @@ def means_of(
         raise FramesError(
             "fill=means needs recorded frames (--frames): a mean is never made up"
         )
-    count = plural(len(frames), "frame")
     means = token_means(model, frames, names, provider=context.provider)
-    return means, f"its mean over {count}"
+    return means, f"its mean over {plural(len(frames), 'frame')}"

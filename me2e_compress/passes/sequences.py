@@ -1,4 +1,4 @@
-"""Sequences of tensors that a graph only takes apart again, as plain operators."""
+"""Replace sequences whose readers only take tensors out of them."""
 
 from collections.abc import Sequence
 
@@ -12,10 +12,10 @@ from me2e_compress.operators import FusedCall
 
 
 def unpack_sequences(model: ir.Model, by: str) -> int:
-    """Write sequences of a known number of tensors as the tensors; count the nodes.
+    """Replace sequences of a known number of tensors; return the number of nodes.
 
-    A sequence goes where all its readers take one tensor out at a constant place, ask
-    for its length, or join all. TensorRT's parser takes no sequence.
+    All readers must take one tensor at a constant place, the length, or join all
+    tensors. TensorRT's parser supports no sequences.
 
     Given:   s = SplitToSequence(x, [2, 4])  ;  y = SequenceAt(s, 1)
 
@@ -27,31 +27,29 @@ def unpack_sequences(model: ir.Model, by: str) -> int:
             if node.op_type not in ("SplitToSequence", "SequenceConstruct"):
                 continue
             readers = list(node.outputs[0].consumers())
-            size = _length(node) if is_standard(node) else None
-            if size is None or not readers or node.outputs[0].is_graph_output():
+            lengths = _lengths(node) if is_standard(node) else None
+            if lengths is None or not readers or node.outputs[0].is_graph_output():
                 continue
-            if not all(_unpacks(reader, size) for reader in readers):
+            if not all(_unpacks(reader, len(lengths)) for reader in readers):
                 continue
             call = FusedCall(node, opset=opset, by=by, names=names)
-            tensors = _tensors(node, size, call)
+            tensors = _tensors(node, lengths, call)
             for reader in readers:
-                _read(FusedCall(reader, opset=opset, by=by, names=names), tensors)
+                reading = FusedCall(reader, opset=opset, by=by, names=names)
+                _rewrite_reader(reading, tensors)
             remove_node(node)
             count += 1 + len(readers)
     return count
 
 
-def _length(node: ir.Node) -> int | None:
-    """Return how many tensors a sequence has; None where that is open."""
-    if node.op_type == "SequenceConstruct":
-        return len(node.inputs)
-    lengths = _lengths(node)
-    return None if lengths is None else len(lengths)
-
-
 def _lengths(node: ir.Node) -> list[int] | None:
-    """Return the lengths of the parts of a SplitToSequence along its axis."""
-    if array_of(node.inputs[0]) is not None:  # a stored weight's are left to folding
+    """Return the lengths of a sequence's tensors along its axis; None if unknown.
+
+    Those of a SequenceConstruct count as 1 each.
+    """
+    if node.op_type == "SequenceConstruct":
+        return [1] * len(node.inputs)
+    if array_of(node.inputs[0]) is not None:  # fold-constants splits weights
         return None
     split = input_at(node, 1)
     shape, axis = static_shape(node.inputs[0]), node.attributes.get_int("axis", 0)
@@ -62,7 +60,7 @@ def _lengths(node: ir.Node) -> list[int] | None:
     lengths, array = integers_of(split), array_of(split)
     if lengths is None or array is None or array.ndim:
         return lengths
-    # one number is the length of each part but the last
+    # One number is the length of each part but the last
     (most,) = lengths
     if size is None or most < 1:
         return None
@@ -77,21 +75,22 @@ def _unpacks(reader: ir.Node, size: int) -> bool:
     return reader.op_type in ("SequenceLength", "ConcatFromSequence")
 
 
-def _tensors(node: ir.Node, size: int, call: FusedCall) -> Sequence[ir.Value | None]:
-    """Return the tensors of a sequence: those of its making, or of a Split."""
-    lengths = _lengths(node) if node.op_type == "SplitToSequence" else None
+def _tensors(
+    node: ir.Node, lengths: list[int], call: FusedCall
+) -> Sequence[ir.Value | None]:
+    """Return the tensors that a sequence is made of; write the Split of one tensor."""
     source = node.inputs[0]
-    if lengths is None or source is None:
+    if node.op_type == "SequenceConstruct" or source is None:
         return node.inputs
     inputs, axis = [source, call.integers(lengths)], node.attributes.get_int("axis", 0)
-    made = call.add("Split", inputs, {"axis": axis}, outputs=size).producer()
+    made = call.add("Split", inputs, {"axis": axis}, outputs=len(lengths)).producer()
     assert made is not None
     for value in made.outputs:
         value.type = source.type
     return made.outputs
 
 
-def _read(call: FusedCall, tensors: Sequence[ir.Value | None]) -> None:
+def _rewrite_reader(call: FusedCall, tensors: Sequence[ir.Value | None]) -> None:
     """Rewrite a reader of a sequence to read its tensors."""
     reader, by = call.node, call.by
     if reader.op_type == "SequenceAt":
@@ -101,7 +100,7 @@ def _read(call: FusedCall, tensors: Sequence[ir.Value | None]) -> None:
     if reader.op_type == "SequenceLength":
         put(reader, "Identity", [call.integers(len(tensors))], by=by)
         return
-    # a new axis is put into each tensor before they are joined along it
+    # Insert the new axis into each tensor, then join them along it
     axis = reader.attributes.get_int("axis", 0)
     if reader.attributes.get_int("new_axis", 0):
         axes = call.integers([axis])

@@ -10,7 +10,7 @@ from onnx import TensorProto
 
 from me2e_compress import graph
 from me2e_compress.errors import GraphError
-from me2e_compress.graph.shapes import can_carry, infer_shapes, static_shape
+from me2e_compress.graph.shapes import can_propagate, infer_shapes, static_shape
 from me2e_compress.graph.summary import macs
 from me2e_compress.manager.equivalence import random_outputs
 from tests.support.calls import calls
@@ -84,16 +84,16 @@ def doubled(times: int) -> ir.Model:
 
 def test_vectors_that_double_are_not_carried_along() -> None:
     model = doubled(30)
-    assert not can_carry(model.graph)
+    assert not can_propagate(model.graph)
     infer_shapes(model)
     assert static_shape(model.graph[30].outputs[0]) == (1024 << 30,)
-    assert can_carry(doubled(4).graph)
+    assert can_propagate(doubled(4).graph)
     made = ir.from_onnx_text(
         '<ir_version: 9, opset_import: ["" : 17]>\n'
         "g () => (int64[n] y) <int64[1] size = {9999999999}> {"
         " a = ConstantOfShape(size) y = Cast<to = 7>(a) }"
     )
-    assert not can_carry(made.graph)
+    assert not can_propagate(made.graph)
 
 
 def with_tensors(path: Path) -> Path:

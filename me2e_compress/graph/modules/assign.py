@@ -25,7 +25,7 @@ Rule = Literal["stamp", "parameter", "scope", "neighbour"]
 
 @dataclasses.dataclass(frozen=True)
 class Placement:
-    """The module of a node, and the rule that found it."""
+    """The module of a node, and the rule that decided it."""
 
     module: str
     rule: Rule
@@ -56,22 +56,22 @@ STACK = "me2e.stack"
 
 
 def detect(model: ir.Model) -> ModuleMap:
-    """Find the preset of a graph.
+    """Return the preset that fits a graph.
 
-    The model's metadata decides (``me2e.stack``: a preset's name, or one followed by
-    ``-`` and a variant, as in ``vad-tiny``). Without it, the preset of which the
-    largest share of modules is found in the graph, then the one that claims most of its
-    names; at least half of the modules must be there.
+    The model's metadata decide (``me2e.stack``: a preset's name, or one followed by
+    ``-`` and a variant, as in ``vad-tiny``). Without them, it is the preset with the
+    largest share of modules in the graph, at least half; of equal ones, the preset that
+    matches most names.
 
     Raises:
         ModuleMapError: no preset fits.
     """
-    # the stack's own name decides
-    stack = model.metadata_props.get(STACK)
+    # The metadata decide
+    stack = model.metadata_props.get(STACK, "")
     for name in presets():
-        if stack is not None and (stack == name or stack.startswith(f"{name}-")):
+        if f"{stack}-".startswith(f"{name}-"):
             return ModuleMap.load(name)
-    # else the best fit
+    # Otherwise the best fit
     scopes = {node: scope_of(node) for node in model.graph.all_nodes()}
     paths = [path for path in (*_parameters(model), *scopes.values()) if path]
     ranked = list[tuple[float, int, str]]()
@@ -92,7 +92,7 @@ def detect(model: ir.Model) -> ModuleMap:
 
 
 def map_of(model: ir.Model, name: str | None) -> ModuleMap:
-    """Load the preset or TOML file of a name, or find the preset that fits.
+    """Load the preset or TOML file of a name, or the preset that fits.
 
     A graph that no preset fits is one module, named ``model``.
     """
@@ -105,14 +105,13 @@ def map_of(model: ir.Model, name: str | None) -> ModuleMap:
 
 
 _DEEPEST = 3
-"""Components of a prefix that is looked for: wrappers nest this deep at most."""
+"""Most components of a prefix that is tried: wrappers nest this deep at most."""
 
 
-def behind_a_prefix(modules: ModuleMap, paths: Iterable[str]) -> str:
-    """Suggest what a map lacks where a prefix hides its names; empty if none does.
+def prefix_hint(modules: ModuleMap, paths: Iterable[str]) -> str:
+    """Suggest ``strip`` for a map if its patterns match behind a prefix; else "".
 
-    The prefix behind which most of its patterns match a path is named, with the first
-    of them.
+    The suggested prefix is the one behind which most patterns match.
     """
     matches: dict[str, dict[tuple[str, str], None]] = {}
     for path in paths:
@@ -121,7 +120,7 @@ def behind_a_prefix(modules: ModuleMap, paths: Iterable[str]) -> str:
             if claims := modules.claims(".".join(parts[depth:])):
                 prefix = ".".join(parts[:depth])
                 matches.setdefault(prefix, {}).update(dict.fromkeys(claims))
-    # a pattern that matches anywhere matches without a prefix, too
+    # A pattern that matches anywhere also matches without a prefix
     named = {
         prefix: [text for _, text in claims if not PathGlob(text).anywhere]
         for prefix, claims in matches.items()
@@ -144,51 +143,50 @@ def assign(model: ir.Model, modules: ModuleMap) -> Assignment:
 
     0. *stamp*: the node's own metadata, in a graph that was imported before;
     1. *parameter*: names of the initializers that reach it, directly or through
-       arithmetic of constants alone (Transpose, Cast, Reshape of a weight); a MatMul
-       whose weight lost its name goes by the bias added to it. An initializer that
-       scopes of several modules read was merged by the exporter and decides nothing;
+       constant arithmetic (Transpose, Cast, Reshape of a weight); for a MatMul whose
+       weight lost its name, that of the bias added to it. An initializer that scopes of
+       several modules read was merged by the exporter and decides nothing;
     2. *scope*: the torch module whose forward made it, see :func:`scope_of`;
-    3. *neighbour*: the one module that all its results go to; else the nearest node
-       that has a module, the producer first, then the consumer. Constants go by
-       their consumers.
+    3. *neighbour*: the one module that reads all its results; else that of the nearest
+       node with a module, the producer first, then the consumer. Constants belong to
+       the module of their consumers.
 
     Raises:
-        ModuleMapError: a required pattern matches nothing, or none at all does.
+        ModuleMapError: a required pattern matches nothing, or no pattern matches.
     """
-    # stamps of an earlier import
+    # Stamps of an earlier import
     nodes = list(model.graph.all_nodes())
+    names = modules.names()
     placed = {
         node: Placement(module, "stamp")
         for node in nodes
-        if (module := node.metadata_props.get(MODULE)) in modules.names()
-        and module is not None
+        if (module := node.metadata_props.get(MODULE)) is not None and module in names
     }
     scopes = {node: scope_of(node) for node in nodes}
     paths = dict.fromkeys(scopes.values()) | dict.fromkeys(_parameters(model))
     if not placed:
         _check_required(modules, paths)
-    # names of parameters, then scopes
+    # Names of parameters, then scopes
     by_scope = {
         node: module
         for node, scope in scopes.items()
         if scope and (module := modules.match(scope)) is not None
     }
-    constant = is_constant(nodes)
+    constant = constant_nodes(nodes)
     for node, module in by_parameter(nodes, modules, by_scope, constant).items():
         placed.setdefault(node, Placement(module, "parameter"))
     for node, module in by_scope.items():
         placed.setdefault(node, Placement(module, "scope"))
     everywhere = modules.match("")
-    if everywhere is not None:  # a pattern ``**``: what has no name is its too
+    if everywhere is not None:  # the pattern ``**`` takes nodes without a name, too
         for node in nodes:
             placed.setdefault(node, Placement(everywhere, "scope"))
-    # what is left goes by its neighbours
+    # The others belong to the modules of their neighbours
     known = {node: place.module for node, place in placed.items()}
     if nodes and not known:
         raise ModuleMapError(
             f"map {modules.name}: none of its patterns matches a parameter or a scope"
-            f" of this graph, which has {_sample(paths)}"
-            f"{behind_a_prefix(modules, paths)}"
+            f" of this graph, which has {_sample(paths)}{prefix_hint(modules, paths)}"
         )
     for node, module in _spread(nodes, known, constant).items():
         placed.setdefault(node, Placement(module, "neighbour"))
@@ -205,7 +203,7 @@ def _check_required(modules: ModuleMap, paths: Collection[str]) -> None:
             raise ModuleMapError(
                 f"map {modules.name}: pattern {pattern!r} of module {module} matches"
                 f" no parameter and no scope; there are {_sample(paths)}"
-                f"{behind_a_prefix(modules, paths)}"
+                f"{prefix_hint(modules, paths)}"
             )
 
 
@@ -225,35 +223,32 @@ def _spread(
     known: Mapping[ir.Node, str],
     constant: Collection[ir.Node],
 ) -> dict[ir.Node, str]:
-    """Assign the nodes without a name of their own, in a few sweeps over the graph.
+    """Assign the nodes without a name to modules, in four sweeps over the graph.
 
-    1. A node whose results all end up in one module, whatever unnamed nodes they pass
-       on the way, prepares that module's input and belongs to it.
-    2. A node whose results go to several modules, or out of the graph, belongs to the
-       module it gets its data from: of its producers, the one that comes last.
-    3. What reads no data, as constants do, goes with the consumer that comes first.
-    4. A node without such neighbours goes with the node before it (in a subgraph: with
-       the node that holds it), at the very start with the one after.
+    1. A node whose results are all read by one module, directly or through other
+       unnamed nodes, belongs to that module: it prepares its input.
+    2. Any other node belongs to the module of its last producer.
+    3. A node without such a producer, as a constant, belongs to the module of its first
+       consumer.
+    4. A node without such neighbours belongs to the module of the node before it (in a
+       subgraph: of the node with the subgraph), the first nodes to that of the next.
 
     ``known`` must not be empty; ``constant`` nodes do not count as producers. Returns
     the module of every node, known ones included.
     """
-    # sweep 1, then 2: from producers to consumers
+    # Sweep 1, then 2: from producers to consumers
     place = {node: index for index, node in enumerate(nodes)}
     modules = dict(known) | _single_destinations(nodes, known)
     for node in nodes:
-        if node in modules or node in constant:
-            continue
-        makers = [value.producer() for value in node.inputs if value is not None]
-        heard = [m for m in makers if m in modules and m not in constant]
-        if heard:
-            modules[node] = modules[max(heard, key=place.__getitem__)]
-    # sweep 3: from consumers to producers
+        makers = [m for m in node.predecessors() if m in modules and m not in constant]
+        if node not in modules and node not in constant and makers:
+            modules[node] = modules[max(makers, key=place.__getitem__)]
+    # Sweep 3: from consumers to producers
     for node in reversed(nodes):
-        heard = [reader for reader in _readers(node) if reader in modules]
-        if node not in modules and heard:
-            modules[node] = modules[min(heard, key=place.__getitem__)]
-    # sweep 4: along the graph's order
+        readers = [reader for reader in node.successors() if reader in modules]
+        if node not in modules and readers:
+            modules[node] = modules[min(readers, key=place.__getitem__)]
+    # Sweep 4: along the graph's order
     last = next(modules[node] for node in nodes if node in modules)
     for node in nodes:
         last = modules.setdefault(node, last)
@@ -268,27 +263,20 @@ def _single_destinations(
     for node in reversed(nodes):
         if node in known:
             continue
-        heard = {known.get(r) or goals.get(r): None for r in _readers(node)}
+        readers = {known.get(r) or goals.get(r) for r in node.successors()}
         outside = any(value.is_graph_output() for value in node.outputs)
-        goals[node] = next(iter(heard)) if len(heard) == 1 and not outside else None
+        goals[node] = readers.pop() if len(readers) == 1 and not outside else None
     return {node: module for node, module in goals.items() if module is not None}
 
 
-def _readers(node: ir.Node) -> list[ir.Node]:
-    return [reader for value in node.outputs for reader in value.consumers()]
-
-
-def is_constant(nodes: Sequence[ir.Node]) -> frozenset[ir.Node]:
+def constant_nodes(nodes: Sequence[ir.Node]) -> frozenset[ir.Node]:
     """Return the nodes that compute from constants alone; nodes come in graph order."""
     constant: set[ir.Node] = set()
     for node in nodes:
-        if has_subgraph(node):
-            continue
-        if all(
-            value.producer() in constant
-            or (value.is_initializer() and not value.is_graph_input())
-            for value in node.inputs
-            if value is not None
+        reads = [value for value in node.inputs if value is not None]
+        others = [value for value in reads if value.producer() not in constant]
+        if not has_subgraph(node) and all(
+            value.is_initializer() and not value.is_graph_input() for value in others
         ):
             constant.add(node)
     return frozenset(constant)
@@ -304,7 +292,7 @@ def by_parameter(
 
     Nodes come in graph order. ``by_scope`` is needed to recognise merged initializers.
     """
-    # from initializers through constant arithmetic to the first nodes that compute
+    # From initializers through constant arithmetic to the first nodes that compute
     claims: dict[ir.Value, str | None] = {}
     placed: dict[ir.Node, str] = {}
     for node in nodes:
@@ -314,30 +302,29 @@ def by_parameter(
             if value is not None
             and (module := _claim(value, claims, modules, by_scope)) is not None
         ]
-        votes = _copied(node, modules, constant) or votes
+        votes = _module_of_copy(node, modules, constant) or votes
         if votes:
             placed[node] = votes[0]
         if node in constant:
             claims.update((value, placed.get(node)) for value in node.outputs)
-    # a MatMul whose weight lost its name goes by the bias added to it
+    # A MatMul whose weight lost its name belongs to the module of the added bias
     for node in nodes:
         if node in placed or node.op_type != "MatMul":
             continue
         readers = node.outputs[0].consumers()
-        if node.outputs[0].is_graph_output() or len(readers) != 1:
-            continue
-        if readers[0].op_type == "Add" and readers[0] in placed:
+        alone = len(readers) == 1 and not node.outputs[0].is_graph_output()
+        if alone and readers[0].op_type == "Add" and readers[0] in placed:
             placed[node] = placed[readers[0]]
     return placed
 
 
-def _copied(
+def _module_of_copy(
     node: ir.Node, modules: ModuleMap, constant: Collection[ir.Node]
 ) -> list[str]:
     """Return the module of a parameter that is stored as a copy of an equal one.
 
-    TorchScript's exporter writes parameters of equal values once, and the others as an
-    Identity of it that has their name.
+    TorchScript's exporter writes the first of equal parameters, and the others as an
+    Identity of that under their names.
     """
     if node.op_type != "Identity" or node not in constant:
         return []
@@ -353,7 +340,7 @@ def _claim(
 ) -> str | None:
     if value in claims or not value.is_initializer() or value.is_graph_input():
         return claims.get(value)
-    # one that scopes of several modules read was merged
+    # An initializer that scopes of several modules read was merged
     scopes = {by_scope[node] for node in value.consumers() if node in by_scope}
     named = modules.match(parameter_path(value.name))
     claims[value] = None if len(scopes) > 1 else named
@@ -368,15 +355,15 @@ _NOT_WEIGHTS = (
 
 @dataclasses.dataclass(frozen=True)
 class Item:
-    """The nodes, weights and cost of one module; None is what nobody counts.
+    """The nodes, weights and cost of one module; None is not counted.
 
     Attributes:
-        nodes: those in subgraphs included.
-        parameters: elements of weights: of its initializers of any type but
-            int32, int64, bool and string, which hold shapes, indices and masks.
-        weight_bytes: of all initializers.
-        macs: multiply-accumulates, those known: a lower bound if
-            others are unknown, and then None instead of 0.
+        nodes: number of nodes, with those in subgraphs.
+        parameters: elements of all initializers but those of int32, int64, bool and
+            string, which are shapes, indices and masks.
+        weight_bytes: bytes of all initializers.
+        macs: known multiply-accumulates: a lower bound if others are unknown, and then
+            None instead of 0.
         unknown_macs_nodes: number of its nodes that are not in ``macs``.
     """
 
@@ -402,7 +389,7 @@ def itemise(
     nodes: dict[str, list[ir.Node]] = {name: [] for name in modules.names()}
     for node in model.graph.all_nodes():
         nodes.setdefault(module_of(node), []).append(node)
-    # weights by the module that owns them
+    # Weights by the module that owns them
     elements, size = dict.fromkeys(nodes, 0), dict.fromkeys(nodes, 0)
     for graph in (model.graph, *model.graph.subgraphs()):
         for value in graph.initializers.values():

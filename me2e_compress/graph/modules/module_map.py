@@ -3,6 +3,7 @@
 import ast
 import dataclasses
 import functools
+import itertools
 from collections.abc import Callable
 from fnmatch import fnmatchcase
 from importlib import resources
@@ -93,22 +94,21 @@ def scope_of(node: ir.Node) -> str:
     """
     props = node.metadata_props
     if props:
-        # the dynamo exporter's metadata, the node itself left out
+        # The dynamo exporter's metadata, without the node itself
         if (scopes := props.get(_SCOPES)) is not None:
             try:
                 parsed: object = ast.literal_eval(scopes)
             except (ValueError, SyntaxError):
                 parsed = []
-            paths = [str(each) for each in parsed] if isinstance(parsed, list) else []
+            paths = [str(path) for path in parsed] if isinstance(parsed, list) else []
             return _last_path(paths[:-1])
         if (namespace := props.get(_NAMESPACE)) is not None:
             paths = [part.partition(": ")[0] for part in namespace.split("/")]
             return _last_path(paths[:-1])
-    # the TorchScript exporter's names
-    scope = _from_name(node.name)
-    if not scope and node.outputs:
-        scope = _from_name(node.outputs[0].name)
-    return scope
+    # The TorchScript exporter's names
+    return _scope_in(node.name) or (
+        _scope_in(node.outputs[0].name) if node.outputs else ""
+    )
 
 
 def leaving(model: ir.Model, holds: Callable[[ir.Node], bool]) -> tuple[ir.Value, ...]:
@@ -124,7 +124,7 @@ def leaving(model: ir.Model, holds: Callable[[ir.Node], bool]) -> tuple[ir.Value
 
 
 def entering(model: ir.Model, holds: Callable[[ir.Node], bool]) -> tuple[ir.Value, ...]:
-    """List the values that some nodes read of others or of the inputs, not weights.
+    """List the values that some nodes read, without weights and their own values.
 
     They are in the order in which they are first read.
     """
@@ -140,11 +140,8 @@ def entering(model: ir.Model, holds: Callable[[ir.Node], bool]) -> tuple[ir.Valu
     )
 
 
-def _from_name(name: str | None) -> str:
-    if not name or "/" not in name:
-        return ""
-    parts = [part for part in name.split("/")[:-1] if part]
-    return ".".join(parts)
+def _scope_in(name: str | None) -> str:
+    return ".".join(part for part in (name or "").split("/")[:-1] if part)
 
 
 def _last_path(paths: list[str]) -> str:
@@ -154,7 +151,7 @@ def _last_path(paths: list[str]) -> str:
 Role = Literal["feature", "prediction"]
 
 WHOLE = "whole"
-"""Name of the map of a graph that is no stack; see `ModuleMap.whole`."""
+"""Name of the map of a graph that is not an ME2E stack; see `ModuleMap.whole`."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -267,14 +264,14 @@ class ModuleMap:
             ModuleMapError: no such preset or file, not TOML, or not a map.
         """
         path = Path(source)
-        # a user's file
+        # A user's file
         if path.suffix == ".toml":
             if not path.is_file():
                 raise ModuleMapError(f"{path}: no such file")
             with documents.reading(path, ModuleMapError, "not TOML"):
                 content = documents.read_bytes(path)
             return cls.parse(content, path.stem, str(path))
-        # presets
+        # Presets
         if str(source) == WHOLE:
             return cls.whole()
         if str(source) not in presets():
@@ -311,7 +308,7 @@ class ModuleMap:
         return cls(WHOLE, (Module("model", "feature", (), ("**",)),))
 
     def __repr__(self) -> str:
-        """Name the map and its modules: fingerprints of drives hold it."""
+        """Return the map's name and modules, which fingerprints of drives contain."""
         return f"<ModuleMap: {self.name}: {', '.join(self.names())}>"
 
     def names(self, role: Role | None = None) -> tuple[str, ...]:
@@ -320,13 +317,13 @@ class ModuleMap:
 
     def module(self, name: str) -> Module:
         """Return a module by its name."""
-        for module in self.modules:
-            if module.name == name:
-                return module
-        raise ModuleMapError(
-            f"{name}: no such module in map {self.name}; it has"
-            f" {', '.join(self.names())}"
-        )
+        modules = {module.name: module for module in self.modules}
+        if name not in modules:
+            there = ", ".join(self.names())
+            raise ModuleMapError(
+                f"{name}: no such module in map {self.name}; it has {there}"
+            )
+        return modules[name]
 
     def match(self, path: str) -> str | None:
         """Return the module that a dotted path belongs to; None if none claims it."""
@@ -363,11 +360,8 @@ class ModuleMap:
         return functools.lru_cache(maxsize=None)(winner)
 
     def _parts(self, path: str) -> tuple[str, ...]:
-        parts = tuple(part for part in path.split(".") if part)
-        start = 0
-        while start < len(parts) and parts[start] in self.strip:
-            start += 1
-        return parts[start:]
+        parts = filter(None, path.split("."))
+        return tuple(itertools.dropwhile(self.strip.__contains__, parts))
 
 
 def presets() -> tuple[str, ...]:

@@ -1,4 +1,4 @@
-"""The edits that every rewrite is made of; none of them touches the interface."""
+"""Edits of graphs that keep the interface: inputs and outputs."""
 
 from collections.abc import Iterable, Mapping, Sequence
 
@@ -29,7 +29,7 @@ def value_names(graph: ir.Graph) -> set[str]:
 
 
 def fresh_name(name: str, names: set[str]) -> str:
-    """Return ``name``, or ``name_1``, ... where that is taken, and enter it."""
+    """Return ``name``, or ``name_1``, ... if it is taken, and add it to the names."""
     unique, count = name, 0
     while unique in names:
         count += 1
@@ -41,10 +41,10 @@ def fresh_name(name: str, names: set[str]) -> str:
 def add_constant(
     graph: ir.Graph, array: Array, name: str, names: set[str] | None = None
 ) -> ir.Value:
-    """Register an initializer under this name, or ``name_1``, ... where it is taken.
+    """Register an initializer under this name, or ``name_1``, ... if it is taken.
 
-    ``names`` are those that are taken, the new one is entered; None looks at the whole
-    graph, which whoever adds thousands had better do once.
+    ``names`` are the taken ones, to which the new one is added; None collects them from
+    the whole graph, which is slow for many constants.
     """
     unique = fresh_name(name, value_names(graph) if names is None else names)
     flat = np.ascontiguousarray(array).reshape(array.shape)
@@ -60,26 +60,22 @@ def add_constant(
 
 
 def can_replace(old: ir.Value, new: ir.Value) -> bool:
-    """Return whether ``new`` may stand for ``old`` without touching the interface."""
+    """Return whether ``new`` can replace ``old`` without changing the interface."""
     if not old.is_graph_output():
         return True
-    return not (
-        new.is_graph_output()
-        or new.is_graph_input()
-        or new.is_initializer()
-        or new.graph is not old.graph
-    )
+    port = new.is_graph_output() or new.is_graph_input() or new.is_initializer()
+    return not port and new.graph is old.graph
 
 
 def replace_value(old: ir.Value, new: ir.Value, names: set[str] | None = None) -> None:
     """Replace a value in all its readers; a graph output keeps its name.
 
-    Where ``old`` is a graph output, ``new`` takes its place and its name, so that the
-    interface stays as it was; ``names`` are taken, as in :func:`add_constant`.
+    If ``old`` is a graph output, ``new`` becomes that output under its name. ``names``
+    are the taken ones, as in :func:`add_constant`.
 
     Raises:
-        GraphError: ``old`` is a graph output, and ``new`` cannot be it, being an
-            input, an initializer, another output or of another graph.
+        GraphError: ``old`` is a graph output, and ``new`` is an input, an initializer,
+            another output or of another graph.
     """
     if not old.is_graph_output():
         old.replace_all_uses_with(new)
@@ -95,7 +91,7 @@ def replace_value(old: ir.Value, new: ir.Value, names: set[str] | None = None) -
 
 
 def bypass(old: ir.Value, new: ir.Value) -> bool:
-    """Replace a value in its readers where that keeps the interface; else False."""
+    """Replace a value and return True; False if that would change the interface."""
     if not can_replace(old, new):
         return False
     replace_value(old, new)
@@ -112,10 +108,10 @@ def put(
     attributes: Mapping[str, int | float | str | Sequence[int]] | None = None,
     domain: str = "",
 ) -> ir.Node:
-    """Put an operator in a node's place; it takes over output and name.
+    """Replace a node by one operator, which gets its name and the name of its output.
 
-    The old node is removed. ``by`` is the pass's name, ``sources`` are the other nodes
-    that the new one stands for; the graph must import ``domain``.
+    ``by`` is the pass's name, ``sources`` are other nodes that the new one replaces;
+    the graph must import ``domain``.
 
     Raises:
         GraphError: another output of the node is read.
@@ -138,7 +134,7 @@ def put(
 
 
 def remove_node(node: ir.Node) -> None:
-    """Remove a node that nothing reads, and what stands in its bodies.
+    """Remove a node that nothing reads, with its bodies.
 
     Raises:
         GraphError: the node is not in a graph, or it is read.
@@ -154,7 +150,7 @@ def remove_node(node: ir.Node) -> None:
 
 
 def remove_unread(values: Iterable[ir.Value | None]) -> None:
-    """Remove the makers of values, and all that only they needed, if nothing reads."""
+    """Remove the unread makers of values, and nodes that become unread by that."""
     waiting = [producer_of(value) for value in values]
     while waiting:
         node = waiting.pop()
@@ -165,7 +161,7 @@ def remove_unread(values: Iterable[ir.Value | None]) -> None:
 
 
 def _empty(body: ir.Graph) -> None:
-    """Take all nodes out of a body: they would go on reading what they captured."""
+    """Remove all nodes of a body, so that they read no outer values any more."""
     for node in body:
         for inner in bodies_of(node):
             _empty(inner)
@@ -174,10 +170,9 @@ def _empty(body: ir.Graph) -> None:
 
 
 def remove_dead(graph: ir.Graph) -> int:
-    """Remove the nodes, and the initializers, that nothing reads; count the nodes.
+    """Remove unread nodes and initializers; return how many there were.
 
-    Initializers go silently where a removed node was their last reader, but those
-    that were idle from the start count.
+    Initializers that were read only by removed nodes do not count.
     """
     idle = sum(len(_idle(inner)) for inner in graphs_of(graph))
     count = 0
@@ -201,20 +196,20 @@ def _idle(graph: ir.Graph) -> list[ir.Value]:
 
 
 def sweep(model: ir.Model) -> None:
-    """Drop the nodes, weights and functions that nothing reads any more.
+    """Remove unread nodes, weights and functions.
 
-    Nodes that stay are left as they are, default attributes and empty inputs too: a
-    changed node would have to name the pass.
+    Other nodes do not change, not even by dropping default attributes or empty inputs:
+    a changed node would have to name the pass.
     """
     remove_dead(model.graph)
     common.RemoveUnusedFunctionsPass()(model)  # type: ignore[no-untyped-call]
 
 
 def lift_constants(model: ir.Model) -> int:
-    """Turn Constant nodes of the graph and its subgraphs into initializers.
+    """Turn Constant nodes of the graph and its subgraphs into initializers; count them.
 
-    Those that are outputs themselves stay, and so do those in function bodies, which
-    have no initializers. Counts the nodes that went.
+    Those that are graph outputs stay, and those in functions, which have no
+    initializers.
     """
     before = _constants(model)
     if not before:
@@ -226,13 +221,9 @@ def lift_constants(model: ir.Model) -> int:
 
 
 def _constants(model: ir.Model) -> list[ir.Node]:
-    return [
-        node
-        for node in nodes_in(model.graph)
-        if node.op_type == "Constant"
-        and node.domain == ""
-        and not node.outputs[0].is_graph_output()
-    ]
+    nodes = (node for node in nodes_in(model.graph) if node.domain == "")
+    constants = (node for node in nodes if node.op_type == "Constant")
+    return [node for node in constants if not node.outputs[0].is_graph_output()]
 
 
 def _spell_strings(node: ir.Node) -> None:

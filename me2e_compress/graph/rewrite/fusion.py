@@ -1,4 +1,4 @@
-"""A fusion: what to look for, whether it may be done, and what takes its place."""
+"""Fusions: a pattern, a check of the match, and its rewrite."""
 
 import dataclasses
 from collections import Counter
@@ -35,7 +35,7 @@ ROUNDS = 16
 
 @dataclasses.dataclass(frozen=True)
 class Facts:
-    """What may be asked for besides the match.
+    """Facts about the graph besides the match.
 
     Attributes:
         opset: the version of ONNX's own operators.
@@ -46,13 +46,13 @@ class Facts:
 
 @dataclasses.dataclass(frozen=True)
 class Kit:
-    """What a rewrite edits the graph with.
+    """Edits the graph around a match.
 
     Attributes:
-        graph: where the match is: the main graph, or a body.
-        match: where the expression was found.
+        graph: the graph of the match: the main graph, or a body.
+        match: the matched nodes and values.
         by: the pass's name.
-        names: of all values of the model; new ones are entered.
+        names: of all values of the model; new ones are added.
     """
 
     graph: ir.Graph
@@ -61,13 +61,13 @@ class Kit:
     names: set[str]
 
     def constant(self, array: Array, name: str) -> ir.Value:
-        """Register an initializer beside the match, under this name if it is free."""
+        """Register an initializer in the graph, under this name if it is free."""
         return add_constant(self.graph, array, name, self.names)
 
     def refill(self, node: ir.Node, index: int, array: Array, name: str) -> None:
-        """Write other numbers into a constant operand, or add one of this name.
+        """Replace the array of a constant operand, or add an operand of this name.
 
-        An initializer that nothing else reads keeps its name.
+        An initializer that no other node reads keeps its name.
         """
         old = input_at(node, index)
         if old is not None and old.is_initializer() and sole_reader(old) is node:
@@ -86,16 +86,12 @@ class Kit:
         *,
         domain: str = "",
     ) -> None:
-        """Replace all that matched by one operator, of any domain."""
+        """Replace all matched nodes by one operator, of any domain."""
+        root, *sources = self.match.nodes
         put(
-            self.match.root,
-            op_type,
-            inputs,
-            by=self.by,
-            sources=self.match.nodes[1:],
-            attributes=attributes,
-            domain=domain,
-        )
+            root, op_type, inputs, by=self.by, sources=sources,
+            attributes=attributes, domain=domain,
+        )  # fmt: skip
 
     def add(
         self,
@@ -103,10 +99,9 @@ class Kit:
         inputs: Sequence[ir.Value | None],
         attributes: Mapping[str, int | float | str | Sequence[int]] | None = None,
     ) -> ir.Value:
-        """Insert one more standard operator before what takes the match's place.
+        """Insert a standard operator before the last matched node; return its output.
 
-        Returns:
-            What it computes; its type and shape are inferred after the pass.
+        Its type and shape are inferred after the pass.
         """
         root = self.match.root
         name = fresh_name(f"{root.outputs[0].name}_{op_type}", self.names)
@@ -117,9 +112,9 @@ class Kit:
         return node.outputs[0]
 
     def absorb(self, first: ir.Node, *others: ir.Node) -> None:
-        """Remove the last node, whose work these nodes do from now on.
+        """Remove the last matched node; the first of these nodes makes its output.
 
-        The first of them makes its output.
+        All of them inherit its provenance.
         """
         root = self.match.root
         for node in (first, *others):
@@ -130,7 +125,7 @@ class Kit:
 
 @dataclasses.dataclass(frozen=True)
 class Fusion:
-    """A pattern, a check and a rewrite.
+    """A named pattern with a check and a rewrite.
 
     ``Relu(Relu(x))`` is ``Relu(x)``::
 
@@ -139,11 +134,11 @@ class Fusion:
         once = Fusion("Relu of Relu", twice, lambda m, kit: kit.put("Relu", [m[x]]))
 
     Attributes:
-        name: what the report counts it as.
-        pattern: the expression.
-        rewrite: edits the graph; or leaves it alone and returns the reason, which is
-            reported.
-        where: whether a match is one at all; what it leaves out is not counted.
+        name: its name in the report.
+        pattern: the pattern.
+        rewrite: edits the graph and returns None, or returns the reason why it does
+            not, which is reported.
+        where: returns whether a match counts; None accepts all.
     """
 
     name: str
@@ -154,12 +149,12 @@ class Fusion:
 
 @dataclasses.dataclass
 class Fused:
-    """What was fused, and what was left and why; each counted.
+    """Counts of fusions.
 
     Attributes:
-        done: by the name of the fusion.
-        refused: by the reason.
-        unread: nodes and weights that nothing read before anything was fused.
+        done: fusions by name.
+        refused: matches that stay, by reason.
+        unread: nodes and weights that were unread before the first fusion.
     """
 
     done: Counter[str] = dataclasses.field(default_factory=Counter)
@@ -168,7 +163,7 @@ class Fused:
 
     @property
     def changes(self) -> int:
-        """How many fusions were done, and unread nodes and weights removed."""
+        """The number of fusions, and of removed unread nodes and weights."""
         return self.done.total() + self.unread
 
     def notes(self) -> tuple[str, ...]:
@@ -183,11 +178,11 @@ class Fused:
 
 
 def fuse(model: ir.Model, fusions: Sequence[Fusion], *, by: str) -> Fused:
-    """Try fusions on every node, in order, until none applies.
+    """Apply fusions to every node, in order and in place, until none applies.
 
-    What nothing reads is removed first, and after every round: it would read what a
-    pattern wants for itself. Shapes must be inferred; bodies are rewritten too, all in
-    place. ``by`` is the pass's name.
+    Unread nodes are removed first and after every round: they would read inner values
+    of patterns. Shapes must be inferred. Bodies are rewritten too. ``by`` is the pass's
+    name.
     """
     table: dict[str, list[Fusion]] = {}
     for fusion in fusions:
@@ -199,7 +194,7 @@ def fuse(model: ir.Model, fusions: Sequence[Fusion], *, by: str) -> Fused:
         done: Counter[str] = Counter()
         fused.refused.clear()  # those of the last round are left
         for body in graphs_of(model.graph):
-            done.update(run.round(body, fused.refused))
+            done.update(run.fuse_body(body, fused.refused))
         if not done:
             break
         fused.done.update(done)
@@ -212,15 +207,15 @@ def fuse(model: ir.Model, fusions: Sequence[Fusion], *, by: str) -> Fused:
 
 @dataclasses.dataclass(frozen=True)
 class _Run:
-    """What stays the same while a model is fused."""
+    """The constant context of a run of :func:`fuse`."""
 
     facts: Facts
     by: str
     names: set[str]
     table: Mapping[str, Sequence[Fusion]]
 
-    def round(self, body: ir.Graph, refused: Counter[str]) -> Counter[str]:
-        """Try every node once; count what was done, and enter what was refused."""
+    def fuse_body(self, body: ir.Graph, refused: Counter[str]) -> Counter[str]:
+        """Try every node once; return counts of fusions, and add those of refusals."""
         done: Counter[str] = Counter()
         for node in list(body):
             for fusion in self.table.get(node.op_type, ()):

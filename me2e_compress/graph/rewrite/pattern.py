@@ -1,14 +1,14 @@
-"""A piece of graph as an expression, and the search for it.
+"""Patterns of operators, and their search in a graph.
 
 ``x * Sigmoid(x)``::
 
     x = var("x")
     swish = op("Mul", x, op("Sigmoid", x))
 
-An expression is matched from its last operator upwards. One object stands for one
-value wherever it occurs, so the two ``x`` must be the same. Operands of commutative
-operators match in either order. What an inner operator makes must be read inside the
-expression alone, in the same graph, and be no output.
+A pattern is matched from its last operator upwards. One object stands for one value
+wherever it occurs, so the two ``x`` must be the same. Operands of commutative operators
+match in any order. Values of inner operators may be read only inside the pattern and in
+the same graph, and may not be graph outputs.
 """
 
 import abc
@@ -33,18 +33,18 @@ from me2e_compress.graph.nodes import (
 _IN_ANY_ORDER = frozenset(
     {"Add", "And", "Equal", "Max", "Mean", "Min", "Mul", "Or", "Sum", "Xor"}
 )
-"""The standard operators whose operands may change places, up to rounding."""
+"""The standard operators whose operands may be swapped, up to rounding."""
 
 
 class Pattern(abc.ABC):
-    """An expression that a value may match; compared by identity."""
+    """A pattern that a value may match; compared by identity."""
 
     @abc.abstractmethod
     def ways(self, value: ir.Value) -> Iterator["Way"]:
-        """Walk the ways in which a value may be this: what must match then."""
+        """Yield the ways in which a value may match, with what must match then."""
 
     def roots(self) -> frozenset[str]:
-        """List the types of the operators that can end the expression.
+        """Return the types of the operators that can end the pattern.
 
         Raises:
             GraphError: it does not end in an operator, so nothing could be replaced.
@@ -57,12 +57,12 @@ Goal: TypeAlias = tuple[Pattern, ir.Value]
 
 @dataclasses.dataclass(frozen=True)
 class Way:
-    """What has to match besides, and the nodes that this takes in.
+    """One way to match a value.
 
     Attributes:
-        goals: the patterns of the operands, each with its value.
-        nodes: the nodes taken in, the last one first.
-        inner: the values that these nodes make for the expression alone.
+        goals: the patterns of the operands, with the values that must match them.
+        nodes: the matched nodes, the last one first.
+        inner: the outputs of these nodes, which only the pattern may read.
     """
 
     goals: tuple[Goal, ...] = ()
@@ -72,26 +72,26 @@ class Way:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Variable(Pattern):
-    """Any value; one that is computed, if asked."""
+    """Any value; with ``computed``, any that is not a constant."""
 
     name: str
     computed: bool = False
 
     def ways(self, value: ir.Value) -> Iterator[Way]:
-        """Accept the value as it is."""
+        """Match the value itself."""
         if not (self.computed and array_of(value) is not None):
             yield Way()
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Constant(Pattern):
-    """A weight, of one element if asked."""
+    """A constant; with ``scalar``, of one element; with ``floating``, of floats."""
 
     scalar: bool = False
     floating: bool = True
 
     def ways(self, value: ir.Value) -> Iterator[Way]:
-        """Accept a weight whose type and size fit."""
+        """Match a constant whose type and size fit."""
         if self.floating and value.dtype not in FLOATS:
             return
         array = array_of(value)
@@ -101,18 +101,18 @@ class Constant(Pattern):
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class OperatorPattern(Pattern):
-    """A node of one of some types, with operands that match."""
+    """A node of one of some types whose operands match; ``more`` may follow them."""
 
     types: tuple[str, ...]
     inputs: tuple[Pattern, ...] = ()
     more: bool = False
 
     def roots(self) -> frozenset[str]:
-        """List its own types."""
+        """Return its own types."""
         return frozenset(self.types)
 
     def ways(self, value: ir.Value) -> Iterator[Way]:
-        """Look at the maker; try the operands in each order that means the same."""
+        """Match the maker of the value, with its operands in all equivalent orders."""
         node = maker(value, *self.types)
         if node is None or value.index() != 0:
             return
@@ -121,28 +121,26 @@ class OperatorPattern(Pattern):
             yield Way(goals, (node,), (value,))
 
     def _orders(self, node: ir.Node) -> Iterator[tuple[ir.Value, ...]]:
-        given = list(node.inputs)
-        while given and given[-1] is None:
-            given.pop()
+        inputs = list(node.inputs)
+        while inputs and inputs[-1] is None:
+            inputs.pop()
         if self.more:
-            given = given[: len(self.inputs)]
-        operands = tuple(value for value in given if value is not None)
-        if not len(operands) == len(given) == len(self.inputs):
+            inputs = inputs[: len(self.inputs)]
+        operands = tuple(value for value in inputs if value is not None)
+        if not len(operands) == len(inputs) == len(self.inputs):
             return
-        if node.op_type in _IN_ANY_ORDER:
-            yield from itertools.permutations(operands)
-        else:
-            yield operands
+        any_order = node.op_type in _IN_ANY_ORDER
+        yield from itertools.permutations(operands) if any_order else [operands]
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Either(Pattern):
-    """The first of some expressions that matches."""
+    """The first of several patterns that matches."""
 
     options: tuple[Pattern, ...]
 
     def roots(self) -> frozenset[str]:
-        """Unite those of the options."""
+        """Return those of all options."""
         return frozenset().union(*(option.roots() for option in self.options))
 
     def ways(self, value: ir.Value) -> Iterator[Way]:
@@ -157,10 +155,7 @@ def var(name: str, *, computed: bool = False) -> Variable:
 
 
 def constant(*, scalar: bool = False, floating: bool = True) -> Constant:
-    """Build the pattern of a weight, of floats unless ``floating`` is False.
-
-    ``scalar`` weights have one element.
-    """
+    """Build the pattern of a constant, as :class:`Constant` says."""
     return Constant(scalar, floating)
 
 
@@ -169,28 +164,25 @@ def op(
 ) -> OperatorPattern:
     """Build the pattern of the first output of an operator, or of one of several.
 
-    ``more`` operands may follow that the pattern does not look at.
+    With ``more``, the operator may have more operands, which may be anything.
     """
     names = (types,) if isinstance(types, str) else types
     return OperatorPattern(names, inputs, more)
 
 
 def either(*options: Pattern) -> Either:
-    """Build the pattern of one of several expressions, tried in this order."""
+    """Build the pattern of the first of several patterns that matches."""
     return Either(options)
-
-
-# The search for an expression in a graph.
 
 
 @dataclasses.dataclass(frozen=True)
 class Match:
-    """Where an expression was found.
+    """The nodes and values that match a pattern.
 
     Attributes:
         root: the last node.
-        nodes: every node of it, the root first.
-        values: what stands for each part of the expression.
+        nodes: all matched nodes, the root first.
+        values: the matched value of every part of the pattern.
     """
 
     root: ir.Node
@@ -198,18 +190,18 @@ class Match:
     values: dict[Pattern, ir.Value]
 
     def __getitem__(self, part: Pattern) -> ir.Value:
-        """Return the value that a part of the expression stands for."""
+        """Return the value that matched a part."""
         return self.values[part]
 
     def __contains__(self, part: Pattern) -> bool:
-        """Return whether the match took this part, of several that it could."""
+        """Return whether a part matched; of alternatives, only one does."""
         return part in self.values
 
     def node(self, part: Pattern) -> ir.Node:
-        """Return the node that makes what a part stands for.
+        """Return the node that makes the value of a part.
 
         Raises:
-            GraphError: nothing makes it, it is an input or a weight.
+            GraphError: no node makes it: it is an input or a weight.
         """
         producer = self.values[part].producer()
         if producer is None:
@@ -233,7 +225,7 @@ class Match:
 
 
 def match(pattern: Pattern, node: ir.Node) -> Match | None:
-    """Find an expression that ends in a node; None if none does."""
+    """Match a pattern that ends in a node; None if it does not match."""
     if any(is_read(value) for value in node.outputs[1:]):
         return None
     return _solve(((pattern, node.outputs[0]),), Match(node, (), {}), ())
@@ -242,9 +234,9 @@ def match(pattern: Pattern, node: ir.Node) -> Match | None:
 def _solve(
     goals: tuple[Goal, ...], match: Match, inner: tuple[ir.Value, ...]
 ) -> Match | None:
-    """Match the first goal in each of its ways until the rest matches too."""
+    """Match the first goal in all its ways until the other goals match too."""
     if not goals:
-        # Nothing else may read what the inner nodes make
+        # No other node may read the outputs of inner nodes
         last = match.root.outputs[0]
         closed = all(value is last or _is_inside(value, match) for value in inner)
         return match if closed else None

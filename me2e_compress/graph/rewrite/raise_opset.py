@@ -1,4 +1,4 @@
-"""Graphs of an older opset, written in a newer one node by node."""
+"""Convert a graph to another opset node by node."""
 
 from collections.abc import Sequence
 
@@ -11,10 +11,10 @@ from me2e_compress.graph.nodes import (
     STANDARD,
     array_of,
     bodies,
+    converted_opset,
     has_subgraph,
     is_standard,
     opset_of,
-    written,
 )
 from me2e_compress.graph.rewrite.edits import (
     add_constant,
@@ -40,10 +40,7 @@ OLDEST_OPSET = 13
 
 
 def raise_opset(model: ir.Model, opset: int, by: str) -> tuple[int, str]:
-    """Write a graph in a newer opset; return the changes, and why it stays if it does.
-
-    See :func:`write_in`.
-    """
+    """Convert a graph to a newer opset: see :func:`write_in`."""
     if opset > (known := onnx.defs.onnx_opset_version()):
         return 0, f"onnx {onnx.__version__} converts to {known} at most"
     before = min(opset, opset_of(model))
@@ -53,19 +50,19 @@ def raise_opset(model: ir.Model, opset: int, by: str) -> tuple[int, str]:
 def write_in(
     model: ir.Model, before: int, opset: int, by: str, *, one_by_one: bool = False
 ) -> tuple[int, str]:
-    """Write a graph in another opset; return the changes, and why it stays if it does.
+    """Convert a graph to another opset; return the changes, and why there are none.
 
-    Operators that did not change in between stay, others are converted by ONNX's
-    version converter, one by one, so that names, metadata and plugins stay. Functions
-    are taken along, as they are. Nothing changes unless every node can be written, and
-    those of functions stay the same. ``before`` is the newest opset that is imported;
-    ``one_by_one`` takes no other operator or inputs: the result cannot be proven.
+    Operators that did not change in between stay; others are converted by ONNX's
+    version converter, one by one, so that names, metadata and plugins stay. Nodes of
+    functions must need no change. Nothing changes unless every node can be converted.
+    ``before`` is the newest imported opset. ``one_by_one`` refuses nodes that become
+    another operator or several, for results that are not proven afterwards.
     """
     changed = [
         (node, own, after, body is not model.graph)
         for body, own in bodies(model)
         for node in body.all_nodes()
-        if _changes(node, own, after := written(own, before, opset))
+        if _changes(node, own, after := converted_opset(own, before, opset))
     ]
     if changed:
         infer_shapes(model)
@@ -94,14 +91,15 @@ def write_in(
     for body, _ in bodies(model):
         for domain in STANDARD:
             if imported := body.opset_imports.get(domain, 0):
-                body.opset_imports[domain] = written(imported, before, opset)
+                new = converted_opset(imported, before, opset)
+                body.opset_imports[domain] = new
     return len(made) + 1, ""
 
 
 def _changes(node: ir.Node, own: int, after: int) -> bool:
-    """Return whether a standard operator is another one in another opset.
+    """Return whether a standard operator differs between two opsets.
 
-    If and Loop take more types, and Scan had an axis of batches.
+    If and Loop only take more types; Scan had an axis of batches.
     """
     if has_subgraph(node) and (node.op_type != "Scan" or own >= _SCAN_AS_IS):
         return False
@@ -110,9 +108,9 @@ def _changes(node: ir.Node, own: int, after: int) -> bool:
 
 
 def alone(node: ir.Node, opset: int) -> onnx.ModelProto:
-    """Build a model of one node without names; unknown types are taken for float32.
+    """Build a model of one node without its name; unknown types become float32.
 
-    Its values are called after their place, ``i0`` and ``o0`` first.
+    Its values are named by position: ``i0``, ``i1``, ..., ``o0``, ...
     """
     inputs = list(dict.fromkeys(value for value in node.inputs if value is not None))
     outputs = _named(node.outputs)
@@ -148,7 +146,7 @@ def _operators(graph: onnx.GraphProto) -> list[tuple[str, ...]]:
 
 
 def _not_converted(node: ir.Node, before: int) -> str:
-    """Return why a node cannot be trusted to the converter, which would take it."""
+    """Return why the converter, which accepts a node, converts it wrongly; or ""."""
     if has_subgraph(node):
         return "Scan of opset 8 has a batch"
     if node.op_type == "Hardmax":
@@ -156,23 +154,23 @@ def _not_converted(node: ir.Node, before: int) -> str:
     if node.op_type != "Resize" or before >= _RESIZE_AS_IS:
         return ""
     scales = _scales(node)
-    if not scales or (max(scales) > 1 and min(scales) < 1):
-        return "it enlarges and shrinks"
-    return ""
+    both = not scales or (max(scales) > 1 and min(scales) < 1)
+    return "it enlarges and shrinks" if both else ""
 
 
 def _scales(node: ir.Node) -> list[float]:
     array = array_of(node.inputs[1]) if len(node.inputs) > 1 else None
-    return [] if array is None else [float(each) for each in array]
+    return [] if array is None else [float(scale) for scale in array]
 
 
 def _replace(
     node: ir.Node, instead: ir.Graph, before: int, names: set[str], by: str
 ) -> None:
-    """Put the nodes of a small graph in the place of one, with its names and origin."""
+    """Replace a node by the nodes of a small graph, with its names and origin."""
     graph = node.graph
     if not isinstance(graph, ir.Graph):
         raise TypeError(f"{node.name} is not in a graph")
+    # Read the inputs of the node, and weights of its graph
     outer = dict.fromkeys(value for value in node.inputs if value is not None)
     for inner, value in zip(list(instead.inputs), outer, strict=True):
         inner.replace_all_uses_with(value)
@@ -181,6 +179,7 @@ def _replace(
             array = inner.const_value.numpy()
             label = f"{node.name}_{inner.name}"
             inner.replace_all_uses_with(add_constant(graph, array, label, names))
+    # Move the nodes; the last of the same operator keeps the name
     nodes, results = list(instead), list(instead.outputs)
     instead.outputs.clear()
     instead.remove(nodes)

@@ -35,15 +35,15 @@ class JoinedStack:
     """A stack of several files, joined into one graph.
 
     Attributes:
-        parts: the files by part, as the TOML lists them.
-        order: the parts, each behind those that feed it.
-        sources: what feeds each input of a part: an output of another, or an input of
-            the stack.
-        outputs: those of all parts.
-        inputs: those of the stack; parts that share a name share the input.
-        names: the name in the graph of each output: ``NAME``, or ``PART.NAME`` where
-            two parts have it, or an input of the stack.
-        recurrent: ``{input: output}`` of what is fed back at the next frame.
+        parts: the files by part, in the order of the TOML.
+        order: the parts in topological order.
+        sources: the source of every input of a part: an output of another part, or an
+            input of the stack.
+        outputs: the outputs of all parts.
+        inputs: the inputs of the stack; parts that share a name share the input.
+        names: the name in the graph of every output: ``NAME``, or ``PART.NAME`` if two
+            parts, or an input of the stack, have that name.
+        recurrent: ``{input: output}`` of states, which are fed back at the next frame.
         model: the graph.
     """
 
@@ -52,7 +52,7 @@ class JoinedStack:
         self.outputs = [
             End(part, name) for part, file in parts.items() for name in file.outputs
         ]
-        # What feeds what, in which order
+        # The sources of inputs, and the order of the parts
         edges = {
             taker: self._output(output, f"[edges] {text}")
             for text, output in content.edges.items()
@@ -72,7 +72,7 @@ class JoinedStack:
         }
         self.order = self._order()
         self.inputs = self._inputs()
-        # The outputs of the stack, and those that come back
+        # Names of the outputs, and the states
         counts = Counter(end.name for end in self.outputs)
         self.names = {
             end: end.name
@@ -82,7 +82,7 @@ class JoinedStack:
         }
         self.recurrent = self._recurrent(state)
         self._check_connected()
-        # One graph, whose metadata say what comes back
+        # One graph, with the states in its metadata
         self.model = _merged(self)
         pairs = {name: self.recurrent.get(name) for name in self.inputs}
         self.model.metadata_props.update(_metadata(parts) | content.metadata)
@@ -111,7 +111,7 @@ class JoinedStack:
         return tuple(file.path for file in self.parts.values())
 
     def feeds(self) -> Iterator[tuple[str, str, str, str]]:
-        """Yield part, input, source and form of what is fed, in the order of runs.
+        """Yield part, input, source and type of every input, in topological order.
 
         A source is an output (``backbone.feats``), ``frames`` or ``state: OUTPUT``.
         """
@@ -130,12 +130,10 @@ class JoinedStack:
         return (part.outputs if output else part.inputs)[end.name]
 
     def _ends(self, text: str, where: str, *, outputs: bool = False) -> list[End]:
-        """Find the inputs or outputs of a text: all of a name, or ``PART.NAME``."""
-        ends = self.outputs
-        if not outputs:
-            ends = [
-                End(part, n) for part, file in self.parts.items() for n in file.inputs
-            ]
+        """Return the inputs or outputs of a text: all of a name, or ``PART.NAME``."""
+        parts = self.parts.items()
+        inputs = [End(part, name) for part, file in parts for name in file.inputs]
+        ends = self.outputs if outputs else inputs
         matches = [end for end in ends if end.name == text]
         matches = matches or [end for end in ends if str(end) == text]
         if not matches:
@@ -144,7 +142,7 @@ class JoinedStack:
         return matches
 
     def _output(self, text: str, where: str) -> End:
-        """Find the one output of a text."""
+        """Return the only output of a text, or raise a GraphError."""
         end, *others = self._ends(text, where, outputs=True)
         if others:
             raise _ambiguous(where, text, [end, *others])
@@ -153,7 +151,7 @@ class JoinedStack:
     def _source(
         self, taker: End, edges: Mapping[End, End], state: Mapping[End, str]
     ) -> End:
-        # Edges come first, then state, then an output of the same name
+        """Return the source of an input: an edge, a state or an output of that name."""
         if taker in edges:
             return edges[taker]
         declared = self.parts[taker.part].recurrent().get(taker.name)
@@ -166,7 +164,7 @@ class JoinedStack:
         return givers[0]
 
     def _order(self) -> tuple[str, ...]:
-        """Sort the parts by what feeds them; refuse misfits and cycles."""
+        """Sort the parts topologically; refuse cycles and types that do not fit."""
         waits: dict[str, list[str]] = {part: [] for part in self.parts}
         for taker, source in self.sources.items():
             if not source.part:
@@ -188,6 +186,7 @@ class JoinedStack:
             ) from error
 
     def _inputs(self) -> dict[str, SessionPort]:
+        """Return the inputs of the stack; parts that share one must agree on it."""
         first = dict[str, End]()
         for taker, source in self.sources.items():
             if source.part:
@@ -203,7 +202,7 @@ class JoinedStack:
         return {name: self._port(end) for name, end in first.items()}
 
     def _recurrent(self, state: Mapping[End, str]) -> dict[str, str]:
-        """Pair inputs with the outputs that come back to them at the next frame."""
+        """Pair inputs with the outputs that are fed back to them at the next frame."""
         names = self.names
         outputs = {names[end]: self._port(end, output=True) for end in self.outputs}
         # Metadata of the files come first; [state] overrides them
@@ -297,14 +296,11 @@ def _metadata(parts: Parts) -> dict[str, str]:
     return merged
 
 
-# The graphs of the parts, moved into one.
-
-
 def _merged(stack: JoinedStack) -> ir.Model:
     """Return one graph of all parts.
 
-    Its inputs are those of the stack, its outputs all that a part gives. Other names
-    that two parts have get the part in front: ``head.w``, and ``/head/Mul`` for
+    Its inputs are those of the stack, its outputs those of all parts. Other names that
+    occur in two parts are prefixed by the part: ``head.w``, and ``/head/Mul`` for
     ``/Mul``. Weights are shared with the files' graphs, not copied.
     """
     parts, names, inputs = stack.parts, stack.names, stack.inputs
@@ -355,7 +351,7 @@ def _merged(stack: JoinedStack) -> ir.Model:
 
 
 def _outputs(graph: ir.Graph, file: Part) -> list[ir.Value]:
-    """List the outputs, behind an Identity where no node gives one: it has no name."""
+    """List the outputs; those that no node makes get an Identity, to be renamed."""
     outputs = list[ir.Value]()
     for value in list(graph.outputs):
         if graph.outputs.count(value) > 1:
@@ -371,16 +367,13 @@ def _outputs(graph: ir.Graph, file: Part) -> list[ir.Value]:
 
 
 def _rename_apart(models: Mapping[str, ir.Model], public: Collection[str]) -> None:
-    """Put the part in front of names of inner values and nodes that others have too."""
+    """Prefix names of inner values and nodes that occur in several parts."""
 
     def apart(
         named: Mapping[str, list[ir.Value] | list[ir.Node]], reserved: Collection[str]
     ) -> None:
-        seen = Counter(
-            name
-            for items in named.values()
-            for name in {item.name for item in items if item.name}
-        )
+        per_part = ({item.name for item in items} for items in named.values())
+        seen = Counter(name for names in per_part for name in names if name)
         used = {*seen, *reserved}
         for part, items in named.items():
             known = dict[str, str]()
@@ -415,7 +408,7 @@ def _inner_values(model: ir.Model) -> Iterator[ir.Value]:
 
 
 def _functions(models: Mapping[str, ir.Model]) -> list[ir.Function]:
-    """Collect the functions; one that differs from another's is renamed."""
+    """Collect the functions; of two that differ under one name, rename the second."""
     known = dict[ir.OperatorIdentifier, ir.Function]()
     for part, model in models.items():
         for key, function in list(model.functions.items()):
@@ -436,7 +429,7 @@ def _text(function: ir.Function) -> bytes:
 
 
 def _write_one_opset(parts: Parts, models: Mapping[str, ir.Model]) -> None:
-    """Write every part in the newest opset of all, or refuse."""
+    """Convert every part to the newest opset of all, or raise a GraphError."""
     opsets = {part: opset_of(model) for part, model in models.items()}
     newest = max(opsets, key=opsets.__getitem__)
     for part, opset in opsets.items():

@@ -1,4 +1,4 @@
-"""Cut one graph into the files of the stack that it was joined from."""
+"""Split a graph into the files of the stack that it was joined from."""
 
 from collections.abc import Mapping
 
@@ -15,24 +15,20 @@ Values = Mapping[str, ir.Value]
 def split_stack(stack: JoinedStack, model: ir.Model) -> dict[str, ir.Model]:
     """Return the graph of every part of a joined graph that passes changed.
 
-    A part is what computes its outputs from its inputs, both under the names that its
-    file has: whoever runs the files one by one can go on. A constant that two parts
-    read stands in both. Inputs and outputs that a pass took away are missing, and so is
-    a part without any output. Metadata that are new since the files were joined are
-    written into every part.
+    A part consists of the nodes between its inputs and outputs, which have the names of
+    its file, so that the files can still be run one by one. A constant that two parts
+    read is in both. Inputs and outputs that a pass removed are missing, and so is a
+    part without outputs. Metadata that were added after joining are in every part.
 
     Raises:
-        GraphError: a part would need what another part computes and does not give.
+        GraphError: a part needs a value that another part computes and does not output.
     """
-    before = stack.model.metadata_props
-    added = {
-        key: text
-        for key, text in model.metadata_props.items()
-        if before.get(key) != text
-    }
-    ends = {
-        str(value.name): value for value in (*model.graph.inputs, *model.graph.outputs)
-    }
+    before, ports = (
+        stack.model.metadata_props,
+        (*model.graph.inputs, *model.graph.outputs),
+    )
+    added = {k: v for k, v in model.metadata_props.items() if before.get(k) != v}
+    ends = {str(value.name): value for value in ports}
     models = dict[str, ir.Model]()
     for part, file in stack.parts.items():
         sources = {name: stack.sources[End(part, name)] for name in file.inputs}
@@ -54,7 +50,7 @@ def split_stack(stack: JoinedStack, model: ir.Model) -> dict[str, ir.Model]:
 
 
 def _cut(model: ir.Model, file: Part, inputs: Values, outputs: Values) -> ir.Model:
-    """Copy what lies between a part's inputs and its outputs, by its file's names."""
+    """Copy the nodes between a part's inputs and outputs, with its file's names."""
     borders = list(dict.fromkeys(inputs.values()))
     # The nodes and weights that compute the outputs
     needed, weights = set[ir.Node](), dict[ir.Value, None]()
@@ -95,7 +91,7 @@ def _rename(graph: ir.Graph, file: Part, inputs: Values, outputs: Values) -> Non
     others = {str(v.name): v for v in (*graph.initializers.values(), *inner)}
 
     def name_it(value: ir.Value, name: str) -> None:
-        # An inner value of that name gives way
+        # Rename an inner value of that name
         other = others.get(name)
         if other is not None and other is not value:
             free = f"{name}_"

@@ -34,7 +34,7 @@ class PartEntry(pydantic.BaseModel):
     file: Path
 
     @pydantic.model_validator(mode="after")
-    def _named(self) -> Self:
+    def _check_name(self) -> Self:
         if not _NAME.fullmatch(self.name):
             raise ValueError(f"name {self.name!r}: letters, digits, _ and - alone")
         return self
@@ -73,7 +73,7 @@ class StackFile(pydantic.BaseModel):
         return texts
 
     @pydantic.model_validator(mode="after")
-    def _once(self) -> Self:
+    def _check_names(self) -> Self:
         names = [entry.name for entry in self.part]
         if twice := [name for name in names if names.count(name) > 1]:
             raise ValueError(f"two parts are called {twice[0]}")

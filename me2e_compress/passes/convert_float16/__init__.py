@@ -48,21 +48,18 @@ from me2e_compress.targets.quantized import (
 )
 from me2e_compress.targets.weights import requantized, scales_in
 
-__all__ = ["ConvertFloat16", "hold_scales"]
+__all__ = ["ConvertFloat16", "raise_scales"]
 
 
-# Scales of int8 that float16 holds: none becomes 0, or loses its digits.
-
-
-def hold_scales(model: ir.Model, narrow: set[ir.Node]) -> None:
-    """Raise scales that float16 lacks, and round their stored integers again.
+def raise_scales(model: ir.Model, narrow: set[ir.Node]) -> None:
+    """Raise int8 scales too small for float16, and round their stored integers again.
 
     Given:   y = DequantizeLinear(q, s)              s float32 [channels], some 1e-9
     Result:  y = DequantizeLinear(q', s')            s' at least 6e-8, q' for s'
 
-    A channel whose weights are nearly 0 has such scales; TensorRT takes none of 0. Both
-    nodes of a pair get the same ones, if one of them is ``narrow``. Nodes are changed
-    in place; scales that float16 holds stay as they are.
+    A channel whose weights are nearly 0 has such scales; TensorRT refuses a scale of 0.
+    Both nodes of a pair get the same scales, if one of them is ``narrow``. Nodes are
+    changed in place; scales that fit float16 stay as they are.
     """
     names = rewrite.value_names(model.graph)
     fresh: dict[ir.Value, ir.Value] = {}
@@ -86,9 +83,8 @@ def hold_scales(model: ir.Model, narrow: set[ir.Node]) -> None:
         if np.array_equal(raised, exact):
             continue
         if scale not in fresh:
-            fresh[scale] = rewrite.add_constant(
-                model.graph, raised, f"{scale.name}_held", names
-            )
+            name = f"{scale.name}_held"
+            fresh[scale] = rewrite.add_constant(model.graph, raised, name, names)
         # Integers that are stored are rounded again
         value = node.inputs[0]
         integers = array_of(value)
@@ -97,8 +93,8 @@ def hold_scales(model: ir.Model, narrow: set[ir.Node]) -> None:
             zero = array_of(input_at(node, 2))
             again = requantized(integers, exact, raised, axis, zero)
             name = f"{value.name}_held"
-            held = rewrite.add_constant(model.graph, again, name, names)
-            node.replace_input_with(0, held)
+            rounded = rewrite.add_constant(model.graph, again, name, names)
+            node.replace_input_with(0, rounded)
         node.replace_input_with(1, fresh[scale])
     rewrite.sweep(model)
 
@@ -149,7 +145,7 @@ class ConvertFloat16(Pass):
             wide |= dict.fromkeys(_matches(model, pattern), "the option keeps it")
         # Everything else that can be float16 becomes float16
         narrow = [n for n in model.graph if n not in wide and types.inputs(n)]
-        hold_scales(model, set(narrow))
+        raise_scales(model, set(narrow))
         retyping = Retyping(model, types, self.name)
         retyping.run(narrow)
         reasons = Counter(
@@ -169,19 +165,13 @@ class ConvertFloat16(Pass):
         return PassResult(model, retyping.changed, tuple(notes))
 
 
-# The nodes that stay in float32, and why.
-
-
 def _matches(model: ir.Model, pattern: str) -> list[ir.Node]:
     """Return the nodes whose name, operator or module a glob matches; at least one."""
-    nodes = [
-        node
-        for node in model.graph
-        if any(
-            fnmatch.fnmatchcase(word or "", pattern)
-            for word in (node.name, node.op_type, provenance.module_of(node))
-        )
-    ]
+
+    def words(node: ir.Node) -> list[str]:
+        return [node.name or "", node.op_type, provenance.module_of(node)]
+
+    nodes = [node for node in model.graph if fnmatch.filter(words(node), pattern)]
     if not nodes:
         raise PreconditionError(f"keep: no node, operator or module is {pattern!r}")
     return nodes
@@ -314,14 +304,11 @@ def _by_ranges(
         return {}
     ranges = Calibrator(provider=provider).run(model, tuple(touched), frames).tensors
     # Keep a factor of headroom for frames that were not measured
-    large = {
-        name: max(-low, high)
-        for name, (low, high) in ranges.items()
-        if max(-low, high) * HEADROOM > LARGEST
-    }
+    reaches = {name: max(-low, high) for name, (low, high) in ranges.items()}
     return {
         node: f"numbers up to {reach:.3g}"
-        for name, reach in large.items()
+        for name, reach in reaches.items()
+        if reach * HEADROOM > LARGEST
         for node in touched[name]
     }
 

@@ -70,14 +70,12 @@ class ElementTypes:
         schema = self._schema(node)
         if schema is None or index >= _FIRST_ONLY.get(node.op_type, index + 1):
             return None
-        name = str(_formal(schema.inputs, index).type_str)
-        allowed = {
-            kind
+        name, wanted = str(_formal(schema.inputs, index).type_str), _ONNX[self.wanted]
+        allowed = any(
+            constraint.type_param_str == name and wanted in constraint.allowed_type_strs
             for constraint in schema.type_constraints
-            if constraint.type_param_str == name
-            for kind in constraint.allowed_type_strs
-        }
-        return name if _ONNX[self.wanted] in allowed else None
+        )
+        return name if allowed else None
 
     def _schema(self, node: ir.Node) -> onnx.defs.OpSchema | None:
         if not is_standard(node) or node.op_type in _BY_TYPE or has_subgraph(node):
@@ -103,12 +101,10 @@ class Retyping:
     """Changes the element type of nodes in place, with Casts at the borders."""
 
     def __init__(self, model: ir.Model, types: ElementTypes, by: str) -> None:
-        self._graph = model.graph
-        self._types = types
-        self._by = by
-        self._names = rewrite.value_names(model.graph)
+        self._graph, self._types, self._by = model.graph, types, by
         # onnxruntime refuses two nodes of one name
-        self._names.update(node.name or "" for node in model.graph)
+        node_names = {node.name or "" for node in model.graph}
+        self._names = rewrite.value_names(model.graph) | node_names
         self._casts: dict[tuple[ir.Value, ir.DataType], ir.Value] = {}
         self.changed = 0
 
@@ -142,7 +138,7 @@ class Retyping:
                 self.changed += 1
         # Insert Casts for the readers, then for the graph outputs
         for value, users in uses.items():
-            self._serve(value, users, wanted)
+            self._cast_for_readers(value, users, wanted)
         self._restore_outputs(results)
 
     def _leave_casts(
@@ -162,7 +158,7 @@ class Retyping:
             if value is None or not (value in results or self._is_constant(value)):
                 wanted.discard((node, 0))
 
-    def _serve(
+    def _cast_for_readers(
         self,
         value: ir.Value,
         users: list[tuple[ir.Node, int]],
@@ -171,7 +167,10 @@ class Retyping:
         """Give the readers of a value their type; a constant of these alone changes."""
         alone = bool(users) and wanted.issuperset(users)
         if self._is_constant(value) and alone and not value.is_graph_output():
-            self._convert(value)
+            array = _converted(value, self._types.wanted)
+            value.const_value = ir.tensor(array, name=value.name)
+            value.type = ir.TensorType(self._types.wanted)
+            self.changed += 1
             return
         for node, index in users:
             kind = self._types.wanted if (node, index) in wanted else self._types.source
@@ -184,9 +183,8 @@ class Retyping:
             return self._casts[value, kind]
         name = f"{value.name}_{kind.name.lower()}"
         if self._is_constant(value):
-            result = rewrite.add_constant(
-                self._graph, _converted(value, kind), name, self._names
-            )
+            array, names = _converted(value, kind), self._names
+            result = rewrite.add_constant(self._graph, array, name, names)
             self._casts[value, kind] = result
             return result
         name = rewrite.fresh_name(name, self._names)
@@ -217,12 +215,6 @@ class Retyping:
 
     def _is_constant(self, value: ir.Value) -> bool:
         return value.is_initializer() and not value.is_graph_input()
-
-    def _convert(self, value: ir.Value) -> None:
-        array = _converted(value, self._types.wanted)
-        value.const_value = ir.tensor(array, name=value.name)
-        value.type = ir.TensorType(self._types.wanted)
-        self.changed += 1
 
 
 def _converted(

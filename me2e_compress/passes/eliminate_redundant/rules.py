@@ -1,11 +1,11 @@
-"""Find nodes that return their input unchanged, and pairs that one node can do.
+"""Rules that remove nodes that return their input, and merge pairs of nodes.
 
-Rules of identities return the value that a node's first output equals, bit for bit, or
-None. Adding +0.0 is not an identity (-0.0 + 0.0 is +0.0); adding -0.0 is, and so is
+A rule of an identity returns the value that a node's first output equals, bit for bit,
+or None. Adding +0.0 is not an identity (-0.0 + 0.0 is +0.0); adding -0.0 is, and so is
 subtracting +0.0.
 
-Rules of pairs rewrite the graph around a node and return the node to look at again (the
-node itself, now unread, where nothing is left of it), or None where they do not apply.
+A rule of a pair rewrites the graph around a node and returns the node to visit next
+(the node itself, now unread, if it was removed), or None where it does not apply.
 """
 
 import dataclasses
@@ -32,8 +32,6 @@ from me2e_compress.graph.nodes import (
     sole_reader,
 )
 from me2e_compress.graph.rewrite import add_constant, bypass, put, value_names
-
-# Nodes that return their input.
 
 Identity = Callable[[ir.Node, int], ir.Value | None]
 
@@ -79,9 +77,7 @@ def _transpose(node: ir.Node, opset: int) -> ir.Value | None:
     order = permutation_of(node)
     if order is not None and order == sorted(order):
         return node.inputs[0]
-    if moves_nothing(node) and same_shape(node.inputs[0], node.outputs[0]):
-        return node.inputs[0]
-    return None
+    return _if_same_shape(node, opset) if moves_nothing(node) else None
 
 
 def moves_nothing(node: ir.Node) -> bool:
@@ -94,10 +90,9 @@ def moves_nothing(node: ir.Node) -> bool:
 
 
 def _slice(node: ir.Node, opset: int) -> ir.Value | None:
-    if input_at(node, 4) is not None:
-        steps = integers_of(input_at(node, 4))
-        if steps is None or any(step != 1 for step in steps):
-            return None
+    steps = input_at(node, 4)
+    if steps is not None and {*(integers_of(steps) or (0,))} != {1}:
+        return None
     return _if_same_shape(node, opset) or _sliced_part(node)
 
 
@@ -219,8 +214,6 @@ IDENTITIES: dict[str, Identity] = {
 }
 
 
-# Pairs that one node can do.
-
 _RESHAPING = VIEWS - {"Identity"}
 
 BROADCASTING = frozenset({*ELEMENTWISE, "Where"})
@@ -264,30 +257,21 @@ Rule = Callable[[ir.Node, MergeSite], ir.Node | None]
 
 def merge(node: ir.Node, site: MergeSite) -> ir.Node | None:
     """Merge a node with the one before it, if one node can do both."""
-    if not is_standard(node):
-        return None
-    if node.op_type in BROADCASTING:
-        return _drop_expand(node, site)
-    if node.op_type in _RESHAPING or node.op_type == "Transpose":
-        return _views(node, site) or (
-            _transposes(node, site) if node.op_type == "Transpose" else None
-        )
-    rule = PAIRS.get(node.op_type)
-    return None if rule is None else rule(node, site)
+    rules = PAIRS.get(node.op_type, ()) if is_standard(node) else ()
+    return next(filter(None, (rule(node, site) for rule in rules)), None)
 
 
 def _before(node: ir.Node, index: int = 0) -> ir.Node | None:
+    """Return the standard node of the same graph that makes an input."""
     value = node.inputs[index]
     inner = None if value is None else value.producer()
-    if inner is None or not is_standard(inner) or inner.graph is not node.graph:
-        return None
-    return inner
+    own = inner is not None and is_standard(inner) and inner.graph is node.graph
+    return inner if own else None
 
 
 def _is_view(node: ir.Node) -> bool:
-    if node.op_type == "Transpose":
-        return moves_nothing(node)
-    return node.op_type in _RESHAPING
+    transposes = node.op_type == "Transpose"
+    return moves_nothing(node) if transposes else node.op_type in _RESHAPING
 
 
 def _views(node: ir.Node, site: MergeSite) -> ir.Node | None:
@@ -322,10 +306,8 @@ def _transposes(node: ir.Node, site: MergeSite) -> ir.Node | None:
         return node
     if sole_reader(inner.outputs[0]) is None:
         return None
-    attributes, sources = {"perm": perm}, [inner]
-    return put(
-        node, "Transpose", [source], by=site.by, sources=sources, attributes=attributes
-    )
+    by, sources, options = site.by, [inner], {"perm": perm}
+    return put(node, "Transpose", [source], by=by, sources=sources, attributes=options)
 
 
 def _casts(node: ir.Node, site: MergeSite) -> ir.Node | None:
@@ -347,7 +329,7 @@ def _casts(node: ir.Node, site: MergeSite) -> ir.Node | None:
 def _concats(node: ir.Node, site: MergeSite) -> ir.Node | None:
     axis = node.attributes.get_int("axis", 0)
     inputs: list[ir.Value | None] = []
-    inner_nodes: list[ir.Node] = []
+    sources: list[ir.Node] = []
     # Take in the operands of Concats that nothing else reads
     for index, value in enumerate(node.inputs):
         inner = _before(node, index)
@@ -358,15 +340,13 @@ def _concats(node: ir.Node, site: MergeSite) -> ir.Node | None:
             and sole_reader(inner.outputs[0]) is node
         ):
             inputs.extend(inner.inputs)
-            inner_nodes.append(inner)
+            sources.append(inner)
         else:
             inputs.append(value)
-    if not inner_nodes:
+    if not sources:
         return None
-    options = {"axis": axis}
-    return put(
-        node, "Concat", inputs, by=site.by, sources=inner_nodes, attributes=options
-    )
+    by, options = site.by, {"axis": axis}
+    return put(node, "Concat", inputs, by=by, sources=sources, attributes=options)
 
 
 def _drop_expand(node: ir.Node, site: MergeSite) -> ir.Node | None:
@@ -396,4 +376,11 @@ def _drop_expand(node: ir.Node, site: MergeSite) -> ir.Node | None:
     return None
 
 
-PAIRS: dict[str, Rule] = {"Cast": _casts, "Concat": _concats}
+PAIRS: dict[str, tuple[Rule, ...]] = {
+    **dict.fromkeys(BROADCASTING, (_drop_expand,)),
+    **dict.fromkeys(_RESHAPING, (_views,)),
+    "Cast": (_casts,),
+    "Concat": (_concats,),
+    "Transpose": (_views, _transposes),
+}
+"""Rules by operator; of several, the first that applies."""

@@ -1,15 +1,13 @@
 """Compute once what does not depend on the inputs.
 
-Choose which constant values become weights and which stay computed.
-
 Folding removes nodes but may add bytes: a table repeated for every token is one node
 and megabytes. A group of connected expressions is folded if it adds at most so many
 bytes for each of its nodes:
 
     bytes stored - bytes of weights that nothing reads any more  <=  limit * nodes
 
-If it adds more, its largest value is computed in every frame, and the rest is grouped
-and asked again. A group that shrinks the weights always goes.
+If it adds more, its largest value stays computed in every frame, and the rest is
+grouped and tested again. A group that shrinks the weights is always folded.
 """
 
 import dataclasses
@@ -52,7 +50,7 @@ ENTRY_BYTES = 64
 
 
 def choose(known: Knowledge, sizes: "_Sizes", bytes_per_node: int) -> list[Expression]:
-    """Choose the constant expressions that are no longer needed; others go on."""
+    """Return the constant expressions to fold, in the order of the graph."""
     gone: set[Expression] = set()
     waiting = sizes.groups(known.expressions)
     while waiting:
@@ -86,7 +84,10 @@ class _Sizes:
         self.weights = {
             value: value.const_value.nbytes + ENTRY_BYTES
             for value in self.readers
-            if value.const_value is not None and self._dies(value)
+            if value.const_value is not None
+            and value.is_initializer()
+            and value not in known.maker
+            and not self._is_read_outside(value)
         }
 
     def growth(self, group: Iterable[Expression]) -> float:
@@ -117,10 +118,8 @@ class _Sizes:
         if isinstance(value.type, ir.SequenceType | ir.OptionalType):
             return math.inf
         array = self.known.arrays.get(value)
-        if array is not None:
-            return array.nbytes + ENTRY_BYTES
-        known = value_bytes(value)
-        return 0 if known is None else known + ENTRY_BYTES
+        size = value_bytes(value) if array is None else array.nbytes
+        return 0 if size is None else size + ENTRY_BYTES
 
     def without_largest(self, group: list[Expression]) -> list[Expression]:
         """Return a group without the makers of its largest stored values."""
@@ -136,8 +135,8 @@ class _Sizes:
         """Group expressions that read each other, or a weight that only they read."""
         parent = {one: one for one in expressions}
 
-        # Union-find over the expressions
         def root(one: Expression) -> Expression:
+            # Union-find with path halving
             while parent[one] is not one:
                 parent[one] = parent[parent[one]]
                 one = parent[one]
@@ -161,18 +160,10 @@ class _Sizes:
         return list(groups.values())
 
     def _is_read_outside(self, value: ir.Value) -> bool:
-        readers = (self._expression(use.node) for use in value.uses())
-        return value.is_graph_output() or None in readers
-
-    def _expression(self, node: ir.Node) -> Expression | None:
-        return self.known.maker.get(node.outputs[0]) if node.outputs else None
-
-    def _dies(self, value: ir.Value) -> bool:
-        return (
-            value.is_initializer()
-            and not value.is_graph_output()
-            and value not in self.known.maker
-            and all(self._expression(use.node) is not None for use in value.uses())
+        """Return whether a graph output, or a node of no expression, is or reads it."""
+        readers = [use.node.outputs for use in value.uses()]
+        return value.is_graph_output() or not all(
+            outputs and outputs[0] in self.known.maker for outputs in readers
         )
 
 
@@ -261,13 +252,11 @@ class FoldConstants(Pass):
         refused: set[ir.Node] = set()
         while True:
             # Collect constant expressions and choose what to store
-            known = Sweep(
-                opset,
-                refused,
-                fresh,
-                through_compute=self.through_compute,
-                trust_shapes=trust,
-            ).run(body)
+            through, learnt = self.through_compute, set(fresh)
+            sweep = Sweep(
+                opset, refused, learnt, through_compute=through, trust_shapes=trust
+            )
+            known = sweep.visit_nodes(body)
             sizes = _Sizes(known)
             gone = choose(known, sizes, self.bytes_per_node)
             values = sizes.stored(gone, set(gone))
@@ -278,10 +267,8 @@ class FoldConstants(Pass):
             refused.update(failed)
             unshaped = [
                 value
-                for value in asked
-                if value in arrays
-                and graphs.static_shape(value) is None
-                and not value.is_graph_output()
+                for value in arrays
+                if graphs.static_shape(value) is None and not value.is_graph_output()
             ]
             if failed or unshaped:
                 for value in () if failed else unshaped:
@@ -289,33 +276,27 @@ class FoldConstants(Pass):
                 continue
             # Write the chosen values into the graph
             growth = int(sizes.growth(gone))
-            known.arrays.update(arrays)
             if not gone:
                 tally.kept += sum(len(one.nodes) for one in known.expressions)
                 return
-            fresh.update(_commit(body, gone, values, known.arrays, self.name))
+            arrays = {**known.arrays, **arrays}
+            fresh.update(_commit(body, gone, values, arrays, self.name))
             tally.folded += sum(len(one.nodes) for one in gone)
             tally.stored += len(values)
             tally.growth_bytes += growth
 
 
 def _notes(tally: _Tally) -> tuple[str, ...]:
-    notes = []
-    if tally.folded:
-        notes.append(
-            f"{plural(tally.folded, 'node')} became"
-            f" {plural(tally.stored, 'initializer')}"
-            f" ({tally.growth_bytes:+,} bytes)"
-        )
-    if tally.inlined:
-        notes.append("branches took the places of Ifs whose conditions are known")
-    if tally.kept:
-        kept = plural(tally.kept, "node")
-        notes.append(f"{kept} left to compute constants: smaller than their values")
-    if tally.refused:
-        what = ", ".join(f"{count} {op}" for op, count in sorted(tally.refused.items()))
-        notes.append(f"onnxruntime cannot evaluate {what}: left as they are")
-    return tuple(notes)
+    nodes, weights = plural(tally.folded, "node"), plural(tally.stored, "initializer")
+    left = plural(tally.kept, "node")
+    refused = ", ".join(f"{count} {op}" for op, count in sorted(tally.refused.items()))
+    notes = (
+        (tally.folded, f"{nodes} became {weights} ({tally.growth_bytes:+,} bytes)"),
+        (tally.inlined, "branches took the places of Ifs whose conditions are known"),
+        (tally.kept, f"{left} left to compute constants: smaller than their values"),
+        (refused, f"onnxruntime cannot evaluate {refused}: left as they are"),
+    )
+    return tuple(note for condition, note in notes if condition)
 
 
 def _commit(
@@ -333,36 +314,33 @@ def _commit(
     leave = {value.name for one in gone for n in one.nodes for value in n.outputs}
     names = value_names(graph) - leave
     stored: dict[bytes, ir.Value] = {}
-    place = {
-        value: (one, index)
+    equals = {
+        outputs[0]: outputs
         for one in gone
-        for index, value in enumerate(one.nodes[0].outputs)
+        for outputs in zip(*(node.outputs for node in one.nodes), strict=True)
     }
     # Store equal values once, for all nodes that compute them
     for value in values:
-        one, index = place[value]
-        is_output = any(node.outputs[index].is_graph_output() for node in one.nodes)
+        is_output = any(equal.is_graph_output() for equal in equals[value])
         label = f"{value.name}_value" if is_output else value.name or ""
-        array = arrays[value]
-        key = digest_of_tensor(ir.tensor(array))
+        key = digest_of_tensor(ir.tensor(arrays[value]))
         if key not in stored:
-            stored[key] = add_constant(graph, array, label, names)
-        weight = stored[key]
-        for node in one.nodes:
-            equal = node.outputs[index]
+            stored[key] = add_constant(graph, arrays[value], label, names)
+        for equal in equals[value]:
             if equal.is_graph_output():
-                _keep_output(graph, node, equal, weight, name)
+                _keep_output(graph, equal, stored[key], name)
             else:
-                equal.replace_all_uses_with(weight)
+                equal.replace_all_uses_with(stored[key])
     # Remove the nodes, readers first
     for one in reversed(gone):
         graph.remove([node for node in one.nodes if node.graph is graph], safe=True)
     return list(stored.values())
 
 
-def _keep_output(
-    graph: ir.Graph, node: ir.Node, value: ir.Value, weight: ir.Value, name: str
-) -> None:
+def _keep_output(graph: ir.Graph, value: ir.Value, weight: ir.Value, name: str) -> None:
+    """Write an Identity that passes a weight on as a graph output."""
+    node = value.producer()
+    assert node is not None
     # A branch may declare another shape than its result has
     if graphs.static_shape(value) is not None:
         value.shape = weight.shape
@@ -389,8 +367,8 @@ def _write_casts(graph: ir.Graph, by: str) -> int:
         if like is None or like.dtype is None or node.domain != "":
             continue
         attributes = {name: each.value for name, each in node.attributes.items()}
-        to = {"to": int(like.dtype)}
-        put(node, "Cast", node.inputs[:1], by=by, attributes={**attributes, **to})
+        attributes["to"] = int(like.dtype)
+        put(node, "Cast", node.inputs[:1], by=by, attributes=attributes)
         count += 1
     return count
 

@@ -1,4 +1,4 @@
-"""The branch of an If whose condition is known takes its place."""
+"""Replace an If whose condition is known by the branch that it takes."""
 
 import onnx_ir as ir
 

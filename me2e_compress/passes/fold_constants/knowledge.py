@@ -47,14 +47,10 @@ class Knowledge:
     ``first`` maps a value that is computed twice to the first value that equals it.
     """
 
-    arrays: dict[ir.Value, Array]
-    expressions: list[Expression]
-    maker: dict[ir.Value, Expression]
-    first: dict[ir.Value, ir.Value]
-
-    def canonical(self, value: ir.Value) -> ir.Value:
-        """Return the first value equal to this one."""
-        return self.first.get(value, value)
+    arrays: dict[ir.Value, Array] = dataclasses.field(default_factory=dict)
+    expressions: list[Expression] = dataclasses.field(default_factory=list)
+    maker: dict[ir.Value, Expression] = dataclasses.field(default_factory=dict)
+    first: dict[ir.Value, ir.Value] = dataclasses.field(default_factory=dict)
 
 
 def evaluate(
@@ -161,9 +157,6 @@ def _node(
     return proto
 
 
-# Shape inference of single nodes, given the data that folding has found.
-
-
 def learn_shapes(
     node: ir.Node, known: Mapping[ir.Value, Array], opset: int, *, answers: bool
 ) -> bool:
@@ -229,31 +222,30 @@ COMPUTE = frozenset(
 """Operators through which folding turns a computation into a weight."""
 
 
+@dataclasses.dataclass
 class Sweep:
     """Walks one graph in order and collects its constant expressions.
 
-    ``refused`` nodes failed in onnxruntime; ``fresh`` initializers are new to ONNX's
-    shape inference; ``trust_shapes`` is False inside loops, where shapes may change.
+    Attributes:
+        opset: of the graph.
+        refused: nodes that failed in onnxruntime.
+        learnt: values whose shape or data ONNX's shape inference did not know.
+        through_compute: whether products and convolutions are constant expressions.
+        trust_shapes: False inside loops, where shapes may change.
+        known: what the walk knows so far.
+        keys: the expressions by operator, inputs and attributes.
     """
 
-    def __init__(
-        self,
-        opset: int,
-        refused: set[ir.Node],
-        fresh: set[ir.Value],
-        *,
-        through_compute: bool,
-        trust_shapes: bool,
-    ) -> None:
-        self.opset = opset
-        self.refused = refused
-        self.through_compute = through_compute
-        self.trust_shapes = trust_shapes
-        self.known = Knowledge({}, [], {}, {})
-        self.learnt = set(fresh)
-        self.keys: dict[object, Expression] = {}
+    opset: int
+    refused: set[ir.Node]
+    learnt: set[ir.Value]
+    _: dataclasses.KW_ONLY
+    through_compute: bool
+    trust_shapes: bool
+    known: Knowledge = dataclasses.field(default_factory=Knowledge)
+    keys: dict[object, Expression] = dataclasses.field(default_factory=dict)
 
-    def run(self, graph: ir.Graph) -> Knowledge:
+    def visit_nodes(self, graph: ir.Graph) -> Knowledge:
         """Visit every node once, producers before readers."""
         for node in graph:
             if self._is_constant(node):
@@ -317,28 +309,23 @@ class Sweep:
 
     def _add(self, node: ir.Node) -> None:
         named = [value for value in node.outputs if value.name]
-        if not all(
-            _is_native(each) and (value_bytes(each) or 0) <= LARGEST for each in named
-        ):
+        if any(not _is_native(v) or (value_bytes(v) or 0) > LARGEST for v in named):
             return
         # Group nodes of equal operator, inputs and attributes
-        inputs = tuple(
-            None if value is None else self.known.canonical(value)
-            for value in node.inputs
-        )
+        first = self.known.first
+        inputs = tuple(value and first.get(value, value) for value in node.inputs)
         key = (node.op_type, inputs, len(node.outputs), attribute_values(node))
-        equal = self.keys.get(key)
-        if equal is None:
-            equal = Expression([], inputs)
-            self.keys[key] = equal
-            self.known.expressions.append(equal)
+        if key not in self.keys:
+            self.keys[key] = Expression([], inputs)
+            self.known.expressions.append(self.keys[key])
+        equal = self.keys[key]
         equal.nodes.append(node)
         # Enter its outputs, with their arrays if they are small
         small = self._evaluate(equal)
-        for first, value in zip(equal.nodes[0].outputs, node.outputs, strict=True):
+        for earliest, value in zip(equal.nodes[0].outputs, node.outputs, strict=True):
             self.known.maker[value] = equal
-            if value is not first:
-                self.known.first[value] = first
+            if value is not earliest:
+                first[value] = earliest
             if small is not None:
                 self.known.arrays[value] = small
                 if value.shape is None and not value.is_graph_output():
@@ -373,9 +360,6 @@ def _shape(node: ir.Node, shape: tuple[int, ...]) -> Array:
         return np.array(math.prod(shape), dtype=np.int64)
     start = node.attributes.get_int("start", 0)
     end = node.attributes.get_int("end", len(shape))
-    rank = len(shape)
-    start = min(max(start + rank if start < 0 else start, 0), rank)
-    end = min(max(end + rank if end < 0 else end, 0), rank)
     return np.array(shape[start:end], dtype=np.int64)
 
 

@@ -99,16 +99,13 @@ def _own_weights(result: ir.Model, model: ir.Model) -> None:
         for name, value in graph.initializers.items():
             tensor = value.const_value
             known = ours[name].const_value if name in ours else None
-            if tensor is None:
-                continue
-            if (
-                known is not None
-                and tensor.dtype == known.dtype
-                and tensor.shape == known.shape
-                and tensor.tobytes() == known.tobytes()
-            ):
+            if known is not None and tensor is not None and _is_equal(tensor, known):
                 value.const_value = known
             elif isinstance(tensor, ir.ExternalTensor):
-                value.const_value = ir.Tensor(
-                    tensor.numpy().copy(), dtype=tensor.dtype, name=name
-                )
+                array = tensor.numpy().copy()
+                value.const_value = ir.Tensor(array, dtype=tensor.dtype, name=name)
+
+
+def _is_equal(one: ir.TensorProtocol, other: ir.TensorProtocol) -> bool:
+    alike = one.dtype == other.dtype and one.shape == other.shape
+    return alike and one.tobytes() == other.tobytes()

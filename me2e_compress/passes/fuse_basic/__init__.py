@@ -48,8 +48,4 @@ class FuseBasic(Pass):
 
     def fusions(self) -> tuple[Fusion, ...]:
         """Return the fusions in the order in which they are tried."""
-        return (
-            *weights.FUSIONS,
-            constants.GEMM,
-            *constants.FUSIONS,
-        )
+        return (*weights.FUSIONS, constants.GEMM, *constants.FUSIONS)

@@ -65,7 +65,7 @@ def _chain(match: Match, kit: Kit) -> str | None:
     return None
 
 
-# Whether any of many conditions is true: torch writes ``count_nonzero(x) > 0`` so. A
+# Whether any condition is true: torch writes ``count_nonzero(x) > 0`` in this form. A
 # sum of ones is above 0 in either type, and onnxruntime's CPU (1.31) adds 2.56 million
 # float32 in 0.2 ms, int64 in 5.
 
@@ -90,17 +90,17 @@ def _add_in_float(match: Match, kit: Kit) -> None:
     kit.put("Greater", [added, kit.constant(zero.astype(np.float32), name)])
 
 
-# Constants of one number get the axes of what they meet, where its last are 1: the
-# result is the same. onnxruntime's CPU (1.31) joins axes of size 1 only as far as both
-# operands have them, and computes one element at a time otherwise: a comparison of
-# 240,000 elements takes 1.39 ms, not 0.03.
+# A constant of one number gets the rank of the other operand if the last axes of that
+# have size 1; the result is the same. onnxruntime's CPU (1.31) merges axes of size 1
+# only if both operands have them, and computes one element at a time otherwise: a
+# comparison of 240,000 elements takes 1.39 ms, not 0.03.
 
 LEAST = 1000
 """Elements that take onnxruntime 6 us one at a time: three starts of a node."""
 
 
 def _slow_scalar(node: ir.Node) -> tuple[int, Array] | None:
-    """Return the operand of one number, and the same with the axes it is to get."""
+    """Return the index of a constant of one number, and that with the other's rank."""
     for index in (0, 1):
         array = array_of(node.inputs[index])
         shape = static_shape(node.inputs[1 - index])

@@ -38,6 +38,7 @@ LEAST_QUERIES, LEAST_KEYS = 8, 64
 WIDEST = 128
 """Channels of a head up to which it is; with 256, it takes the same time."""
 
+_FLOAT = ir.DataType.FLOAT
 _Shape = tuple[int, ...]
 
 
@@ -60,11 +61,11 @@ def fuse_attention(node: ir.Node, call: FusedCall) -> ir.Value | None:
 
     Result:  y = me2e::MultiHeadAttention(q, k, v)
 
-    Where Transposes put the heads of q, k and v into the batch, what they read is taken
-    as it is, and Transposes behind y that undo it go too.
+    Transposes that put the heads of q, k and v into the batch, and those behind y that
+    undo it, are removed too.
     """
     softmax = maker(node.inputs[0], "Softmax")
-    attention = None if softmax is None else _found(node, softmax)
+    attention = None if softmax is None else _match(node, softmax)
     if attention is None or softmax is None:
         return None
     if call.opset < _OPSET:
@@ -72,7 +73,7 @@ def fuse_attention(node: ir.Node, call: FusedCall) -> ir.Value | None:
     return _fused(call, attention, _checked(attention, softmax))
 
 
-def _found(node: ir.Node, softmax: ir.Node) -> _Attention | None:
+def _match(node: ir.Node, softmax: ir.Node) -> _Attention | None:
     """Return the parts of an attention; None if there are not two products."""
     scores, scale = _unscaled(softmax.inputs[0])
     product, value = maker(scores, "MatMul"), node.inputs[1]
@@ -93,7 +94,7 @@ def _found(node: ir.Node, softmax: ir.Node) -> _Attention | None:
 
 
 def _unscaled(value: ir.Value | None) -> tuple[ir.Value | None, float]:
-    """Return what is multiplied by numbers, one after the other, and their product."""
+    """Return a value before it was scaled by constants, and their product."""
     scale, node = 1.0, maker(value, "Mul", "Div")
     while node is not None:
         factor, number = node.inputs[0], scalar_of(node.inputs[1])
@@ -114,22 +115,22 @@ def _checked(attention: _Attention, softmax: ir.Node) -> _Shape:
         raise PreconditionError("its shapes are not known")
     if min(map(len, (query, key, value))) < 2:
         raise PreconditionError("one of its operands is a vector")
-    if any(maker(each, "DequantizeLinear") for each in attention[:3]):
-        raise PreconditionError("its products are int8")
-    if any(each.dtype != ir.DataType.FLOAT for each in attention[:3]):
-        raise PreconditionError("it is not of float32 numbers")
-    count, width = query[-2:]
-    keys = key[-1]
-    if key != (*query[:-2], width, keys) or value != (*query[:-2], keys, width):
-        raise PreconditionError(
-            "query, key and value are of different batches or sizes"
-        )
-    if softmax.attributes.get_int("axis", -1) not in (-1, len(query) - 1):
-        raise PreconditionError("its softmax is not over the last axis")
-    if width > WIDEST:
-        raise PreconditionError(f"a head has more than {WIDEST} channels")
-    if count < LEAST_QUERIES or keys < LEAST_KEYS:
-        raise PreconditionError(f"its queries and keys are few: {count} and {keys}")
+    operands, (*batch, count, width), keys = attention[:3], query, key[-1]
+    like = key == (*batch, width, keys) and value == (*batch, keys, width)
+    axis = softmax.attributes.get_int("axis", -1)
+    problems = {
+        "its products are int8": any(maker(v, "DequantizeLinear") for v in operands),
+        "it is not of float32 numbers": any(v.dtype != _FLOAT for v in operands),
+        "query, key and value are of different batches or sizes": not like,
+        "its softmax is not over the last axis": axis not in (-1, len(query) - 1),
+        f"a head has more than {WIDEST} channels": width > WIDEST,
+        f"its queries and keys are few: {count} and {keys}": (
+            count < LEAST_QUERIES or keys < LEAST_KEYS
+        ),
+    }
+    for problem, is_there in problems.items():
+        if is_there:
+            raise PreconditionError(problem)
     return query
 
 
@@ -164,9 +165,10 @@ def _fused(call: FusedCall, attention: _Attention, shape: _Shape) -> ir.Value:
 
 
 def _viewed(call: FusedCall, value: ir.Value | None, rows: int) -> ir.Value:
-    """Return a value as [B, rows, C], its axes up to ``rows`` joined, and those after.
+    """Return a value as [B, rows, C]: join the axes before, and those after, ``rows``.
 
-    ``rows`` counts from the end. A Reshape of such a value gives that.
+    ``rows`` counts from the end. If the value is a Reshape of one of that shape, that
+    one is returned.
     """
     shape = static_shape(value)
     assert value is not None
@@ -183,7 +185,7 @@ def _viewed(call: FusedCall, value: ir.Value | None, rows: int) -> ir.Value:
 def _attention(
     call: FusedCall, rows: list[ir.Value], factor: float, heads: int
 ) -> ir.Value:
-    """Write the fused node; ``factor`` is by what the scale is not 1 / sqrt(C)."""
+    """Write the fused node; ``factor`` is the scale divided by 1 / sqrt(C)."""
     query, key, value = rows
     if abs(factor - 1) > _SAME:
         query = call.add("Mul", [query, call.numbers(factor, query)])

@@ -62,12 +62,9 @@ def _fused(node: ir.Node, call: FusedCall, *, relu: int) -> ir.Value | None:
     bias = input_at(node, 2)
     if bias is None:
         bias = call.constant(np.zeros(filters.shape[0], np.float32), "bias")
-    result = call.add(
-        "WinogradConvolution",
-        [image, weight, bias],
-        {"pads": pads, "relu": relu},
-        domain=OWN_DOMAIN,
-    )
+    inputs = [image, weight, bias]
+    options: dict[str, int | list[int]] = {"pads": pads, "relu": relu}
+    result = call.add("WinogradConvolution", inputs, options, domain=OWN_DOMAIN)
     result.shape, result.type = ir.Shape(made), ir.TensorType(ir.DataType.FLOAT)
     return result
 
@@ -75,21 +72,16 @@ def _fused(node: ir.Node, call: FusedCall, *, relu: int) -> ir.Value | None:
 def _pads(node: ir.Node) -> list[int] | None:
     """Return the pads of a Conv at stride 1, of one group; None for all others."""
     read = node.attributes
-    plain = all(
-        each == 1
-        for name in ("strides", "dilations")
-        for each in read.get_ints(name) or ()
-    )
-    if not plain or read.get_int("group", 1) != 1:
+    steps = {*read.get_ints("strides", ()), *read.get_ints("dilations", ())}
+    if steps - {1} or read.get_int("group", 1) != 1:
         return None
     if read.get_string("auto_pad", "NOTSET") != "NOTSET":
         return None
-    pads = read.get_ints("pads")
-    return [0, 0, 0, 0] if pads is None else list(pads)
+    return list(read.get_ints("pads", (0, 0, 0, 0)))
 
 
 def _shortcut(node: ir.Node) -> bool:
-    """Return whether a sum with something computed is all that reads a Conv."""
+    """Return whether only an Add reads a Conv, and adds no constant to it."""
     reader = sole_reader(node.outputs[0])
     if reader is None or reader.op_type != "Add" or not is_standard(reader):
         return False
@@ -97,7 +89,7 @@ def _shortcut(node: ir.Node) -> bool:
 
 
 def _pays(image: tuple[int, ...], made: tuple[int, ...], *, shortcut: bool) -> bool:
-    """Return whether the kernel is faster, by what was measured."""
+    """Return whether the kernel is faster, by the measured times."""
     (batch, deep, *_), (_, out, high, wide) = image, made
     # Whole tiles of 4 x 4, all of them in whole blocks of 48
     tiles = batch * math.ceil(high / 4) * math.ceil(wide / 4)

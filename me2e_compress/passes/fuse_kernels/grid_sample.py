@@ -5,8 +5,8 @@ Given:   Reshape(Transpose(rows [H W, C])) -> GridSample -> Reshape -> Transpose
 Result:  Reshape -> me2e::MultiScaleDeformableAttention -> Reshape, on the rows
 
 onnxruntime's CPU reads a map channel by channel; the kernel reads all channels of a
-pixel at once, and wants them side by side. BEVFormer keeps its view so, and turns it
-about only to rotate it. Nearest samples are bilinear ones at rounded positions.
+pixel at once, which must be contiguous. BEVFormer stores its bird's-eye view so, and
+transposes it only to rotate it. Nearest samples are bilinear ones at rounded positions.
 """
 
 import dataclasses
@@ -83,16 +83,18 @@ def _checked(node: ir.Node, image: ir.Value, grid: ir.Value) -> tuple[str, _Size
     """Return how it samples, and its sizes; refuse what the kernel cannot do."""
     mode = node.attributes.get_string("mode", "bilinear")
     padding = node.attributes.get_string("padding_mode", "zeros")
-    if mode not in (*_BILINEAR, _NEAREST):
-        raise PreconditionError(f"it samples {mode}")
-    if padding != "zeros":
-        raise PreconditionError(f"it pads with {padding}, not zeros")
-    if node.attributes.get_int("align_corners", 0):
-        raise PreconditionError("it aligns corners")
+    problems = {
+        f"it samples {mode}": mode not in (*_BILINEAR, _NEAREST),
+        f"it pads with {padding}, not zeros": padding != "zeros",
+        "it aligns corners": node.attributes.get_int("align_corners", 0),
+    }
+    for problem, is_there in problems.items():
+        if is_there:
+            raise PreconditionError(problem)
     map_, places = static_shape(image), static_shape(grid)
     if map_ is None or places is None or len(map_) != 4 or 0 in (*map_, *places):
         raise PreconditionError("sizes are unknown, or it samples a volume")
-    if image.dtype != ir.DataType.FLOAT or grid.dtype != ir.DataType.FLOAT:
+    if {image.dtype, grid.dtype} != {ir.DataType.FLOAT}:
         raise PreconditionError("it is not of float32")
     if map_[1] < LEAST_CHANNELS:
         raise PreconditionError(f"{map_[1]} channels, below {LEAST_CHANNELS}")
@@ -100,7 +102,7 @@ def _checked(node: ir.Node, image: ir.Value, grid: ir.Value) -> tuple[str, _Size
 
 
 def _source_rows(image: ir.Value, sizes: _Sizes) -> ir.Value | None:
-    """Return what the image is turned from, its channels last; None if nothing."""
+    """Return the value with its channels last that the image is transposed from."""
     value = image
     while (view := maker(value, *VIEWS)) is not None and view.inputs[0] is not None:
         value = view.inputs[0]

@@ -1,6 +1,7 @@
 """Fuse positions and weights into the deformable attention that reads them."""
 
 import dataclasses
+import itertools
 import math
 from collections.abc import Callable, Sequence
 
@@ -71,8 +72,8 @@ class _Sizes:
 
 
 @dataclasses.dataclass(frozen=True)
-class _Found:
-    """Where the operands of a call are read; what there is none of is None.
+class _Match:
+    """Where the operands of a call are read; None for one that it lacks.
 
     ``rows`` is the layout of the scores, whose last dimension is a row of the softmax.
     """
@@ -95,10 +96,10 @@ def fuse_raw_attention(node: ir.Node, call: FusedCall) -> ir.Value | None:
     Result:  y = me2e::RawDeformableAttention(
                  value, sizes, starts, points, offsets, scores, mask)
 
-    Operands are read before they are repeated. What is no such sum or softmax, or is
-    read by others too, is read as it is.
+    Operands are read before they are repeated. An operand that is no such sum or
+    softmax, or that other nodes read too, stays as it is.
     """
-    form = _find(node) if call.opset >= SOFTMAX_OPSET else None
+    form = _match(node) if call.opset >= SOFTMAX_OPSET else None
     if form is None:
         return None
     inputs = [*node.inputs[:3], *_written(call, form)]
@@ -107,7 +108,7 @@ def fuse_raw_attention(node: ir.Node, call: FusedCall) -> ir.Value | None:
     return result
 
 
-def _find(node: ir.Node) -> _Found | None:
+def _match(node: ir.Node) -> _Match | None:
     locations, weights = node.inputs[3], node.inputs[4]
     shape = static_shape(locations)
     if locations is None or weights is None or shape is None:
@@ -117,7 +118,7 @@ def _find(node: ir.Node) -> _Found | None:
     sizes = _Sizes(*shape[:5])
     at = View(locations, (*sizes.weights, whole(XY, 2)))
     share = View(weights, sizes.weights)
-    plain = _Found(sizes, None, at, None, ((),) * 5, (share,), 1.0)
+    plain = _Match(sizes, None, at, None, ((),) * 5, (share,), 1.0)
     # The sum and the softmax, if they are there
     form = _product(share, plain) or plain
     places = _sum(at)
@@ -158,7 +159,7 @@ def _away(sizes: _Sizes, view: View) -> Layout:
     return _pairs((*outer, sizes.form([view], of_camera=False)[3], points))
 
 
-def _written(call: FusedCall, read: _Found) -> list[ir.Value]:
+def _written(call: FusedCall, read: _Match) -> list[ir.Value]:
     """Write the operands from reference points to mask."""
     zeros, like, form = np.zeros((1, 1, 1, 1, 1, 2)), read.away.value, read.sizes.form
     # Zeros stand for no reference point, and for weights without a softmax
@@ -194,7 +195,7 @@ def _axes(view: View) -> set[str]:
     return {digit.axis for digit in flat(view.layout)}
 
 
-def _product(view: View, plain: _Found) -> _Found | None:
+def _product(view: View, plain: _Match) -> _Match | None:
     """Return the factors of weights, if one of them is a softmax over points."""
     *_, last = (each for each in sources(view) if isinstance(each, View))
     node = producer_of(last.value)
@@ -208,12 +209,12 @@ def _product(view: View, plain: _Found) -> _Found | None:
     if node.op_type != "Mul" or None in shapes:
         return None
     # One factor is the softmax, perhaps behind other products
-    left, right = (
+    factors = [
         View(each, aligned(last.layout, shape))
         for each, shape in zip(node.inputs, shapes, strict=True)
         if each is not None and shape is not None
-    )
-    for one, other in ((left, right), (right, left)):
+    ]
+    for one, other in itertools.permutations(factors):
         inner = _product(one, plain)
         if inner is not None:
             masks, scale = (*inner.masks, other), inner.scale * last.scale
@@ -221,7 +222,7 @@ def _product(view: View, plain: _Found) -> _Found | None:
     return None
 
 
-def _softmax(node: ir.Node, view: View, plain: _Found) -> _Found | None:
+def _softmax(node: ir.Node, view: View, plain: _Match) -> _Match | None:
     """Return the scores of a softmax over the points of one level or of several."""
     source = node.inputs[0]
     assert source is not None

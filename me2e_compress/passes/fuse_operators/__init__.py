@@ -80,8 +80,8 @@ class FuseOperators(Pass):
         run = _Run(self.name, opset, names, proofs)
         left: list[str] = []
         for body in graphs_of(model.graph):
-            left += run.tried(body, gathered.is_sampler, run.sample)
-            left += run.tried(body, _is_sampler, run.fuse)
+            left += run.try_nodes(body, gathered.is_sampler, run.sample)
+            left += run.try_nodes(body, _is_sampler, run.fuse)
         if run.fused:
             model.opset_imports.setdefault(OWN_DOMAIN, 1)
         if run.fused or run.sampled:
@@ -101,7 +101,7 @@ def _is_sampler(node: ir.Node) -> bool:
 
 
 class _Run:
-    """Writes one match after another, counts them, and keeps the worst error."""
+    """Rewrites matches, counts them, and keeps the largest error."""
 
     def __init__(self, by: str, opset: int, names: set[str], proofs: Proofs) -> None:
         self.by, self.opset, self.names, self.proofs = by, opset, names, proofs
@@ -109,13 +109,13 @@ class _Run:
         self.worst = 0.0
         self._failed: set[tuple[ir.Value, ...]] = set()
 
-    def tried(
+    def try_nodes(
         self,
         body: ir.Graph,
         is_one: Callable[[ir.Node], bool],
         rewrite: Callable[[ir.Graph, ir.Node], None],
     ) -> Iterator[str]:
-        """Rewrite every node of a kind; say of each that stays why it does."""
+        """Rewrite every node of a kind; yield a note for each that stays."""
         for node in list(body):
             if node.graph is not body or not is_one(node):
                 continue
@@ -169,9 +169,9 @@ class _Run:
         draw: Draw,
         least: int = 1,
     ) -> tuple[ir.Value, float]:
-        """Write what may stand for a value, and put it there if that is proven.
+        """Write a replacement of a value, and keep it if both are proven equal.
 
-        Returns the new value, and how far it is apart.
+        Returns the new value, and its error.
         """
         root, known = old.producer(), set(body.initializers)
         if root is None:

@@ -91,15 +91,14 @@ def find(node: ir.Node) -> Decomposed:
         raise PreconditionError("the sum is over channels or heads too")
     if any(digit.axis == LEVEL for digit in left):
         raise PreconditionError("the levels are not summed over")
-    return Decomposed(
-        levels,
-        weights,
-        tuple(results(total)),
-        queries=tuple(each for each in left if each.axis in (ROW, COLUMN)),
-        points=tuple(each for each in gone if each.axis in (ROW, COLUMN)),
-        batch=(static_shape(levels[0].image.value) or (0,))[0],
-        channels=(static_shape(levels[0].image.value) or (0, 0))[1],
+    # What remains of rows and columns are queries
+    queries, points = (
+        tuple(digit for digit in digits if digit.axis in (ROW, COLUMN))
+        for digits in (left, gone)
     )
+    batch, channels, *_ = static_shape(levels[0].image.value) or (0, 0)
+    ends = tuple(results(total))
+    return Decomposed(levels, weights, ends, queries, points, batch, channels)
 
 
 def with_images(decomposed: Decomposed) -> Decomposed:
@@ -134,10 +133,11 @@ def with_images(decomposed: Decomposed) -> Decomposed:
 
 
 def _level(node: ir.Node) -> tuple[Level, View]:
+    """Describe a GridSample and the layout of its output, or raise why it cannot be."""
     for name, allowed in SAMPLING.items():
-        given = node.attributes.get_string(name, allowed[0])
-        if given not in allowed:
-            raise PreconditionError(f"it samples with {name}={given}")
+        mode = node.attributes.get_string(name, allowed[0])
+        if mode not in allowed:
+            raise PreconditionError(f"it samples with {name}={mode}")
     if node.attributes.get_int("align_corners", 0):
         raise PreconditionError("it samples with align_corners=1")
     # Shapes and types must be known and supported
@@ -149,7 +149,7 @@ def _level(node: ir.Node) -> tuple[Level, View]:
         )
     if len(shape) != 4:
         raise PreconditionError("it samples in three dimensions")
-    if image.dtype != ir.DataType.FLOAT or grid.dtype != ir.DataType.FLOAT:
+    if {image.dtype, grid.dtype} != {ir.DataType.FLOAT}:
         raise PreconditionError("it samples in another type than float32")
     # Describe both operands by their digits
     batch, channels, height, width = shape
@@ -163,6 +163,7 @@ def _level(node: ir.Node) -> tuple[Level, View]:
 
 
 def _levels(node: ir.Node) -> tuple[tuple[Level, ...], View]:
+    """Return the levels that are joined with a GridSample's, and their samples."""
     level, sampled = _level(node)
     end = list(results(sampled))[-1]
     concat = sole_reader(end.value)
@@ -195,10 +196,11 @@ def _sampler(value: ir.Value | None) -> ir.Node | None:
 
 
 def _weighted(samples: View) -> tuple[View, View]:
+    """Return the product of samples with weights that reads them, and the weights."""
     node = sole_reader(samples.value)
     if node is None or node.op_type != "Mul" or not is_standard(node):
         raise PreconditionError("what it samples is not multiplied by weights")
-    other = node.inputs[1] if node.inputs[0] is samples.value else node.inputs[0]
+    other = node.inputs[node.inputs[0] is samples.value]
     shape, full = static_shape(other), static_shape(samples.value)
     if other is None or shape is None or static_shape(node.outputs[0]) != full:
         raise PreconditionError("what it samples is not multiplied by weights")
@@ -210,6 +212,7 @@ def _weighted(samples: View) -> tuple[View, View]:
 
 
 def _total(product: View, kinds: tuple[str, ...]) -> tuple[View, bool]:
+    """Return the sum that reads a product, and whether it is a mean."""
     node = sole_reader(product.value)
     if node is None or node.op_type not in kinds or not is_standard(node):
         raise PreconditionError("the weighted samples are not summed")

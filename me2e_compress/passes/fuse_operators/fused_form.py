@@ -1,6 +1,7 @@
 """Write the fused node of a deformable attention and lay out its operands."""
 
 import dataclasses
+import itertools
 import math
 from collections.abc import Callable, Container, Sequence
 
@@ -11,6 +12,7 @@ from me2e_compress.errors import PreconditionError
 from me2e_compress.operators import OWN_DOMAIN, FusedCall
 from me2e_compress.passes.digits import (
     Digit,
+    Digits,
     Layout,
     flat,
     merged,
@@ -34,8 +36,6 @@ from me2e_compress.passes.fuse_operators.views import (
     sources,
     terms,
 )
-
-# Find where an operand of the fused node can be read, and what its layout costs.
 
 
 @dataclasses.dataclass(frozen=True)
@@ -68,20 +68,14 @@ def join_levels(selections: Sequence[Selection]) -> View | None:
 def options_of(
     views: Sequence[View], join: Callable[[Sequence[Selection]], View | None]
 ) -> list[Source]:
-    """Return where an operand can be read: per level, then from all levels together."""
-    # Walk back from each level
+    """Return where an operand can be read: level by level, then all levels at once."""
+    # Walk back from each level; one may be read from further away than another
     walks = [list(sources(view)) for view in views]
-    ends = [walk[-1] for walk in walks]
-    options = [
-        Source(option)
-        for option in zip(
-            *([each for each in walk if isinstance(each, View)] for walk in walks),
-            strict=False,  # a level may be read from further away than another
-        )
-    ]
+    steps = ([view for view in walk if isinstance(view, View)] for walk in walks)
+    options = [Source(option) for option in zip(*steps, strict=False)]
     # Where all levels are selections of one value, read that
-    selections = [each for each in ends if isinstance(each, Selection)]
-    if len(selections) < len(ends):
+    selections = [walk[-1] for walk in walks if isinstance(walk[-1], Selection)]
+    if len(selections) < len(walks):
         return options
     first = selections[0]
     together = (
@@ -94,12 +88,9 @@ def options_of(
 
 def whole_views(view: View) -> list[View]:
     """Return where a value can be read as a whole and unscaled."""
-    return [
-        each
-        for each in sources(view)
-        if isinstance(each, View)
-        and (each.scale, each.shift) == (view.scale, view.shift)
-    ]
+    views = (each for each in sources(view) if isinstance(each, View))
+    scaling = view.scale, view.shift
+    return [each for each in views if (each.scale, each.shift) == scaling]
 
 
 def sums_of(option: Source) -> list[Source]:
@@ -122,11 +113,11 @@ def sums_of(option: Source) -> list[Source]:
 def cheapest(
     options: Sequence[Source],
     form: Callable[[int | None], Layout],
-    covered: tuple[Digit, ...] = (),
+    covered: Digits = (),
 ) -> tuple[float, Source]:
     """Return the lowest cost of laying out a source, and the last such source.
 
-    ``covered`` are digits that another operator repeats the operand over anyway.
+    ``covered`` are digits over which a later product repeats the operand anyway.
     """
 
     def cost(option: Source) -> float:
@@ -150,8 +141,8 @@ def cost_of(
 ) -> float:
     """Return the bytes written to bring a view to a layout.
 
-    The view need not be repeated over ``covered`` digits, nor at all as a ``part`` of a
-    sum or product, which repeats it and is scaled elsewhere.
+    It need not be repeated over ``covered`` digits. A ``part`` of a sum or product is
+    repeated by that, and scaled elsewhere.
     """
     have, wanted = flat(view.layout), flat(form)
     have, wanted = split_like(have, wanted), split_like(wanted, have)
@@ -189,15 +180,13 @@ def laid_out(call: FusedCall, view: View, form: Layout) -> ir.Value:
     have, wanted = flat(view.layout), flat(form)
     have, wanted = split_like(have, wanted), split_like(wanted, have)
     present = tuple(digit for digit in wanted if digit in have)
-    shape = sizes(view.layout)
     if present != have:
         # Reorder runs of digits by one Transpose
         pieces, order = runs(have, present)
-        value = call.transpose(_shaped(call, value, shape, sizes(tuple(pieces))), order)
-        shape = tuple(sizes(tuple(pieces))[place] for place in order)
+        value = call.transpose(call.view(value, sizes(tuple(pieces))), order)
     if len(present) < len(wanted):
-        return _repeated(call, value, shape, wanted, have, form)
-    return _shaped(call, value, shape, sizes(form))
+        return _repeated(call, value, wanted, have, form)
+    return call.view(value, sizes(form))
 
 
 def combined(
@@ -210,16 +199,11 @@ def combined(
     digits = [digit for view in views for digit in flat(view.layout)]
     every = split_like(flat(form), digits)
     have = [set(split_like(flat(view.layout), every)) for view in views]
-    groups: list[tuple[Digit, ...]] = []
+    groups: list[Digits] = []
     for dimension in form:
-        last: tuple[bool, ...] | None = None
-        for digit in split_like(dimension, digits):
-            who = tuple(digit in each for each in have)
-            if who == last:
-                groups[-1] = (*groups[-1], digit)
-            else:
-                groups.append((digit,))
-            last = who
+        split = split_like(dimension, digits)
+        by_owners = itertools.groupby(split, lambda d: [d in each for each in have])
+        groups.extend(tuple(run) for _, run in by_owners)
     # Combine the views by broadcasting
     value: ir.Value | None = None
     for view, mine in zip(views, have, strict=True):
@@ -231,31 +215,22 @@ def combined(
     present = set().union(*have)
     shape = sizes(tuple(run if run[0] in present else () for run in groups))
     if shape == sizes(tuple(groups)):
-        return _shaped(call, value, shape, sizes(form))
-    wanted = [digit for run in groups for digit in run]
-    return _repeated(call, value, shape, wanted, present, form)
+        return call.view(value, sizes(form))
+    return _repeated(call, value, flat(tuple(groups)), present, form)
 
 
 def _repeated(
     call: FusedCall,
     value: ir.Value,
-    shape: Sequence[int],
-    wanted: Sequence[Digit],
+    wanted: Digits,
     present: Container[Digit],
     form: Layout,
 ) -> ir.Value:
-    """Repeat a value of some digits over the wanted ones, in a layout."""
+    """Repeat a value of the present digits over all wanted ones, in a layout."""
     full = [digit.size for digit in wanted]
     ones = [digit.size if digit in present else 1 for digit in wanted]
-    value = _shaped(call, value, shape, ones)
-    value = call.add("Expand", [value, call.integers(full)])
-    return _shaped(call, value, full, sizes(form))
-
-
-def _shaped(
-    call: FusedCall, value: ir.Value, have: Sequence[int], wanted: Sequence[int]
-) -> ir.Value:
-    return value if tuple(have) == tuple(wanted) else call.reshape(value, list(wanted))
+    value = call.add("Expand", [call.view(value, ones), call.integers(full)])
+    return call.view(value, sizes(form))
 
 
 OP_TYPE = "MultiScaleDeformableAttention"
@@ -278,8 +253,7 @@ class Plan:
     def inputs(self) -> tuple[View, ...]:
         """Every view that the fused node reads."""
         mask = () if self.mask is None else (self.mask,)
-        sources = (self.value, self.locations, self.weights)
-        return (*(view for each in sources for view in each.views), *mask)
+        return (*self.value.views, *self.locations.views, *self.weights.views, *mask)
 
 
 def plan(decomposed: Decomposed) -> Plan:
@@ -308,12 +282,10 @@ def plan(decomposed: Decomposed) -> Plan:
         read = cheapest(value, form.value)
         places = cheapest(locations, form.locations)
         shares = cheapest(weights, form.weights, covered)
-        mask = min(
-            reversed(masks),
-            key=lambda view: cost_of(view, form.weights(None), part=True),
-            default=None,
-        )
-        # of the results, the one furthest behind takes the most with it
+        full = form.weights(None)
+        costs = {view: cost_of(view, full, part=True) for view in reversed(masks)}
+        mask = min(costs, key=costs.__getitem__, default=None)
+        # Of results of equal cost, the last one replaces the most nodes
         last = min(reversed(decomposed.results), key=form.result_cost)
         cost = read[0] + places[0] + shares[0] + form.result_cost(last)
         plans.append(

@@ -1,8 +1,9 @@
 """Find bilinear sampling that is written with Gather, and write it as GridSample.
 
-mmcv's ``bilinear_grid_sample`` and the like spare TensorRT's GridSample: the floor of
-each position, the indices of the four corners, and the sum of what is gathered, times
-its share. How corners are masked, weighted and added up is left to the proof.
+mmcv's ``bilinear_grid_sample`` and the like avoid GridSample, which older TensorRT
+lacks: they take the floor of each position, gather the four corners, and add them up,
+times their shares. Only the floors and the sum are matched; that masks and shares are
+those of GridSample is proven numerically.
 """
 
 import dataclasses
@@ -180,11 +181,9 @@ def _image(node: ir.Node) -> tuple[ir.Value, tuple[int, ...], list[int]]:
     shape = static_shape(data)
     if data is None or shape is None or data.dtype != ir.DataType.FLOAT:
         raise PreconditionError("it gathers no float32 of a known shape")
-    products = [each for each in _behind(node.inputs[1]) if each.op_type == "Mul"]
-    arrays = [array_of(value) for each in products for value in each.inputs]
-    factors = [
-        int(each.item()) for each in arrays if each is not None and each.size == 1
-    ]
+    products = [made for made in _behind(node.inputs[1]) if made.op_type == "Mul"]
+    arrays = [array_of(value) for made in products for value in made.inputs]
+    factors = [int(a.item()) for a in arrays if a is not None and a.size == 1]
     return data, (0,), [n for n in dict.fromkeys((*factors, *shape[1:])) if n > 0]
 
 

@@ -19,7 +19,7 @@ OUTSIDE = 0.25
 """How far beyond a feature map's edges positions are drawn, relative to its size."""
 
 IR_VERSION = 8
-"""Old enough for every onnxruntime that has GridSample."""
+"""The IR version of pieces: that of the first onnxruntime with GridSample."""
 
 
 def nodes_between(output: ir.Value, inputs: Sequence[ir.Value]) -> list[ir.Node]:

@@ -78,7 +78,7 @@ def joined(selections: Sequence[Selection], digits: Digits) -> View | None:
     # The parts must be adjacent and equal in all other respects
     for each in selections:
         own = each.view.layout
-        beside = own[: each.axis] + layout[axis : axis + 1] + own[each.axis + 1 :]
+        beside = (*own[:axis], layout[axis], *own[axis + 1 :])
         alike = dataclasses.replace(each.view, layout=beside) == first.view
         if not alike or each.axis != axis or each.start != start:
             return None

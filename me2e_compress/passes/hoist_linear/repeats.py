@@ -149,17 +149,11 @@ def _sizes(
     shape: Sequence[int], kept: Digits
 ) -> tuple[tuple[int, ...], tuple[int, ...]] | None:
     """Return the small and the large sizes; None if the source has another order."""
-    small: list[int] = []
-    large: list[int] = []
-    mine: list[Digit] = []
+    small, large, mine = list[int](), list[int](), list[Digit]()
 
     def is_kept(one: Digit) -> bool:
-        return any(
-            other.axis == one.axis
-            and other.stride <= one.stride
-            and one.end <= other.end
-            for other in kept
-        )
+        same = (other for other in kept if other.axis == one.axis)
+        return any(o.stride <= one.stride and one.end <= o.end for o in same)
 
     # Cut each axis into digits that the source has and digits that it repeats over
     for axis, size in enumerate(shape):
@@ -217,13 +211,13 @@ def is_row_wise(node: ir.Node, opset: int) -> bool:
 
 @dataclasses.dataclass(frozen=True)
 class _Operand:
-    """What a node reads instead: a value as it is, or every element once.
+    """An operand of the node that is computed once.
 
     Attributes:
-        value: what it reads now.
-        shape: the shape of what it reads instead.
-        repeated: where the elements are that it reads once.
-        numbers: or those of a constant.
+        value: the operand now, with its repetitions.
+        shape: the shape of the operand without them.
+        repeated: where it is read without them; None if it does not repeat.
+        numbers: the numbers of a constant, without them.
     """
 
     value: ir.Value
@@ -234,7 +228,7 @@ class _Operand:
 
 @dataclasses.dataclass(frozen=True)
 class _Plan:
-    """A node on other operands: the shape of its result, and that of all repeats."""
+    """A node's new operands, and the shape of its result once and with its repeats."""
 
     operands: tuple[_Operand, ...]
     small: tuple[int, ...]
@@ -278,20 +272,17 @@ def _plan(node: ir.Node, opset: int) -> _Plan | None:
         return _Plan((operand,), repeated.small, repeated.large)
     if not repeated.small[-1] == repeated.large[-1] == given[-1]:
         return None
-    small, large = (
-        (*sizes[:-1], shape[-1]) for sizes in (repeated.small, repeated.large)
-    )
-    return _Plan((operand,), small, large)
+    ends = shape[-1:]
+    return _Plan((operand,), repeated.small[:-1] + ends, repeated.large[:-1] + ends)
 
 
 def _turned(node: ir.Node, value: ir.Value) -> _Plan | None:
+    """Plan a Transpose of a value that repeats."""
     repeated, order = repeated_axes(value), permutation_of(node)
     if repeated is None or order is None or repeated.large != static_shape(value):
         return None
-    small, large = (
-        tuple(sizes[axis] for axis in order)
-        for sizes in (repeated.small, repeated.large)
-    )
+    small = tuple(repeated.small[axis] for axis in order)
+    large = tuple(repeated.large[axis] for axis in order)
     return _Plan((_Operand(value, repeated.small, repeated),), small, large)
 
 
@@ -308,19 +299,17 @@ def _combined(node: ir.Node, shape: tuple[int, ...]) -> _Plan | None:
             return None
         small = given if repeated is None else repeated.small
         operands.append(_Operand(value, small, repeated))
-    if all(each.repeated is None for each in operands):
+    if all(operand.repeated is None for operand in operands):
         return None
-    small = np.broadcast_shapes(*(each.shape for each in operands))
+    small = np.broadcast_shapes(*(operand.shape for operand in operands))
     return _Plan(tuple(operands), small, shape)
 
 
 def _joined(node: ir.Node, shape: tuple[int, ...]) -> _Plan | None:
     """Plan a Concat whose operands all repeat along the same axes, constants too."""
-    # A constant repeats along an axis if all its slices are equal
     values = [value for value in node.inputs if value is not None]
-    axis = node.attributes.get_int("axis", 0) % len(shape)
     stored = {value: array_of(value) for value in values if holds_numbers(value)}
-    common = set(range(len(shape))) - {axis}
+    common = set(range(len(shape))) - {node.attributes.get_int("axis", 0) % len(shape)}
     repeats: dict[ir.Value, RepeatedAxes] = {}
     if len(stored) == len(values):
         return None
@@ -332,29 +321,23 @@ def _joined(node: ir.Node, shape: tuple[int, ...]) -> _Plan | None:
             common = {at for at in common if one.small[at] != one.large[at]}
         elif value not in stored:
             return None
+    # A constant repeats along an axis if all its slices are equal
     for array in stored.values():
         assert array is not None
         common = {at for at in common if np.all(array == np.take(array, [0], at))}
     if not common:
         return None
-    operands = tuple(
-        _once(value, common, repeats.get(value), stored.get(value)) for value in values
-    )
-    small = [1 if at in common else size for at, size in enumerate(shape)]
-    return _Plan(operands, tuple(small), shape)
 
+    def once(sizes: Sequence[int]) -> tuple[int, ...]:
+        return tuple(1 if at in common else size for at, size in enumerate(sizes))
 
-def _once(
-    value: ir.Value, axes: set[int], repeated: RepeatedAxes | None, array: Array | None
-) -> _Operand:
-    shape = tuple(
-        1 if at in axes else size for at, size in enumerate(static_shape(value) or ())
-    )
-    if array is not None:
-        array = array[
-            tuple(slice(1 if at in axes else None) for at in range(len(shape)))
-        ]
-    return _Operand(value, shape, repeated, array)
+    operands = []
+    for value in values:
+        small, array = once(static_shape(value) or ()), stored.get(value)
+        if array is not None:
+            array = array[tuple(map(slice, small))]
+        operands.append(_Operand(value, small, repeats.get(value), array))
+    return _Plan(tuple(operands), once(shape), shape)
 
 
 def _pays(node: ir.Node, plan: _Plan) -> bool:
@@ -368,17 +351,13 @@ def _pays(node: ir.Node, plan: _Plan) -> bool:
         if operand.repeated is None:
             continue
         # The nodes of a repetition that only this one needs
-        owned = itertools.takewhile(
-            lambda each: sole_reader(each.outputs[0]) is not None,
-            operand.repeated.nodes,
-        )
+        nodes, small = operand.repeated.nodes, operand.repeated.small
+        owned = itertools.takewhile(lambda n: sole_reader(n.outputs[0]), nodes)
         before += sum(map(work, owned))
-        if static_shape(operand.repeated.source) != operand.repeated.small:
+        if static_shape(operand.repeated.source) != small:
             after += 1.0
-        if operand.shape != operand.repeated.small:
-            moved += (
-                math.prod(operand.shape) + math.prod(operand.repeated.small)
-            ) * item
+        if operand.shape != small:
+            moved += (math.prod(operand.shape) + math.prod(small)) * item
             after += 1.0
     # Repeating the result, and giving it its shape
     if plan.small != plan.large:
@@ -398,10 +377,8 @@ def _rewrite(call: FusedCall, plan: _Plan) -> None:
     if node.op_type in ALONG_AXIS:
         attributes["axis"] = rank - 1
     new = call.add(node.op_type, inputs, attributes)
-    # Repeat the result, unless its readers see no difference
-    axes = [
-        operand.repeated for operand in plan.operands if operand.repeated is not None
-    ]
+    # Repeat the result, unless its readers broadcast it themselves
+    axes = [operand.repeated for operand in plan.operands if operand.repeated]
     call.sources = (node, *dict.fromkeys(one for each in axes for one in each.nodes))
     new = _expanded(call, call.view(new, plan.small), plan.large)
     replace(call, call.view(new, static_shape(node.outputs[0]) or ()))

@@ -118,8 +118,7 @@ def layer_behind(value: ir.Value) -> LinearLayer | None:
     """Return the layer that computes a value."""
     node = maker(value, "MatMul", "Gemm", "Add")
     if node is None or node.op_type != "Add":
-        is_layer = node is not None and is_product(node)
-        return LinearLayer(node, None) if node is not None and is_layer else None
+        return None if node is None or not is_product(node) else LinearLayer(node, None)
     for operand in node.inputs:
         product = maker(operand, "MatMul", "Gemm")
         if product is not None and is_product(product) and _adds_bias(node, product):
@@ -129,7 +128,7 @@ def layer_behind(value: ir.Value) -> LinearLayer | None:
 
 def is_product(node: ir.Node) -> bool:
     """Return whether a node multiplies rows by a constant matrix."""
-    if node.op_type not in ("MatMul", "Gemm") or node.domain not in ("", "ai.onnx"):
+    if node.op_type not in ("MatMul", "Gemm") or not is_standard(node):
         return False
     if node.attributes.get_int("transA", 0):
         return False
@@ -338,12 +337,8 @@ class _Search:
     def total(self, terms: Terms, shape: tuple[int, ...]) -> ir.Value:
         """Write a sum, its terms of the fewest rows first; these take the vectors."""
         # A single row broadcasts as a vector, and is added to the next constant
-        rows = [
-            numbers.reshape(-1) if numbers.size == numbers.shape[-1] else numbers
-            for numbers in sorted(
-                (each for each in terms if not isinstance(each, ir.Value)), key=np.size
-            )
-        ]
+        arrays = sorted((a for a in terms if not isinstance(a, ir.Value)), key=np.size)
+        rows = [a.reshape(-1) if a.size == a.shape[-1] else a for a in arrays]
         while len(rows) > 1 and rows[0].ndim == 1:
             rows = [rows[0] + rows[1], *rows[2:]]
         values = [each for each in terms if isinstance(each, ir.Value)]
