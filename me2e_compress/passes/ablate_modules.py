@@ -119,8 +119,8 @@ class AblateModules(Pass):
         # Rewire readers to substitutes and along new edges
         modules = context.modules
         if self.fill == "substitute":
-            wanted = [each for module in known for each in module.substitutes]
-            notes += [self._substitute(model, each, modules) for each in wanted]
+            wanted = [one for module in known for one in module.substitutes]
+            notes += [self._substitute(model, one, modules) for one in wanted]
         for edge in self.edges:
             notes.append(add_edge(model, edge, modules, self._is_dropped, self.name))
         # Fill what is left after the first sweep, then sweep again

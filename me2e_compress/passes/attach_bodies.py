@@ -46,7 +46,7 @@ class AttachBodies(Pass):
 
     def run(self, model: ir.Model, context: Context) -> PassResult:
         """Add a function for each kind of fused node that has none."""
-        fused = [each.node for each in operators.fused_nodes(model)]
+        fused = [call.node for call in operators.fused_nodes(model)]
         bare = [node for node in fused if node.op_identifier() not in model.functions]
         named = [node for node in bare if _has_domain(node)]
         notes = list(operators.raise_for_bodies(model, named, self.name))
@@ -73,7 +73,7 @@ class AttachBodies(Pass):
     def _body(self, calls: Sequence[FusedNode]) -> ir.Function:
         first = calls[0]
         inputs = [
-            _parameter(index, [each.node.inputs[index] for each in calls])
+            _parameter(index, [call.node.inputs[index] for call in calls])
             for index in range(len(first.node.inputs))
         ]
         # One call of the operator inside a function of the same signature
@@ -84,7 +84,7 @@ class AttachBodies(Pass):
         node.overload, node.name = identifier[2], first.operator.name
         opsets = {"": first.opset}
         body = ir.Graph(values, [result], nodes=[node], opset_imports=opsets)
-        attributes = [ir.Attr(each.name, each.type, each.value) for each in given]
+        attributes = [ir.Attr(a.name, a.type, a.value) for a in given]
         function = ir.Function(*identifier, graph=body, attributes=attributes)
         # Store shared constants, then expand the operator
         for value, known in inputs:
@@ -132,7 +132,7 @@ def _parameter(
     if len(types) == 1 and (kind := next(iter(types))) is not None:
         value.type = ir.TensorType(kind)
     # Only a small constant that is equal in every call is stored
-    arrays = [None if each is None else graph.array_of(each) for each in given]
+    arrays = [None if v is None else graph.array_of(v) for v in given]
     first = arrays[0]
     if first is None or first.size > LARGEST_TABLE:
         return value, None

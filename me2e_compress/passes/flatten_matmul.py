@@ -141,7 +141,7 @@ def _flatten(call: FusedCall) -> ir.Node | None:
     ways = [(left, shapes[0], right, shapes[1], False)]
     if shapes[1][-1] == 1:
         ways.append((right, _turned(shapes[1]), left, _turned(shapes[0]), True))
-    forms = [_form(*way, all_axes=each) for way in ways for each in (False, True)]
+    forms = [_form(*way, all_axes=every) for way in ways for every in (False, True)]
     best = min(filter(None, forms), key=lambda form: form.price, default=None)
     now = small_products(*shapes) / SMALL_PRODUCTS_PER_NODE
     if best is None or best.price >= now:

@@ -128,4 +128,4 @@ def _roots(model: ir.Model, value: ir.Value | None) -> list[ir.Value]:
         made = producer_of(value)
         if made is not None and made.op_type not in ("Shape", "Size"):
             pending += made.inputs
-    return [each for each in model.graph.inputs if each in seen]
+    return [port for port in model.graph.inputs if port in seen]

@@ -57,7 +57,7 @@ class TranslatePlugins(Pass):
             node, operator = fused.node, fused.operator
             to = operators.dialect_of(operator, self.dialect)
             if to is None:
-                there = ", ".join(each.name for each in operator.all_dialects())
+                there = ", ".join(dialect.name for dialect in operator.all_dialects())
                 raise PreconditionError(
                     f"node {node.name}: the dialect {self.dialect} has no"
                     f" {operator.name} ({node.op_type}); it is in {there}"
@@ -92,7 +92,7 @@ class ExpandOperators(Pass):
             PreconditionError: the graph cannot be written in the opset of a body.
         """
         counts: Counter[str] = Counter()
-        nodes = [each.node for each in operators.fused_nodes(model)]
+        nodes = [fused.node for fused in operators.fused_nodes(model)]
         raised = operators.raise_for_bodies(model, nodes, self.name)
         for fused in operators.fused_nodes(model):
             opset, names = fused.opset, fused.names

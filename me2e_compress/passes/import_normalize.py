@@ -10,7 +10,14 @@ import onnx_ir as ir
 from me2e_compress.display import plural
 from me2e_compress.graph import graphs_of, provenance
 from me2e_compress.graph.modules.assign import assign
-from me2e_compress.graph.nodes import array_of, is_plugin, nodes_in, nodes_of, opset_of
+from me2e_compress.graph.nodes import (
+    array_of,
+    bodies,
+    is_plugin,
+    nodes_in,
+    nodes_of,
+    opset_of,
+)
 from me2e_compress.graph.rewrite import add_constant, lift_constants
 from me2e_compress.graph.rewrite.raise_opset import OLDEST_OPSET, raise_opset
 from me2e_compress.graph.shapes import static_shape
@@ -48,9 +55,11 @@ def demote(model: ir.Model, by: str) -> tuple[int, str]:
                 value.type = ir.TensorType(ir.DataType.FLOAT)
                 count += 1
     for node in nodes_of(model):
-        attributes = [_demoted(node, each) for each in node.attributes.values()]
-        changed = [each for each in attributes if each is not None]
-        node.attributes.update({each.name: each for each in changed})
+        attributes = [
+            _demoted(node, attribute) for attribute in node.attributes.values()
+        ]
+        changed = [attribute for attribute in attributes if attribute is not None]
+        node.attributes.update({attribute.name: attribute for attribute in changed})
         if changed:
             provenance.inherit(node, [node], by=by)
         count += len(changed)
@@ -179,7 +188,7 @@ class ImportNormalize(Pass):
         if model.functions and model.ir_version < _FUNCTIONS_SINCE_IR:
             model.ir_version = _FUNCTIONS_SINCE_IR
             changes += 1
-        for body in _bodies(model):
+        for body, _ in bodies(model):
             for node in nodes_in(body):
                 if node.domain not in body.opset_imports:
                     body.opset_imports[node.domain] = 1
@@ -214,7 +223,7 @@ def _flatten_scales(model: ir.Model, by: str) -> int:
 def needs_import(model: ir.Model) -> bool:
     """Return whether nodes lack provenance, or plugins a domain of their own."""
     return bool(provenance.missing(model)) or any(
-        _plugins_without_domain(body, model) for body in _bodies(model)
+        _plugins_without_domain(body, model) for body, _ in bodies(model)
     )
 
 
@@ -223,7 +232,7 @@ def with_own_domains(model: ir.Model) -> ir.Model:
     if not any(ORIGINAL_DOMAIN in node.metadata_props for node in nodes_of(model)):
         return model
     copy = model.clone()
-    for body in _bodies(copy):
+    for body, _ in bodies(copy):
         for node in nodes_in(body):
             if ORIGINAL_DOMAIN in node.metadata_props:
                 node.domain = node.metadata_props.pop(ORIGINAL_DOMAIN)
@@ -241,16 +250,11 @@ def _raise(model: ir.Model, by: str) -> tuple[int, str]:
     return changes, f"opset {opset} stays: {reason}" if reason else became
 
 
-def _bodies(model: ir.Model) -> Iterator[ir.Graph | ir.Function]:
-    yield model.graph
-    yield from model.functions.values()
-
-
 def _name_nodes(model: ir.Model, by: str) -> int:
     """Name nodes without a unique name; new names depend only on the order of nodes."""
     count = 0
-    for body in _bodies(model):
-        # Reserve all given names first
+    for body, _ in bodies(model):
+        # Reserve all existing names first
         nodes = list(nodes_in(body))
         reserved = {node.name for node in nodes if node.name}
         taken, counters = set[str](), dict[str, int]()
@@ -280,7 +284,7 @@ def _isolate_plugins(model: ir.Model, by: str) -> int:
     plugin symbolic without a domain (``MSDAPlugin``).
     """
     count = 0
-    for body in _bodies(model):
+    for body, _ in bodies(model):
         moved = _plugins_without_domain(body, model)
         for node in moved:
             node.metadata_props.setdefault(ORIGINAL_DOMAIN, node.domain)

@@ -70,7 +70,7 @@ def raise_scales(model: ir.Model, narrow: set[ir.Node]) -> None:
         # The other nodes of its pair
         if node.op_type == QUANTIZE:
             readers = node.outputs[0].consumers()
-            partners = [each for each in readers if each.op_type == DEQUANTIZE]
+            partners = [reader for reader in readers if reader.op_type == DEQUANTIZE]
         else:
             partners = list(filter(None, [producer_of(node.inputs[0])]))
         if narrow.isdisjoint((node, *partners)):
@@ -151,7 +151,7 @@ class ConvertFloat16(Pass):
         reasons = Counter(
             reason
             for node, reason in wide.items()
-            if any(each is not None and each.dtype == FLOAT for each in node.inputs)
+            if any(value is not None and value.dtype == FLOAT for value in node.inputs)
         )
         nodes, stay = plural(len(narrow), "node"), reasons.total()
         notes = [f"{nodes} in float16, {stay} stay in float32"]
@@ -320,11 +320,11 @@ def _between(model: ir.Model, wide: Mapping[ir.Node, str]) -> dict[ir.Node, str]
     def from_wide(node: ir.Node) -> bool:
         data = node.inputs if node.op_type == "Concat" else node.inputs[:1]
         makers = [None if value is None else value.producer() for value in data]
-        return all(each is None or each in wide or each in moves for each in makers)
+        return all(maker is None or maker in wide or maker in moves for maker in makers)
 
     def to_wide(node: ir.Node) -> bool:
         readers = itertools.chain(*(value.consumers() for value in node.outputs))
-        return all(each in wide or each in moves for each in readers)
+        return all(reader in wide or reader in moves for reader in readers)
 
     # Strike out moves next to float16 nodes until nothing changes
     before = -1

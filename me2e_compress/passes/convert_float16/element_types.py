@@ -82,7 +82,7 @@ class ElementTypes:
             return None
         if node.op_type == "DequantizeLinear" and "output_dtype" in node.attributes:
             return None  # of that type, whatever its scale is of
-        values = [each for each in (*node.inputs, *node.outputs) if each is not None]
+        values = [value for value in (*node.inputs, *node.outputs) if value is not None]
         if not all(isinstance(v.type, ir.TensorType | None) for v in values):
             return None  # sequences and optionals
         if not onnx.defs.has(node.op_type, self._opset, ""):
@@ -133,7 +133,7 @@ class Retyping:
             if node.op_type == "Cast" and node.outputs[0] in results:
                 node.attributes["to"] = ir.AttrInt64("to", types.wanted.value)
             reads = any((node, index) in wanted for index in chosen[node])
-            if reads or any(each in results for each in node.outputs):
+            if reads or any(value in results for value in node.outputs):
                 provenance.inherit(node, [node], by=self._by)
                 self.changed += 1
         # Insert Casts for the readers, then for the graph outputs

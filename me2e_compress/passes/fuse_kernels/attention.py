@@ -146,7 +146,7 @@ def _fused(call: FusedCall, attention: _Attention, shape: _Shape) -> ir.Value:
         if turn is not None and order and permutation_of(turn) == order
     ]
     if len(reads) == len(turns):
-        rows = [_viewed(call, each, -2) for each in reads]
+        rows = [_viewed(call, read, -2) for read in reads]
         result = _attention(call, rows, factor, shape[-3])
         split = call.reshape(result, static_shape(reads[0]) or ())
         # What takes the heads out of the batch again is done already

@@ -130,12 +130,10 @@ def _match(node: ir.Node) -> _Match | None:
     near, scores = form.near, form.scores
     return dataclasses.replace(
         form,
-        near=near and _cheapest(near, lambda each: _pairs(sizes.form([each]))),
-        away=_cheapest(form.away, lambda each: _away(sizes, each)),
-        scores=scores and _cheapest(scores, lambda each: form.rows),
-        masks=tuple(
-            _cheapest(mask, lambda each: sizes.form([each])) for mask in form.masks
-        ),
+        near=near and _cheapest(near, lambda v: _pairs(sizes.form([v]))),
+        away=_cheapest(form.away, lambda v: _away(sizes, v)),
+        scores=scores and _cheapest(scores, lambda v: form.rows),
+        masks=tuple(_cheapest(mask, lambda v: sizes.form([v])) for mask in form.masks),
     )
 
 
@@ -182,7 +180,7 @@ def _sum(view: View) -> tuple[View, View] | None:
     parts = terms(whole_views(view)[-1])
     if parts is None:
         return None
-    near, away = sorted(parts, key=lambda each: math.prod(sizes_of(each.layout)))
+    near, away = sorted(parts, key=lambda part: math.prod(sizes_of(part.layout)))
     needed = _axes(view) - {BATCH, LEVEL}
     if not needed <= _axes(away):
         near, away = away, near
@@ -197,7 +195,7 @@ def _axes(view: View) -> set[str]:
 
 def _product(view: View, plain: _Match) -> _Match | None:
     """Return the factors of weights, if one of them is a softmax over points."""
-    *_, last = (each for each in sources(view) if isinstance(each, View))
+    *_, last = (source for source in sources(view) if isinstance(source, View))
     node = producer_of(last.value)
     if node is None or not is_standard(node) or last.shift != 0.0:
         return None
@@ -205,7 +203,7 @@ def _product(view: View, plain: _Match) -> _Match | None:
         return None
     if node.op_type == "Softmax":
         return _softmax(node, last, plain)
-    shapes = [static_shape(each) for each in node.inputs]
+    shapes = [static_shape(value) for value in node.inputs]
     if node.op_type != "Mul" or None in shapes:
         return None
     # One factor is the softmax, perhaps behind other products

@@ -195,15 +195,15 @@ class _Run:
             inherit(each, [root, *matched], by=self.by)
         replace_value(old, new)
         # Remove what is unread now, readers first
-        for each in reversed(matched):
-            if each.graph is not None and not any(map(is_read, each.outputs)):
-                each.graph.remove(each, safe=True)
+        for node in reversed(matched):
+            if node.graph is not None and not any(map(is_read, node.outputs)):
+                node.graph.remove(node, safe=True)
         return new, error
 
     def _fold(self, body: ir.Graph, new: ir.Value, plan: fused_form.Plan) -> None:
         """Store operands that are computed of constants alone."""
         between = nodes_between(new, [view.value for view in plan.inputs])
-        node = next(each for each in between if each.domain == OWN_DOMAIN)
+        node = next(made for made in between if made.domain == OWN_DOMAIN)
         mask = () if plan.mask is None else (plan.mask,)
         for index, read in (
             (0, plan.value.views),

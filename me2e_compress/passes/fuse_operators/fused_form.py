@@ -49,18 +49,20 @@ class Source:
 def join_pixels(selections: Sequence[Selection]) -> View | None:
     """Join feature maps that were cut from one row of pixels, level after level."""
     if any(
-        merged(each.view.layout[each.axis]) != whole(PIXEL, each.size)
-        for each in selections
+        merged(selection.view.layout[selection.axis]) != whole(PIXEL, selection.size)
+        for selection in selections
     ):
         return None
-    return joined(selections, whole(PIXEL, sum(each.size for each in selections)))
+    return joined(
+        selections, whole(PIXEL, sum(selection.size for selection in selections))
+    )
 
 
 def join_levels(selections: Sequence[Selection]) -> View | None:
     """Join positions that were cut from one row of levels."""
     first = selections[0]
     digits = first.view.layout[first.axis]
-    if any(each.view.layout[each.axis] != digits for each in selections):
+    if any(selection.view.layout[selection.axis] != digits for selection in selections):
         return None
     return joined(selections, (*whole(LEVEL, len(selections)), *digits))
 
@@ -88,9 +90,9 @@ def options_of(
 
 def whole_views(view: View) -> list[View]:
     """Return where a value can be read as a whole and unscaled."""
-    views = (each for each in sources(view) if isinstance(each, View))
+    views = (source for source in sources(view) if isinstance(source, View))
     scaling = view.scale, view.shift
-    return [each for each in views if (each.scale, each.shift) == scaling]
+    return [v for v in views if (v.scale, v.shift) == scaling]
 
 
 def sums_of(option: Source) -> list[Source]:
@@ -267,8 +269,10 @@ def plan(decomposed: Decomposed) -> Plan:
     # of equals the last one is taken: sums are the last resort
     locations = [*(each for option in plain for each in sums_of(option)), *plain]
     if decomposed.images:  # their levels lie image by image: there is nothing to join
-        value = [each for each in value if len(each.views) == 1]
-        locations = [each for each in locations if len(each.views) == 1 or each.total]
+        value = [option for option in value if len(option.views) == 1]
+        locations = [
+            option for option in locations if len(option.views) == 1 or option.total
+        ]
         if not (value and locations):
             raise PreconditionError("its levels are made apart")
     weights = [Source((view,)) for view in whole_views(decomposed.weights)]

@@ -96,7 +96,7 @@ class Sampling:
         """Write the GridSample, and what brings its operands and result in shape."""
         batch, channels, rows, columns = self.shape
         layout = self.result.layout
-        places = tuple(each for each in layout if each and each[-1].axis == AT)
+        places = tuple(digits for digits in layout if digits and digits[-1].axis == AT)
         total = math.prod(sizes(places))
         width = math.gcd(total // batch, sizes((places or ((),))[-1:])[0])
         form = regrouped((whole(AT, total),), (batch, total // batch // width, width))

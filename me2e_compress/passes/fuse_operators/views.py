@@ -76,13 +76,13 @@ def joined(selections: Sequence[Selection], digits: Digits) -> View | None:
     first, start = selections[0], 0
     axis, layout = first.axis, first.view.layout
     # The parts must be adjacent and equal in all other respects
-    for each in selections:
-        own = each.view.layout
+    for selection in selections:
+        own = selection.view.layout
         beside = (*own[:axis], layout[axis], *own[axis + 1 :])
-        alike = dataclasses.replace(each.view, layout=beside) == first.view
-        if not alike or each.axis != axis or each.start != start:
+        alike = dataclasses.replace(selection.view, layout=beside) == first.view
+        if not alike or selection.axis != axis or selection.start != start:
             return None
-        start += each.size
+        start += selection.size
     whole = (static_shape(first.view.value) or ())[axis]
     if start != whole or math.prod(d.size for d in digits) != start:
         return None
@@ -95,7 +95,7 @@ def terms(view: View) -> tuple[View, View] | None:
     node = producer_of(view.value)
     if node is None or node.op_type != "Add" or not is_standard(node):
         return None
-    shapes = [static_shape(each) for each in node.inputs]
+    shapes = [static_shape(value) for value in node.inputs]
     if sole_reader(view.value) is None or None in shapes:
         return None
     first, second = (

@@ -292,12 +292,12 @@ class _Search:
         shape = static_shape(value)
         if node.op_type not in ("Add", "Sub") or not is_standard(node) or not shape:
             return None
-        terms = [each for each in node.inputs if each is not None]
-        rows = [static_shape(each) or () for each in terms if not holds_numbers(each)]
-        if any(each[-1:] != shape[-1:] for each in rows):
+        terms = [term for term in node.inputs if term is not None]
+        rows = [static_shape(term) or () for term in terms if not holds_numbers(term)]
+        if any(row[-1:] != shape[-1:] for row in rows):
             return None
         # The Add is needed as before; a layer or a constant among the terms takes W in
-        one, two = (self.of(each, owned=owned, depth=depth) for each in terms)
+        one, two = (self.of(term, owned=owned, depth=depth) for term in terms)
         minus = node.op_type == "Sub"
         cost = one.cost + two.cost + (not owned)
         cost += minus * shape[-1] * self.columns * self.item_cost
@@ -341,9 +341,9 @@ class _Search:
         rows = [a.reshape(-1) if a.size == a.shape[-1] else a for a in arrays]
         while len(rows) > 1 and rows[0].ndim == 1:
             rows = [rows[0] + rows[1], *rows[2:]]
-        values = [each for each in terms if isinstance(each, ir.Value)]
-        items = [*values, *(self._stored(each, "sum") for each in rows)]
-        items.sort(key=lambda each: math.prod(static_shape(each) or ()))
+        values = [term for term in terms if isinstance(term, ir.Value)]
+        items = [*values, *(self._stored(row, "sum") for row in rows)]
+        items.sort(key=lambda item: math.prod(static_shape(item) or ()))
         if len(items) > 1 and items[0].is_initializer():
             items[:2] = items[1], items[0]
         first, *rest = items
