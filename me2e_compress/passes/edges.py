@@ -191,9 +191,7 @@ def _ends(
     read = reader.entries(model)
     left = [v for v in source.exits(model) if not goes(v.producer())]
     if not read or not left:
-        what = (
-            f"{edge.reader} reads nothing" if left else f"{edge.source} gives nothing"
-        )
+        what = f"{edge.reader} reads" if left else f"{edge.source} gives"
         raise PreconditionError(f"edge {edge.label}: {what} nothing")
     # Restrict the reader's inputs to those that ``of`` makes
     made = [value for value in read if not source.holds(value.producer())]

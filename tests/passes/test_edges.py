@@ -191,7 +191,7 @@ def test_a_broadcast_of_more_than_one_meaning_is_none() -> None:
             r" what \*.attn reads \(query \[1,1,8\], bev \[1,5,8\]\)",
         ),
         (Edge("*.lidar", "*.attn"), r"the graph has no \*.lidar"),
-        (Edge("map", "*.lidar"), r"\*.lidar reads nothing"),
+        (Edge("map", "*.lidar"), r"\*.lidar reads nothing$"),
         (Edge("map", "planner", "add", of="occ"), "planner reads nothing of occ, only"),
         (Edge("planner", "map"), r"plan \[1,1,8\] does not fit /map/MatMul"),
         (Edge("motion", "*.attn", axis=7), "nothing that leaves motion"),
