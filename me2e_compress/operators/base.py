@@ -3,7 +3,7 @@
 import abc
 import dataclasses
 import functools
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import ClassVar
 
 import onnx_ir as ir
@@ -14,7 +14,14 @@ from me2e_compress.graph.shapes import Dims, open_shape, product
 from me2e_compress.graph.summary import total_bytes
 from me2e_compress.graph.validity import PLUGIN_DOMAIN
 from me2e_compress.operators.call import Attributes, FusedCall
-from me2e_compress.operators.dialect import OWN_DOMAIN, Arrays, Dialect, NdArray, Values
+from me2e_compress.operators.dialect import (
+    OWN_DOMAIN,
+    Arrays,
+    Dialect,
+    NdArray,
+    Shapes,
+    Values,
+)
 from me2e_compress.registry import Registry
 
 
@@ -59,9 +66,7 @@ class Operator(abc.ABC):
     def reference(self, inputs: Arrays, attributes: Attributes) -> NdArray:
         """Compute the operator in the own form, in numpy and float64."""
 
-    def output_shape(
-        self, shapes: Sequence[Dims | None], attributes: Attributes
-    ) -> Dims | None:
+    def output_shape(self, shapes: Shapes, attributes: Attributes) -> Dims | None:
         """Return the output's shape in the own form; unknown sizes are None."""
         letters = set(self.output.split())
         pairs = zip(self.own.operands, shapes, strict=False)
@@ -69,14 +74,12 @@ class Operator(abc.ABC):
             return None
         return self._sizes(self.output, shapes, attributes)
 
-    def macs(self, shapes: Sequence[Dims | None], attributes: Attributes) -> int | None:
+    def macs(self, shapes: Shapes, attributes: Attributes) -> int | None:
         """Count the multiply-accumulates of a call in the own form, if known."""
         sizes = self._sizes(self.work, shapes, attributes)
         return product(sizes) if self.work else None
 
-    def _sizes(
-        self, dims: str, shapes: Sequence[Dims | None], attributes: Attributes
-    ) -> Dims:
+    def _sizes(self, dims: str, shapes: Shapes, attributes: Attributes) -> Dims:
         """Replace letters of operands and names of attributes by their sizes."""
         known = {k: value for k, value in attributes.items() if isinstance(value, int)}
         for operand, shape in zip(self.own.operands, shapes, strict=False):
@@ -216,7 +219,11 @@ def int8_op_types() -> frozenset[str]:
 
 
 def _calls() -> list[tuple[Operator, Dialect]]:
-    return [(each, dialect) for each in operators() for dialect in each.all_dialects()]
+    return [
+        (operator, dialect)
+        for operator in operators()
+        for dialect in operator.all_dialects()
+    ]
 
 
 @functools.cache

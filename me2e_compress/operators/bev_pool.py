@@ -1,8 +1,6 @@
 """BEV pooling of camera features by depth (BEVPoolv2, arXiv 2211.17111)."""
 
 import dataclasses
-from collections.abc import Sequence
-from typing import ClassVar
 
 import numpy as np
 import onnx_ir as ir
@@ -21,6 +19,7 @@ from me2e_compress.operators.dialect import (
     Dialect,
     NdArray,
     Operand,
+    Shapes,
     Values,
     number,
     present,
@@ -57,9 +56,9 @@ class BEVPool(Operator):
     that share a cell, each cell once. Output [1, out_height, out_width, C].
     """
 
-    name: ClassVar[str] = "bev-pool"
-    own: ClassVar[Dialect] = _dialect("me2e", "BEVPoolV2", OWN_DOMAIN, "me2e")
-    dialects: ClassVar[tuple[Dialect, ...]] = (
+    name = "bev-pool"
+    own = _dialect("me2e", "BEVPoolV2", OWN_DOMAIN, "me2e")
+    dialects = (
         _dialect("derryhub", "BEVPoolV2TRT", "", _DERRYHUB),
         _dialect("derryhub-trt2", "BEVPoolV2TRT2", "", _DERRYHUB),
         _dialect("mmdeploy", "bev_pool_v2", "mmdeploy", "BEVDet"),
@@ -97,7 +96,7 @@ class BEVPool(Operator):
     def reference(self, inputs: Arrays, attributes: Attributes) -> NdArray:
         """Compute it in numpy, [1, out_height, out_width, C] float64."""
         depth, feature, of_depth, of_feature, of_cell, starts, lengths = (
-            np.asarray(each) for each in inputs
+            np.asarray(value) for value in inputs
         )
         rows = feature.reshape(-1, feature.shape[-1]).astype(np.float64)
         numbers = depth.reshape(-1).astype(np.float64)
@@ -108,15 +107,13 @@ class BEVPool(Operator):
             ground[of_cell[start]] = numbers[of_depth[one]] @ rows[of_feature[one]]
         return ground.reshape(1, height, width, -1)
 
-    def output_shape(
-        self, shapes: Sequence[Dims | None], attributes: Attributes
-    ) -> Dims | None:
+    def output_shape(self, shapes: Shapes, attributes: Attributes) -> Dims | None:
         """Return [1, out_height, out_width, C]."""
-        sizes = (number(attributes, each.name) for each in _SIZES)
+        sizes = (number(attributes, size.name) for size in _SIZES)
         feature = shapes[1]
         return (1, *sizes, None if feature is None else feature[-1])
 
-    def macs(self, shapes: Sequence[Dims | None], attributes: Attributes) -> int | None:
+    def macs(self, shapes: Shapes, attributes: Attributes) -> int | None:
         """Count one for each of the K points and C channels."""
         feature, ranks = shapes[1], shapes[2]
         if feature is None or ranks is None:

@@ -2,13 +2,10 @@
 
 import dataclasses
 import functools
-from collections.abc import Sequence
-from typing import ClassVar
 
 import numpy as np
 import onnx_ir as ir
 
-from me2e_compress.graph.shapes import Dims
 from me2e_compress.operators.base import Operator
 from me2e_compress.operators.bilinear import sample_levels, sample_levels_array
 from me2e_compress.operators.call import Attributes, FusedCall
@@ -23,6 +20,7 @@ from me2e_compress.operators.dialect import (
     Dialect,
     NdArray,
     Operand,
+    Shapes,
     Values,
     present,
 )
@@ -54,7 +52,7 @@ class ScaledFeature(Dialect):
         wide = call.cast(feature, scale.dtype or ir.DataType.FLOAT)
         return (call.add("Mul", [wide, scale]), *others)
 
-    def shapes_to_own(self, shapes: Sequence[Dims | None]) -> Sequence[Dims | None]:
+    def shapes_to_own(self, shapes: Shapes) -> Shapes:
         """Drop the shape of the scales."""
         return shapes[:5]
 
@@ -79,14 +77,12 @@ class DeformableAggregation(Operator):
     G). Output [N, A, C], the sum over points, cameras and levels.
     """
 
-    name: ClassVar[str] = "deformable-aggregation"
-    output: ClassVar[str] = "N A C"
-    work: ClassVar[str] = "4 N A P V L C"
-    int8_inputs: ClassVar[tuple[int, ...]] = (0,)
-    own: ClassVar[Dialect] = Dialect(
-        "me2e", _OP, OWN_DOMAIN, _operands(INTEGERS, FLOATS), "me2e"
-    )
-    dialects: ClassVar[tuple[Dialect, ...]] = (
+    name = "deformable-aggregation"
+    output = "N A C"
+    work = "4 N A P V L C"
+    int8_inputs = (0,)
+    own = Dialect("me2e", _OP, OWN_DOMAIN, _operands(INTEGERS, FLOATS), "me2e")
+    dialects = (
         Dialect("sparsedrive", _OP, "SparseDrive", _PLUGIN, "SparseDrive"),
         ScaledFeature(
             "sparsedrive-v2",
@@ -145,7 +141,7 @@ class DeformableAggregation(Operator):
 
     def reference(self, inputs: Arrays, attributes: Attributes) -> NdArray:
         """Compute it in numpy, [N, A, C] float64."""
-        feature, sizes, starts, at, weights = (np.asarray(each) for each in inputs)
+        feature, sizes, starts, at, weights = (np.asarray(array) for array in inputs)
         batch, anchors, points, cameras, levels, groups = weights.shape
         rows, width = feature.shape[1:]
         value = feature.astype(np.float64)

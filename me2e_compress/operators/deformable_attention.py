@@ -2,8 +2,7 @@
 
 import dataclasses
 import math
-from collections.abc import Iterable, Sequence
-from typing import ClassVar
+from collections.abc import Iterable
 
 import numpy as np
 import onnx_ir as ir
@@ -25,6 +24,7 @@ from me2e_compress.operators.dialect import (
     Dialect,
     NdArray,
     Operand,
+    Shapes,
     Values,
     present,
 )
@@ -104,7 +104,7 @@ class RawAttention(Dialect):
         raw = call.reshape(raw, (batch, queries, heads, -1))
         return self.in_types(call, (value, shapes, reference, offsets, raw))
 
-    def shapes_to_own(self, shapes: Sequence[Dims | None]) -> Sequence[Dims | None]:
+    def shapes_to_own(self, shapes: Shapes) -> Shapes:
         """Split the last axes into levels, points and x, y."""
         value, sizes, _, offsets, weights = shapes
         levels = None if sizes is None else sizes[0]
@@ -268,14 +268,14 @@ class DeformableAttention(Operator):
     :class:`~me2e_compress.operators.raw_attention.RawOwnForm`.
     """
 
-    name: ClassVar[str] = "deformable-attention"
-    output: ClassVar[str] = "N Q M D"
-    work: ClassVar[str] = "4 N Q M L P D"
-    int8_inputs: ClassVar[tuple[int, ...]] = (0,)
-    own: ClassVar[Dialect] = Dialect(
+    name = "deformable-attention"
+    output = "N Q M D"
+    work = "4 N Q M L P D"
+    int8_inputs = (0,)
+    own = Dialect(
         "me2e", "MultiScaleDeformableAttention", OWN_DOMAIN, _operands(INTEGERS), "me2e"
     )
-    dialects: ClassVar[tuple[Dialect, ...]] = (
+    dialects = (
         Dialect("tensorrt", _ATTENTION, "trt.plugins", _PLUGIN, _OSS),
         Dialect("tensorrt-v2", _ATTENTION, "trt.plugins", _PLUGIN, _OSS, (), "2"),
         Dialect("far3d", _ATTENTION, "trt", _PLUGIN, "DL4AGX far3d"),

@@ -2,7 +2,6 @@
 
 import dataclasses
 import math
-from typing import ClassVar
 
 import numpy as np
 import onnx_ir as ir
@@ -71,14 +70,12 @@ class DeformableConvolution(Operator):
     ``deform_groups``. Output [N, O, F, G].
     """
 
-    name: ClassVar[str] = "deformable-convolution"
-    output: ClassVar[str] = "N O F G"
-    work: ClassVar[str] = "N O F G I R S"
-    opset: ClassVar[int] = 19
-    own: ClassVar[Dialect] = Dialect(
-        "me2e", _CONV, OWN_DOMAIN, _operands(FLOATS), "me2e", _OWN
-    )
-    dialects: ClassVar[tuple[Dialect, ...]] = (
+    name = "deformable-convolution"
+    output = "N O F G"
+    work = "N O F G I R S"
+    opset = 19
+    own = Dialect("me2e", _CONV, OWN_DOMAIN, _operands(FLOATS), "me2e", _OWN)
+    dialects = (
         Dialect("tensorrt", _CONV, *_LIBRARY, _OSS),
         Dialect("tensorrt-v2", _CONV, *_LIBRARY, _OSS, "2"),
         Dialect("mmdeploy", _MMCV, "mmdeploy", *_MMDEPLOY, _OWN),
@@ -104,7 +101,7 @@ class DeformableConvolution(Operator):
     def reference(self, inputs: Arrays, attributes: Attributes) -> NdArray:
         """Compute it in numpy, [N, O, F, G] float64."""
         image, offset, mask, weight, *bias = (
-            np.asarray(each, np.float64) for each in inputs if each is not None
+            np.asarray(value, np.float64) for value in inputs if value is not None
         )
         batch, deep, high, wide = image.shape
         down, across = offset.shape[2:]

@@ -18,6 +18,7 @@ OWN_DOMAIN = "me2e"
 NdArray: TypeAlias = npt.NDArray[Any]
 Arrays: TypeAlias = Sequence[NdArray | None]
 Values: TypeAlias = Sequence[ir.Value | None]
+Shapes: TypeAlias = Sequence[Dims | None]
 
 FLOATS = (ir.DataType.FLOAT, ir.DataType.FLOAT16)
 FLOAT32 = (ir.DataType.FLOAT,)
@@ -163,7 +164,7 @@ class Dialect:
         """Convert the shape of the own form's output to that of this dialect's."""
         return shape
 
-    def shapes_to_own(self, shapes: Sequence[Dims | None]) -> Sequence[Dims | None]:
+    def shapes_to_own(self, shapes: Shapes) -> Shapes:
         """Convert the shapes of this dialect's inputs to those of the own form's."""
         return shapes
 
@@ -190,7 +191,7 @@ class Dialect:
         Raises:
             PreconditionError: an attribute is unknown, or has a value it cannot have.
         """
-        known = {each.name: each for each in self.attributes}
+        known = {attribute.name: attribute for attribute in self.attributes}
         attributes: dict[str, AttributeValue] = {n: a.default for n, a in known.items()}
         # Both name and value must be allowed
         for name, written in node.attributes.items():
@@ -214,7 +215,7 @@ class Dialect:
     def check(self, node: ir.Node) -> None:
         """Raise a PreconditionError where the inputs of a node do not fit."""
         # The number of inputs
-        least = sum(not each.optional for each in self.operands)
+        least = sum(not operand.optional for operand in self.operands)
         count = len(node.inputs)
         if not least <= count <= len(self.operands):
             wanted = str(least) if least == len(self.operands) else f"{least} or more"

@@ -2,13 +2,10 @@
 
 import dataclasses
 import itertools
-from collections.abc import Sequence
-from typing import ClassVar
 
 import numpy as np
 import onnx_ir as ir
 
-from me2e_compress.graph.shapes import Dims
 from me2e_compress.operators.base import Operator
 from me2e_compress.operators.call import Attributes, FusedCall
 from me2e_compress.operators.dialect import (
@@ -21,6 +18,7 @@ from me2e_compress.operators.dialect import (
     Dialect,
     NdArray,
     Operand,
+    Shapes,
     Values,
     number,
     present,
@@ -37,7 +35,7 @@ _CUBIC = -0.75
 
 def grid_sample_array(inputs: Arrays, attributes: Attributes) -> NdArray:
     """Compute ``grid_sample`` in numpy, [N, C, ...] float64."""
-    image, grid = (np.asarray(each, np.float64) for each in inputs)
+    image, grid = (np.asarray(value, np.float64) for value in inputs)
     batch, channels, *sizes = image.shape
     rows = image.reshape(batch, channels, -1)
     # Neighbours along each axis
@@ -139,7 +137,7 @@ class ScaledGrid(Dialect):
         grid = call.transpose(grid, (0, rank - 1, *range(1, rank - 1)))
         return image, call.add("Mul", [grid, call.numbers(_SCALE, grid)])
 
-    def shapes_to_own(self, shapes: Sequence[Dims | None]) -> Sequence[Dims | None]:
+    def shapes_to_own(self, shapes: Shapes) -> Shapes:
         """Put the components last."""
         image, grid = shapes
         return image, None if grid is None else (grid[0], *grid[2:], grid[1])
@@ -190,15 +188,15 @@ class GridSampler2D(Operator):
     [N, C, F, G].
     """
 
-    name: ClassVar[str] = "grid-sampler-2d"
-    output: ClassVar[str] = "N C F G"
-    work: ClassVar[str] = "N C F G"
-    own: ClassVar[Dialect] = _own(2)
-    dialects: ClassVar[tuple[Dialect, ...]] = (
+    name = "grid-sampler-2d"
+    output = "N C F G"
+    work = "N C F G"
+    own = _own(2)
+    dialects = (
         *_scaled(2),
         Dialect("mmdeploy", "grid_sampler", "mmdeploy", _MMDEPLOY, "mmdeploy", _OWN),
     )
-    opset: ClassVar[int] = 16
+    opset = 16
 
     def body(self, call: FusedCall, inputs: Values, attributes: Attributes) -> ir.Value:
         """Write GridSample, which onnxruntime's CPU has for float32 in every opset."""
@@ -218,7 +216,7 @@ class GridSampler2D(Operator):
         """Compute it in numpy, [N, C, ...] float64."""
         return grid_sample_array(inputs, attributes)
 
-    def macs(self, shapes: Sequence[Dims | None], attributes: Attributes) -> int | None:
+    def macs(self, shapes: Shapes, attributes: Attributes) -> int | None:
         """Count the neighbours of each element: 2 or 4 along each axis, or none."""
         mode = number(attributes, "interpolation_mode")
         elements, axes = super().macs(shapes, attributes), len(self.output.split()) - 2
@@ -242,9 +240,9 @@ class GridSampler3D(GridSampler2D):
     [N, C, E, F, G].
     """
 
-    name: ClassVar[str] = "grid-sampler-3d"
-    output: ClassVar[str] = "N C E F G"
-    work: ClassVar[str] = "N C E F G"
-    own: ClassVar[Dialect] = _own(3)
-    dialects: ClassVar[tuple[Dialect, ...]] = _scaled(3)
-    opset: ClassVar[int] = _RENAMED
+    name = "grid-sampler-3d"
+    output = "N C E F G"
+    work = "N C E F G"
+    own = _own(3)
+    dialects = _scaled(3)
+    opset = _RENAMED

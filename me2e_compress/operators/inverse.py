@@ -1,8 +1,6 @@
 """The inverse of small matrices, for example of cameras."""
 
 import dataclasses
-from collections.abc import Sequence
-from typing import ClassVar
 
 import numpy as np
 import onnx_ir as ir
@@ -19,6 +17,7 @@ from me2e_compress.operators.dialect import (
     Dialect,
     NdArray,
     Operand,
+    Shapes,
     Values,
     present,
 )
@@ -41,9 +40,9 @@ class Inverse(Operator):
     the determinant.
     """
 
-    name: ClassVar[str] = "inverse"
-    own: ClassVar[Dialect] = Dialect("me2e", "Inverse", OWN_DOMAIN, _ANY, "me2e")
-    dialects: ClassVar[tuple[Dialect, ...]] = (
+    name = "inverse"
+    own = Dialect("me2e", "Inverse", OWN_DOMAIN, _ANY, "me2e")
+    dialects = (
         *(
             Dialect(name, "InverseTRT", "", _BATCHES, "BEVFormer_tensorrt")
             for name in ("derryhub", "derryhub-trt2", "dl4agx-uniad")
@@ -81,13 +80,11 @@ class Inverse(Operator):
         """Compute it in numpy, float64."""
         return np.linalg.inv(np.asarray(inputs[0], np.float64))
 
-    def output_shape(
-        self, shapes: Sequence[Dims | None], attributes: Attributes
-    ) -> Dims | None:
+    def output_shape(self, shapes: Shapes, attributes: Attributes) -> Dims | None:
         """Return the shape of the matrices."""
         return shapes[0]
 
-    def macs(self, shapes: Sequence[Dims | None], attributes: Attributes) -> int | None:
+    def macs(self, shapes: Shapes, attributes: Attributes) -> int | None:
         """Count n cubed for each matrix, the work of an elimination."""
         shape = shapes[0]
         return None if shape is None else product((*shape, shape[-1]))

@@ -2,7 +2,6 @@
 
 import dataclasses
 import math
-from typing import ClassVar
 
 import numpy as np
 import onnx_ir as ir
@@ -64,14 +63,14 @@ class FusedMultiHeadAttention(Operator):
     heads side by side, of C / heads channels each.
     """
 
-    name: ClassVar[str] = "multi-head-attention"
-    output: ClassVar[str] = "B Q C"
-    work: ClassVar[str] = "2 B Q C K"
-    own: ClassVar[Dialect] = Dialect(
+    name = "multi-head-attention"
+    output = "B Q C"
+    work = "2 B Q C K"
+    own = Dialect(
         "me2e", "MultiHeadAttention", OWN_DOMAIN, _operands(FLOATS), "me2e",
         (Attribute("heads", 1, required=False),),
     )  # fmt: skip
-    dialects: ClassVar[tuple[Dialect, ...]] = tuple(
+    dialects = tuple(
         HeadsInBatch(name, op_type, "", _operands(INT8_TOO), "BEVFormer_tensorrt")
         for name, op_type in (("derryhub", "QKVTRT"), ("derryhub-trt2", "QKVTRT2"))
     )

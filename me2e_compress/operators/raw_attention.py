@@ -6,13 +6,12 @@ query's offsets and scores, and heads share its reference points.
 """
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 
 import numpy as np
 import onnx_ir as ir
 
 from me2e_compress.errors import PreconditionError
-from me2e_compress.graph.shapes import Dims
 from me2e_compress.operators.call import Attributes, FusedCall, Size
 from me2e_compress.operators.dialect import (
     FLOATS,
@@ -20,6 +19,7 @@ from me2e_compress.operators.dialect import (
     OWN_DOMAIN,
     Dialect,
     Operand,
+    Shapes,
     Values,
     present,
 )
@@ -95,7 +95,7 @@ class RawOwnForm(Dialect):
         result.type = ir.TensorType(ir.DataType.FLOAT)
         return result
 
-    def shapes_to_own(self, shapes: Sequence[Dims | None]) -> Sequence[Dims | None]:
+    def shapes_to_own(self, shapes: Shapes) -> Shapes:
         """Say how many levels and points there are after repetition."""
         value, sizes, starts, _, offsets, *_ = shapes
         if offsets is None:
@@ -132,7 +132,7 @@ def _tiled(
         if size == wanted or (beside and size == 1):
             continue
         if not isinstance(size, int) or not isinstance(wanted, int):
-            parts = [call.value_of(each) for each in (wanted, size)]
+            parts = [call.value_of(count) for count in (wanted, size)]
             times[axis] = call.add("Div", parts)
         elif size == 0 or wanted % size:
             raise PreconditionError(

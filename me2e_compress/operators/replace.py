@@ -8,7 +8,7 @@ import onnx_ir as ir
 
 from me2e_compress.errors import GraphError, PreconditionError
 from me2e_compress.graph import opset_of
-from me2e_compress.graph.nodes import STANDARD, is_read, nodes_in
+from me2e_compress.graph.nodes import STANDARD, bodies, is_read, nodes_in
 from me2e_compress.graph.rewrite import value_names
 from me2e_compress.graph.rewrite.raise_opset import raise_opset
 from me2e_compress.graph.shapes import open_shape
@@ -38,14 +38,13 @@ def fused_nodes(model: ir.Model) -> list[FusedNode]:
     """Return the fused nodes of a graph, of its bodies and of its functions."""
     names = value_names(model.graph)
     names.update(node.name or "" for node in nodes_in(model.graph))
-    bodies: list[tuple[ir.Graph | ir.Function, int, set[str]]]
-    bodies = [(model.graph, opset_of(model), names)]
-    bodies += [(f, opset_of(f), names_in(f)) for f in model.functions.values()]
+    names_of: dict[ir.Graph | ir.Function, set[str]] = {model.graph: names}
+    names_of |= {function: names_in(function) for function in model.functions.values()}
     return [
-        FusedNode(node, *row, opset, names)
-        for body, opset, names in bodies
+        FusedNode(node, *call, opset_of(body), names)
+        for body, names in names_of.items()
         for node in nodes_in(body)
-        if (row := find(node)) is not None
+        if (call := find(node)) is not None
     ]
 
 
@@ -75,8 +74,7 @@ def raise_for_bodies(
 
 def import_domains(model: ir.Model) -> None:
     """Import exactly the used domains; constants of functions become Constant nodes."""
-    bodies: list[ir.Graph | ir.Function] = [model.graph, *model.functions.values()]
-    for body in bodies:
+    for body, _ in bodies(model):
         # Drop unused imports and add missing ones
         used = {node.domain for node in nodes_in(body)}
         for domain in body.opset_imports.keys() - used - {*STANDARD}:

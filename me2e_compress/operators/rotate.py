@@ -2,13 +2,10 @@
 
 import dataclasses
 import math
-from collections.abc import Sequence
-from typing import ClassVar
 
 import numpy as np
 import onnx_ir as ir
 
-from me2e_compress.graph.shapes import Dims
 from me2e_compress.operators.base import Operator
 from me2e_compress.operators.bilinear import sample_levels
 from me2e_compress.operators.call import Attributes, FusedCall
@@ -21,6 +18,7 @@ from me2e_compress.operators.dialect import (
     Dialect,
     NdArray,
     Operand,
+    Shapes,
     Values,
     present,
 )
@@ -54,11 +52,11 @@ class Rotate(Operator):
     [C, H, W], as torchvision's ``rotate`` (BEVFormer_tensorrt, rotateKernel.cu).
     """
 
-    name: ClassVar[str] = "rotate"
-    output: ClassVar[str] = "C H W"
-    work: ClassVar[str] = "4 C H W"
-    own: ClassVar[Dialect] = _dialect("me2e", "Rotate", OWN_DOMAIN, "me2e")
-    dialects: ClassVar[tuple[Dialect, ...]] = (
+    name = "rotate"
+    output = "C H W"
+    work = "4 C H W"
+    own = _dialect("me2e", "Rotate", OWN_DOMAIN, "me2e")
+    dialects = (
         _dialect("derryhub", "RotateTRT", "", _DERRYHUB),
         _dialect("derryhub-trt2", "RotateTRT2", "", _DERRYHUB),
         _dialect("dl4agx-uniad", "RotateTRT", "", _DERRYHUB),
@@ -119,7 +117,7 @@ class Rotate(Operator):
 
     def reference(self, inputs: Arrays, attributes: Attributes) -> NdArray:
         """Compute it in numpy, [C, H, W] float64."""
-        image, angle, center = (np.asarray(each, np.float64) for each in inputs)
+        image, angle, center = (np.asarray(value, np.float64) for value in inputs)
         height, width = image.shape[1:]
         # Rotate the pixel centres back
         turn = -np.deg2rad(angle.item())
@@ -135,7 +133,7 @@ class Rotate(Operator):
         grid = 2 * at[None] / size - 1
         return grid_sample_array((image[None], grid), BILINEAR).squeeze(0)
 
-    def macs(self, shapes: Sequence[Dims | None], attributes: Attributes) -> int | None:
+    def macs(self, shapes: Shapes, attributes: Attributes) -> int | None:
         """Count four neighbours for each element; none for the nearest."""
         nearest = attributes["interpolation"] == 1
         return 0 if nearest else super().macs(shapes, attributes)

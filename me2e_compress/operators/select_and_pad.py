@@ -1,7 +1,6 @@
 """The flagged rows of a table, padded to a fixed number."""
 
 import dataclasses
-from typing import ClassVar
 
 import numpy as np
 import onnx_ir as ir
@@ -49,13 +48,11 @@ class SelectAndPad(Operator):
     where a row is taken; invalid [C]; ``P`` rows. Output [B, P, C].
     """
 
-    name: ClassVar[str] = "select-and-pad"
-    output: ClassVar[str] = "B P C"
-    work: ClassVar[str] = "0"
-    own: ClassVar[Dialect] = _dialect(
-        "me2e", "SelectAndPad", OWN_DOMAIN, "me2e", FLOATS, INTEGERS
-    )
-    dialects: ClassVar[tuple[Dialect, ...]] = (
+    name = "select-and-pad"
+    output = "B P C"
+    work = "0"
+    own = _dialect("me2e", "SelectAndPad", OWN_DOMAIN, "me2e", FLOATS, INTEGERS)
+    dialects = (
         _dialect("dl4agx", "SelectAndPadPlugin", "custom_op", "DL4AGX", FLOAT32),
         _dialect("autoware", "SelectAndPadPlugin", "", "Autoware"),
     )
@@ -87,7 +84,7 @@ class SelectAndPad(Operator):
 
     def reference(self, inputs: Arrays, attributes: Attributes) -> NdArray:
         """Compute it in numpy, [B, P, C] float64."""
-        feature, flag, invalid = (np.asarray(each) for each in inputs)
+        feature, flag, invalid = (np.asarray(value) for value in inputs)
         count = number(attributes, "P")
         result = np.empty((len(feature), count, feature.shape[2]))
         result[:] = invalid

@@ -2,7 +2,6 @@
 
 import dataclasses
 from collections.abc import Sequence
-from typing import ClassVar
 
 import numpy as np
 import onnx_ir as ir
@@ -18,6 +17,7 @@ from me2e_compress.operators.dialect import (
     Dialect,
     NdArray,
     Operand,
+    Shapes,
     Values,
     number,
     numbers,
@@ -43,17 +43,15 @@ class WinogradConvolution(Operator):
     distributed, 64 to 512 channels).
     """
 
-    name: ClassVar[str] = "winograd-convolution"
-    own: ClassVar[Dialect] = Dialect(
+    name = "winograd-convolution"
+    own = Dialect(
         "me2e", "WinogradConvolution", OWN_DOMAIN,
         (Operand("X", "N C H W"), Operand("W", "K C 3 3"), Operand("B", "K")), "me2e",
         (Attribute("pads", (0, 0, 0, 0)), Attribute("relu", 0, choices=(0, 1))),
     )  # fmt: skip
-    dialects: ClassVar[tuple[Dialect, ...]] = ()
+    dialects = ()
 
-    def output_shape(
-        self, shapes: Sequence[Dims | None], attributes: Attributes
-    ) -> Dims | None:
+    def output_shape(self, shapes: Shapes, attributes: Attributes) -> Dims | None:
         """Return [N, K, H', W'], smaller than the padded image by 2."""
         batch, out, *image = self._sizes("N K H W", shapes, attributes)
         pads = numbers(attributes, "pads")
@@ -63,7 +61,7 @@ class WinogradConvolution(Operator):
         )
         return (batch, out, *sizes)
 
-    def macs(self, shapes: Sequence[Dims | None], attributes: Attributes) -> int | None:
+    def macs(self, shapes: Shapes, attributes: Attributes) -> int | None:
         """Count those of the convolution, not of the algorithm."""
         made = self.output_shape(shapes, attributes)
         (deep,) = self._sizes("C", shapes, attributes)
@@ -91,7 +89,7 @@ class WinogradConvolution(Operator):
         options = (*numbers(attributes, "pads"), number(attributes, "relu"))
         given = [image, weight, bias, call.integers(options)]
         result = call.add(self.own.op_type, given, domain=DOMAIN)
-        made = self.output_shape([open_shape(each) for each in inputs], attributes)
+        made = self.output_shape([open_shape(value) for value in inputs], attributes)
         result.shape = None if made is None else ir.Shape(made)
         result.type = ir.TensorType(ir.DataType.FLOAT)
         return result
@@ -99,7 +97,7 @@ class WinogradConvolution(Operator):
     def reference(self, inputs: Arrays, attributes: Attributes) -> NdArray:
         """Compute it in numpy, [N, K, H', W'] float64."""
         image, weight, bias = (
-            np.asarray(each, np.float64) for each in inputs if each is not None
+            np.asarray(value, np.float64) for value in inputs if value is not None
         )
         top, left, bottom, right = numbers(attributes, "pads")
         padded = np.pad(image, ((0, 0), (0, 0), (top, bottom), (left, right)))

@@ -8,6 +8,7 @@ import numpy.typing as npt
 
 from me2e_compress.operators import Dialect
 from me2e_compress.operators.grid_sampler import ScaledGrid
+from tests.operators.running import in_float32
 
 Arrays = dict[str, npt.NDArray[Any]]
 Drawn = tuple[Arrays, Mapping[str, Any]]
@@ -15,11 +16,8 @@ Random = np.random.Generator
 
 
 def single(**arrays: npt.NDArray[Any]) -> Arrays:
-    kinds: dict[Any, type] = {
-        np.dtype(np.float64): np.float32,
-        np.dtype(np.int64): np.int32,
-    }
-    return {name: a.astype(kinds.get(a.dtype, a.dtype)) for name, a in arrays.items()}
+    ints = {n: a.astype(np.int32) for n, a in arrays.items() if a.dtype == np.int64}
+    return in_float32({**arrays, **ints})
 
 
 def aggregation(dialect: Dialect, random: Random) -> Drawn:
@@ -62,13 +60,10 @@ def sampler(dialect: Dialect, random: Random) -> Drawn:
     grid = random.uniform(-1.6, 1.6, (batch, *random.integers(1, 4, dims), dims))
     if isinstance(dialect, ScaledGrid):
         grid = 10 * np.moveaxis(grid, -1, 1)
-    options = (random.integers(2), random.integers(3), random.integers(2))
-    attributes = dict(
-        zip((a.name for a in dialect.attributes), map(int, options), strict=True)
-    )
-    return single(
-        input=random.normal(size=(batch, channels, *sizes)), grid=grid
-    ), attributes
+    options = map(int, (random.integers(2), random.integers(3), random.integers(2)))
+    names = (attribute.name for attribute in dialect.attributes)
+    image = random.normal(size=(batch, channels, *sizes))
+    return single(input=image, grid=grid), dict(zip(names, options, strict=True))
 
 
 def selection(dialect: Dialect, random: Random) -> Drawn:
@@ -85,32 +80,27 @@ def pool(dialect: Dialect, random: Random) -> Drawn:
     cells = random.permutation(12)[:5]
     lengths = random.integers(1, 4, 5)
     total = int(lengths.sum())
-    arrays = {
-        "depth": random.uniform(size=(2, 3, 2, 2)),
-        "feat": random.normal(size=(2, 2, 2, 4)),
-        "ranks_depth": random.integers(0, 24, total),
-        "ranks_feat": random.integers(0, 8, total),
-        "ranks_bev": np.repeat(cells, lengths),
-        "interval_starts": lengths.cumsum() - lengths,
-        "interval_lengths": lengths,
-    }
-    whole = {
-        n: a.astype(np.int32) if a.dtype == np.int64 else a for n, a in arrays.items()
-    }
-    return single(**whole), {"out_height": 3, "out_width": 4}
+    arrays = single(
+        depth=random.uniform(size=(2, 3, 2, 2)),
+        feat=random.normal(size=(2, 2, 2, 4)),
+        ranks_depth=random.integers(0, 24, total),
+        ranks_feat=random.integers(0, 8, total),
+        ranks_bev=np.repeat(cells, lengths),
+        interval_starts=lengths.cumsum() - lengths,
+        interval_lengths=lengths,
+    )
+    return arrays, {"out_height": 3, "out_width": 4}
 
 
 def attention(dialect: Dialect, random: Random) -> Drawn:
-    batch, queries, keys, width, heads = (
-        int(each) for each in random.integers(1, 6, 5)
-    )
-    heads = heads if dialect.attributes else 1
-    width *= heads
+    batch, queries, keys, width, heads = map(int, random.integers(1, 6, 5))
+    options = {"heads": heads} if dialect.attributes else {}
+    width *= options.get("heads", 1)
     return single(
         query=random.normal(size=(batch, queries, width)),
         key=random.normal(size=(batch, keys, width)),
         value=random.normal(size=(batch, keys, width)),
-    ), {"heads": heads} if dialect.attributes else {}
+    ), options
 
 
 def convolution(dialect: Dialect, random: Random) -> Drawn:

@@ -6,12 +6,12 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import onnx_ir as ir
-import onnxruntime
 
-from me2e_compress.graph.shapes import infer_shapes
+from me2e_compress.graph import infer_shapes, opset_of
 from me2e_compress.operators import Dialect, Operator, expand
 from me2e_compress.operators.call import AttributeValue
 from me2e_compress.testing.check_operator import DrawnCall, dialect_reference
+from tests.passes.small import compute
 
 Arrays = Mapping[str, npt.NDArray[Any]]
 
@@ -56,21 +56,15 @@ def graph_of(
         if name in constants:
             value.const_value = ir.tensor(array, name=name)
         values.append(value)
-    node = ir.node(
-        dialect.op_type,
-        values,
-        attributes,
-        domain=dialect.domain,
-        name="fused",
-        num_outputs=1,
-    )
+    domain = dialect.domain
+    node = ir.node(dialect.op_type, values, attributes, domain=domain, name="fused")
     node.outputs[0].name = "result"
     graph = ir.Graph(
         [value for value in values if value.name not in constants],
         node.outputs,
         nodes=[node],
         initializers=[value for value in values if value.name in constants],
-        opset_imports={"": opset, dialect.domain: opset if not dialect.domain else 1},
+        opset_imports={domain: 1, "": opset},
         name="one",
     )
     return ir.Model(graph, ir_version=9)
@@ -79,41 +73,19 @@ def graph_of(
 def run(model: ir.Model, arrays: Arrays) -> npt.NDArray[Any]:
     """Run a graph of standard operators by onnxruntime; return its output."""
     infer_shapes(model)
-    options = onnxruntime.SessionOptions()
-    options.intra_op_num_threads = 1
-    options.log_severity_level = 3
-    written = ir.to_proto(model).SerializeToString()
-    session = onnxruntime.InferenceSession(
-        written, options, providers=["CPUExecutionProvider"]
-    )
-    asked = {port.name for port in session.get_inputs()}
-    found = session.run(None, {n: a for n, a in arrays.items() if n in asked})
-    return np.asarray(found[0])
+    names = {port.name for port in model.graph.inputs}
+    feeds = {name: array for name, array in arrays.items() if name in names}
+    return np.asarray(compute(model, feeds)[0])
 
 
 def body_and_reference(
-    operator: Operator,
-    dialect: Dialect,
-    arrays: Arrays,
-    *,
-    opset: int,
-    constants: Sequence[str] = (),
-    attributes: Mapping[str, AttributeValue] | None = None,
-    open_dims: bool = False,
+    operator: Operator, dialect: Dialect, model: ir.Model, arrays: Arrays
 ) -> tuple[npt.NDArray[Any], npt.NDArray[Any]]:
-    """Run the body of one call, and compute its reference on the same arrays."""
-    model = graph_of(
-        dialect,
-        arrays,
-        opset=opset,
-        constants=constants,
-        attributes=attributes,
-        open_dims=open_dims,
-    )
+    """Run the body of the only node of a graph, and compute its reference."""
     node = model.graph[0]
-    call = DrawnCall(arrays, attributes or {})
-    expand(node, opset=opset, by="test")
-    assert all(each.domain == "" for each in model.graph)
-    for domain in [each for each in model.graph.opset_imports if each]:
+    call = DrawnCall(arrays, dialect.attributes_of(node))
+    expand(node, opset=opset_of(model), by="test")
+    assert all(node.domain == "" for node in model.graph)
+    for domain in model.graph.opset_imports.keys() - {""}:
         del model.graph.opset_imports[domain]
     return run(model, arrays), dialect_reference(operator, dialect, call)

@@ -121,9 +121,8 @@ def test_the_body_of_every_dialect_is_its_reference(
 ) -> None:
     arrays = arrays_of(dialect, call)
     constants = [name for name in SHAPES if name in arrays] if known else []
-    got, want = body_and_reference(
-        OPERATOR, dialect, arrays, opset=opset, constants=constants
-    )
+    model = graph_of(dialect, arrays, opset=opset, constants=constants)
+    got, want = body_and_reference(OPERATOR, dialect, model, arrays)
     assert got.shape == want.shape
     np.testing.assert_allclose(got, want, rtol=0, atol=1e-4)
 
@@ -134,9 +133,8 @@ def test_sizes_that_only_the_run_tells(dialect: Dialect, opset: int) -> None:
     arrays = arrays_of(dialect, CALL)
     raw = isinstance(dialect, RawAttention)  # needs levels and points of a group
     constants = ["spatial_shapes", "reference_points"] if raw else []
-    got, want = body_and_reference(
-        OPERATOR, dialect, arrays, opset=opset, constants=constants, open_dims=True
-    )
+    model = graph_of(dialect, arrays, opset=opset, constants=constants, open_dims=True)
+    got, want = body_and_reference(OPERATOR, dialect, model, arrays)
     np.testing.assert_allclose(got, want, rtol=0, atol=1e-4)
 
 
@@ -145,12 +143,11 @@ def test_in_float64_the_body_is_the_reference_to_rounding(name: str) -> None:
     dialect = dialect_of(OPERATOR, name)
     assert dialect is not None
     arrays = {
-        key: array.astype(np.float64) if array.dtype == np.float32 else array
-        for key, array in arrays_of(dialect, CALL).items()
+        name: array.astype(np.float64) if array.dtype == np.float32 else array
+        for name, array in arrays_of(dialect, CALL).items()
     }
-    got, want = body_and_reference(
-        OPERATOR, dialect, arrays, opset=13, constants=["spatial_shapes"]
-    )
+    model = graph_of(dialect, arrays, opset=13, constants=SHAPES[:1])
+    got, want = body_and_reference(OPERATOR, dialect, model, arrays)
     assert got.dtype == np.float64
     np.testing.assert_allclose(got, want, rtol=1e-9, atol=1e-12)
 
@@ -192,18 +189,8 @@ def node_of(dialect: str, **changed: npt.NDArray[Any]) -> ir.Node:
 @pytest.mark.parametrize(
     ("dialect", "attribute", "arrays", "message"),
     [
-        (
-            "mmdeploy",
-            ir.AttrInt64("im2col", 64),
-            {},
-            "fused: .*: no attribute 'im2col'; there are im2col_step",
-        ),
-        (
-            "mmdeploy",
-            ir.AttrString("im2col_step", "64"),
-            {},
-            "im2col_step is '64', not int",
-        ),
+        ("mmdeploy", ir.AttrInt64("im2col", 64), {}, "'im2col'; there are im2col_step"),
+        ("mmdeploy", ir.AttrString("im2col_step", "64"), {}, "step is '64', not int"),
         (
             "tensorrt",
             None,
@@ -211,18 +198,8 @@ def node_of(dialect: str, **changed: npt.NDArray[Any]) -> ir.Node:
             r"fused: MultiscaleDeformableAttnPlugin_TRT of TensorRT OSS:"
             r" sampling_locations is \[1, 3, 2, 8\], not \[N=1, Q=3, M=2, L=2",
         ),
-        (
-            "derryhub",
-            None,
-            {"spatial_shapes": np.ones((3, 2), np.int32)},
-            "do not go with 3 levels",
-        ),
-        (
-            "me2e-raw",
-            None,
-            {"mask": np.ones((1, 1, 1, 1, 3), np.float32)},
-            "mask has 3 of axis 4, which do not",
-        ),
+        ("derryhub", None, {"spatial_shapes": np.ones((3, 2), "i")}, "with 3 levels"),
+        ("me2e-raw", None, {"mask": np.ones((1,) * 4 + (3,), "f")}, "3 of axis 4, whi"),
     ],
 )
 def test_what_a_dialect_does_not_take_is_named(
@@ -267,14 +244,6 @@ def test_the_domain_and_the_version_tell_the_dialect(
     assert found is not None
     assert found[1].name == name
     assert find(ir.node("GridSample", [])) is None
-
-
-def test_a_node_says_what_it_gives() -> None:
-    own = OPERATOR.own
-    shapes = [(1, 30, 8, 32), (1, 2), (1,), (1, 100, 8, 1, 4, 2), (1, 100, 8, 1, 4)]
-    assert OPERATOR.output_shape(shapes, {}) == (1, 100, 8, 32)
-    assert OPERATOR.macs(shapes, {}) == 4 * 100 * 8 * 4 * 32
-    assert own.domain == "me2e"
 
 
 def test_it_says_which_inputs_are_positions_and_which_scores() -> None:

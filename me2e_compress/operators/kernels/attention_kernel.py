@@ -75,14 +75,14 @@ class _Step:
         builder = self.builder
         before = self._row(self.state, WORD(MOST))
         # new = max(old, scores), in variables that LLVM keeps in registers
-        largest = [self._variable(each) for each in before]
+        largest = [self._variable(vector) for vector in before]
         with cgutils.for_range(builder, self.count) as loop:
             scores = self._row(self.scores, loop.index)
             for most, score in zip(largest, scores, strict=True):
                 old = builder.load(most)
                 more = builder.fcmp_unordered(">", score, old)
                 builder.store(builder.select(more, score, old), most)
-        most = [builder.load(each) for each in largest]
+        most = [builder.load(variable) for variable in largest]
         self._set_row(self.state, WORD(MOST), most)
         # What was summed before has powers of score - old: times 2^(old - new)
         corrections = [
@@ -97,7 +97,7 @@ class _Step:
         ]
         with cgutils.for_range(builder, self.channels) as loop:
             row = zip(self._row(self.sums, loop.index), corrections, strict=True)
-            corrected = [builder.fmul(each, correction) for each, correction in row]
+            corrected = [builder.fmul(total, correction) for total, correction in row]
             self._set_row(self.sums, loop.index, corrected)
         # 2^(score - new), and the total of these
         with cgutils.for_range(builder, self.count) as loop:
@@ -108,7 +108,7 @@ class _Step:
             self._set_row(self.scores, loop.index, powers)
             for total, power in zip(totals, powers, strict=True):
                 builder.store(builder.fadd(builder.load(total), power), total)
-        self._set_row(self.state, WORD(SUM), [builder.load(each) for each in totals])
+        self._set_row(self.state, WORD(SUM), [builder.load(total) for total in totals])
 
     def _variable(self, vector: Any) -> Any:
         return cgutils.alloca_once_value(self.builder, vector)

@@ -39,14 +39,16 @@ def register(options: ort.SessionOptions, kernels: Iterable[CompiledKernel]) -> 
         ImportError: Numba is not installed, or does not work here.
     """
     library = trampoline()
-    _asked.code = {each: load_or_compile(each, default_folder()) for each in kernels}
+    _asked.code = {
+        kernel: load_or_compile(kernel, default_folder()) for kernel in kernels
+    }
     library.fill(_address(_register))
     options.register_custom_ops_library(library.path)
 
 
 def register_named(options: ort.SessionOptions, names: Iterable[str]) -> None:
     """Call :func:`register` for kernels given by name."""
-    known = {each.op_type: each for each in KERNELS}
+    known = {kernel.op_type: kernel for kernel in KERNELS}
     register(options, [known[name] for name in names])
 
 
@@ -83,8 +85,8 @@ def _operator(kernel: CompiledKernel, compute: int, block: int, base: int) -> An
     """Write an ``OrtCustomOp``, followed by the state of its kernels."""
     name = ctypes.create_string_buffer(kernel.op_type.encode())
     texts = [
-        ctypes.create_string_buffer(f"{kernel.op_type}: {each}".encode())
-        for each in kernel.messages
+        ctypes.create_string_buffer(f"{kernel.op_type}: {message}".encode())
+        for message in kernel.messages
     ]
     # Callbacks that describe the operator, called only on opening
     callbacks = {

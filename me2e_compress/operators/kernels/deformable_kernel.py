@@ -209,7 +209,7 @@ def functions_of(
             and the sizes Q and P, and returns whether sizes fit.
         block: makes the function of a block, for the element type of value.
     """
-    kind = next((_KINDS[each] for each in _KINDS if op_type.endswith(each)), None)
+    kind = next((_KINDS[name] for name in _KINDS if op_type.endswith(name)), None)
     inputs = ranks if kind is not None else ranks[:-2]
     compute = _compute(inputs, len(ranks) - 2, words_of_call, queries, take)
     return {"compute": compute, "block": block(kind or types.float32)}

@@ -69,7 +69,7 @@ def _fingerprint() -> str:
     known = hashlib.sha256()
     for file in sorted(Path(__file__).parent.glob("*.py")):
         known.update(file.read_bytes())
-    versions = (metadata.version(each) for each in ("numba", "llvmlite"))
+    versions = (metadata.version(package) for package in ("numba", "llvmlite"))
     cpu = (llvm.get_host_cpu_name(), llvm.get_host_cpu_features().flatten())
     known.update("\n".join((*versions, *cpu, platform.machine())).encode())
     return known.hexdigest()[:32]

@@ -74,7 +74,7 @@ class Vectors:
         self.builder.call(function, [place, INT(0), INT(3), INT(1)])
 
     def _masked(self, name: str, result: Any, arguments: list[Any]) -> Any:
-        kind = ir.FunctionType(result, [each.type for each in arguments])
+        kind = ir.FunctionType(result, [value.type for value in arguments])
         name = f"llvm.masked.{name}.v{self.lanes}f32.p0"
         function = cgutils.get_or_insert_function(self.builder.module, kind, name)
         return self.builder.call(function, arguments)

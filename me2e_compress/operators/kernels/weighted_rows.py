@@ -50,7 +50,7 @@ class _Loops:
         self.rows = builder.inttoptr(rows, ELEMENTS[kind].as_pointer())
         self.offsets = builder.inttoptr(offsets, INT.as_pointer())
         self.weights, self.out = (
-            builder.inttoptr(each, FLOAT.as_pointer()) for each in (weights, out)
+            builder.inttoptr(address, FLOAT.as_pointer()) for address in (weights, out)
         )
         self.first, self.last, self.size = first, last, size
 

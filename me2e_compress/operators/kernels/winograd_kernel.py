@@ -161,11 +161,11 @@ def _outputs(
     across = []
     for part in range(SIDE):
         parts = (WORD(k * SIDE + part) for k in range(SIDE))
-        places = [w.place(m, builder.mul(plane, each)) for each in parts]
+        places = [w.place(m, builder.mul(plane, part)) for part in parts]
         across.append(_output(w, [w.load(place) for place in places]))
     for k in range(OUT):
         made = [w.add(each, both[0]) for each in _output(w, [col[k] for col in across])]
-        made = [w.at_least(each, both[1]) for each in made]
+        made = [w.at_least(node, both[1]) for node in made]
         # Rows below the image have no lanes
         inside = builder.icmp_signed("<", WORD(k), rows)
         limit = builder.select(inside, count, WORD(0))

@@ -9,16 +9,14 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from me2e_compress.errors import FramesError
-from me2e_compress.operators import kernels
 from me2e_compress.operators.multi_head_attention import FusedMultiHeadAttention
 from me2e_compress.runtime import runnable
 from me2e_compress.runtime.session import Session
+from tests.operators.kernels import needs_kernels
 from tests.operators.running import graph_of
 from tests.support.profiles import scaled
 
-pytestmark = pytest.mark.skipif(
-    kernels.why_not() is not None, reason=str(kernels.why_not())
-)
+pytestmark = needs_kernels
 
 OPERATOR = FusedMultiHeadAttention()
 Arrays = dict[str, npt.NDArray[Any]]
@@ -73,9 +71,7 @@ def test_it_answers_its_reference(
 
 
 @pytest.mark.parametrize(("width", "called"), [(8, ["MultiHeadAttention"]), (300, [])])
-def test_its_kernel_is_called_unless_heads_are_too_wide(
-    width: int, called: list[str]
-) -> None:
+def test_the_kernel_refuses_wide_heads(width: int, called: list[str]) -> None:
     arrays = drawn(1, 5, 6, width)
     model = graph_of(OPERATOR.own, arrays, opset=17)
 

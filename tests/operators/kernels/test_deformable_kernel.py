@@ -8,20 +8,19 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from me2e_compress.operators import Dialect, kernels
+from me2e_compress.operators import Dialect
 from me2e_compress.operators.deformable_aggregation import DeformableAggregation
 from me2e_compress.operators.deformable_attention import DeformableAttention
 from me2e_compress.operators.raw_attention import raw_own_form
 from me2e_compress.runtime import runnable
 from me2e_compress.runtime.session import Session
 from me2e_compress.testing.check_operator import DrawnCall, dialect_reference
+from tests.operators.kernels import needs_kernels
 from tests.operators.running import graph_of, in_float32
 from tests.operators.test_deformable_attention import arrays_of
 from tests.support.profiles import scaled
 
-pytestmark = pytest.mark.skipif(
-    kernels.why_not() is not None, reason=str(kernels.why_not())
-)
+pytestmark = needs_kernels
 
 OPERATOR = DeformableAttention()
 RAW = raw_own_form()
@@ -129,9 +128,7 @@ def raw_call(scores: int = 16, spread: float = 9) -> dict[str, Any]:
 
 
 @pytest.mark.parametrize(("scores", "spread"), [(16, 9), (8, 9), (4, 90), (6, 90)])
-def test_levels_share_offsets_and_a_camera_without_weight_is_not_read(
-    scores: int, spread: float
-) -> None:
+def test_a_camera_without_weight_is_not_read(scores: int, spread: float) -> None:
     arrays = raw_call(scores, spread)
     arrays["mask"][:, :, :, 1] = 0
     expected = dialect_reference(OPERATOR, RAW, DrawnCall(arrays))

@@ -8,12 +8,10 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from me2e_compress.operators import kernels
+from tests.operators.kernels import needs_kernels
 from tests.support.profiles import scaled
 
-pytestmark = pytest.mark.skipif(
-    kernels.why_not() is not None, reason=str(kernels.why_not())
-)
+pytestmark = needs_kernels
 
 
 @pytest.fixture(scope="module")

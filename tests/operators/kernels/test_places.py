@@ -8,10 +8,7 @@ import pytest
 
 from me2e_compress.operators import kernels
 from me2e_compress.operators.kernels import trampoline
-
-needs_kernels = pytest.mark.skipif(
-    kernels.why_not() is not None, reason=str(kernels.why_not())
-)
+from tests.operators.kernels import needs_kernels
 
 
 def test_the_folder_is_this_users_alone(tmp_path: Path) -> None:
@@ -52,7 +49,7 @@ def test_no_writable_cache(tmp_path: Path) -> None:
 
 
 @needs_kernels
-def test_a_cache_from_which_nothing_may_run(
+def test_a_cache_mounted_noexec(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     real = ctypes.CDLL

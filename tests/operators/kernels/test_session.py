@@ -27,12 +27,9 @@ from me2e_compress.runtime.session import Session, open_graph
 from me2e_compress.workflows.checks import try_first
 from me2e_compress.workflows.listing import doctor
 from me2e_compress.workflows.result import SILENT
+from tests.operators.kernels import needs_kernels
 from tests.operators.running import graph_of
 from tests.operators.test_deformable_attention import CALL, arrays_of
-
-needs_kernels = pytest.mark.skipif(
-    kernels.why_not() is not None, reason=str(kernels.why_not())
-)
 
 OPERATOR = DeformableAttention()
 TENSORRT = dialect_of(OPERATOR, "tensorrt")
@@ -159,9 +156,7 @@ def _claim(model: ir.Model, name: str) -> None:
 
 
 @needs_kernels
-def test_a_library_that_claims_the_operator_does_no_harm(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_another_library_may_have_the_operator(monkeypatch: pytest.MonkeyPatch) -> None:
     model, arrays = call()
     node = model.graph[0]
     mine = kernels.KERNELS[0]
@@ -243,9 +238,7 @@ def test_a_graph_with_kernels_is_opened_apart_with_them(
     assert verdict.read_bytes() == b"ran"
 
 
-def test_numba_is_imported_for_fused_nodes_only(
-    driver: ir.Model, tmp_path: Path
-) -> None:
+def test_numba_is_imported_only_for_kernels(driver: ir.Model, tmp_path: Path) -> None:
     graph.save(driver, tmp_path / "m.onnx")
     script = (
         "import sys; from pathlib import Path\n"

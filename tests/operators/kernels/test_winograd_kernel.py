@@ -14,12 +14,11 @@ from me2e_compress.errors import FramesError
 from me2e_compress.operators import kernels
 from me2e_compress.operators.winograd_convolution import WinogradConvolution
 from me2e_compress.runtime.session import Session
+from tests.operators.kernels import needs_kernels
 from tests.operators.running import graph_of
 from tests.support.profiles import scaled
 
-pytestmark = pytest.mark.skipif(
-    kernels.why_not() is not None, reason=str(kernels.why_not())
-)
+pytestmark = needs_kernels
 
 OPERATOR = WinogradConvolution()
 Arrays = dict[str, npt.NDArray[np.float32]]
@@ -119,9 +118,7 @@ def test_no_run_keeps_memory() -> None:
         ("X", (1, 4, 1, 5), "at least 2 x 2"),
     ],
 )
-def test_inputs_that_do_not_fit(
-    name: str, shape: tuple[int, ...], message: str
-) -> None:
+def test_misfit_inputs(name: str, shape: tuple[int, ...], message: str) -> None:
     shapes = {"X": (1, 4, 5, 5), "W": (3, 3, 4, 6), "B": (6,), "options": (5,)}
     shapes[name] = shape
     arrays: dict[str, npt.NDArray[Any]] = {
