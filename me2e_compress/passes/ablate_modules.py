@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Callable
-from typing import ClassVar, Literal
+from typing import Literal
 
 import onnx_ir as ir
 
@@ -68,8 +68,8 @@ class AblateModules(Pass):
         edges: what reads what besides, or instead; ``drop=[]`` adds them alone.
     """
 
-    name: ClassVar[str] = "ablate-modules"
-    exact: ClassVar[bool] = False
+    name = "ablate-modules"
+    exact = False
     drop: tuple[str, ...]
     fill: Literal["zeros", "substitute", "means"] = "substitute"
     keep: tuple[str, ...] = ()

@@ -3,7 +3,6 @@
 import dataclasses
 import itertools
 from collections.abc import Sequence
-from typing import ClassVar
 
 import numpy as np
 import onnx_ir as ir
@@ -41,8 +40,8 @@ class AttachBodies(Pass):
     functions cannot have) get no body; the notes name them.
     """
 
-    name: ClassVar[str] = "attach-bodies"
-    exact: ClassVar[bool] = True
+    name = "attach-bodies"
+    exact = True
 
     def run(self, model: ir.Model, context: Context) -> PassResult:
         """Add a function for each kind of fused node that has none."""

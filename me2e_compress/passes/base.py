@@ -64,9 +64,8 @@ class Context:
         # Measure only what an earlier run has not measured
         known = self.measured.get(name)
         if known is None or not known.hold_for(graph.digest(model), tensors, method):
-            known = Calibrator(method, provider=self.provider).run(
-                model, tensors, self.frames
-            )
+            calibrator = Calibrator(method, provider=self.provider)
+            known = calibrator.run(model, tensors, self.frames)
             self.measured[name] = known
         return known
 

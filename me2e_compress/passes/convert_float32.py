@@ -1,7 +1,6 @@
 """Convert a float16 graph to float32."""
 
 import dataclasses
-from typing import ClassVar
 
 import onnx_ir as ir
 
@@ -29,8 +28,8 @@ class ConvertFloat32(Pass):
     and bodies of If, Loop and Scan are left alone.
     """
 
-    name: ClassVar[str] = "convert-float32"
-    exact: ClassVar[bool] = False
+    name = "convert-float32"
+    exact = False
 
     def run(self, model: ir.Model, context: Context) -> PassResult:
         """Retype every node that can be retyped and drop the Casts that become idle."""

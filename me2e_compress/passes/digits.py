@@ -81,7 +81,7 @@ def regrouped(layout: Layout, shape: Sequence[int]) -> Layout | None:
 
 
 def before(node: ir.Node, layout: Layout) -> Layout | None:
-    """Return the layout of what a node reads, from that of what it gives.
+    """Return the layout of a node's input from that of its output.
 
     None if it is no layout operator, a shape is unknown, or a Reshape breaks digits up.
     """
@@ -116,16 +116,10 @@ def split_like(digits: Digits, others: Iterable[Digit]) -> Digits:
     # sizes 2, 4 and 2, of which the last is the most significant
     pieces_of: list[Digit] = []
     for digit in digits:
-        inner = {
-            edge
-            for edge in edges.get(digit.axis, ())
-            if digit.stride < edge < digit.end
-        }
-        bounds = [digit.stride, *sorted(inner), digit.end]
-        pieces = [
-            Digit(digit.axis, low, high // low)
-            for low, high in itertools.pairwise(bounds)
-        ]
+        known = sorted(edges.get(digit.axis, ()))
+        inner = (edge for edge in known if digit.stride < edge < digit.end)
+        bounds = itertools.pairwise([digit.stride, *inner, digit.end])
+        pieces = [Digit(digit.axis, low, high // low) for low, high in bounds]
         pieces_of.extend(reversed(pieces))
     return tuple(pieces_of)
 
@@ -137,15 +131,10 @@ def runs(source: Digits, wanted: Digits) -> tuple[list[Digits], list[int]]:
     """
     # A run begins wherever the next wanted digit is not the next of the source
     places = [source.index(digit) for digit in wanted]
-    starts = [
-        place
-        for before, place in zip([None, *places], places, strict=False)
-        if before is None or place != before + 1
-    ]
+    pairs = itertools.pairwise([-2, *places])
+    starts = [place for before, place in pairs if place != before + 1]
     # The same runs in the order of the source, each up to where the next begins
     cuts = sorted(starts)
-    pieces = [
-        source[low:high]
-        for low, high in zip(cuts, [*cuts[1:], len(source)], strict=True)
-    ]
+    bounds = itertools.pairwise([*cuts, len(source)])
+    pieces = [source[low:high] for low, high in bounds]
     return pieces, [cuts.index(start) for start in starts]

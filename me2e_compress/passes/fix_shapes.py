@@ -4,7 +4,6 @@ import contextlib
 import dataclasses
 import json
 from collections.abc import Mapping, Sequence
-from typing import ClassVar
 
 import onnx
 import onnx_ir as ir
@@ -33,9 +32,9 @@ class FixShapes(Pass):
         RecipeError: a size is below 1, or none is given.
     """
 
-    name: ClassVar[str] = "fix-shapes"
-    exact: ClassVar[bool] = True
-    changes_interface: ClassVar[bool] = True
+    name = "fix-shapes"
+    exact = True
+    changes_interface = True
     dims: Mapping[str, int]
 
     def __post_init__(self) -> None:

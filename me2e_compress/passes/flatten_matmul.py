@@ -2,7 +2,6 @@
 
 import dataclasses
 import math
-from typing import ClassVar
 
 import numpy as np
 import onnx_ir as ir
@@ -45,8 +44,8 @@ class FlattenMatmul(Pass):
     the same; a runtime may add them up in another order.
     """
 
-    name: ClassVar[str] = "flatten-matmul"
-    exact: ClassVar[bool] = True
+    name = "flatten-matmul"
+    exact = True
 
     def run(self, model: ir.Model, context: Context) -> PassResult:
         """Rewrite every product that has a cheaper form, until none has."""

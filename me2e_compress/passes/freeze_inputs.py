@@ -3,7 +3,6 @@
 import dataclasses
 import json
 import math
-from typing import ClassVar
 
 import numpy as np
 import onnx_ir as ir
@@ -36,9 +35,9 @@ class FreezeInputs(Pass):
         inputs: the inputs that become constant.
     """
 
-    name: ClassVar[str] = "freeze-inputs"
-    exact: ClassVar[bool] = False
-    changes_interface: ClassVar[bool] = True
+    name = "freeze-inputs"
+    exact = False
+    changes_interface = True
     inputs: tuple[str, ...] = ("lidar2img",)
 
     def __post_init__(self) -> None:

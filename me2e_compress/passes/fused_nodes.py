@@ -2,7 +2,6 @@
 
 import dataclasses
 from collections import Counter
-from typing import ClassVar
 
 import onnx_ir as ir
 
@@ -32,8 +31,8 @@ class TranslatePlugins(Pass):
         RecipeError: no such dialect.
     """
 
-    name: ClassVar[str] = "translate-plugins"
-    exact: ClassVar[bool] = True
+    name = "translate-plugins"
+    exact = True
 
     dialect: str
 
@@ -82,8 +81,8 @@ class ExpandOperators(Pass):
     plugin that no dialect names is left alone.
     """
 
-    name: ClassVar[str] = "expand-operators"
-    exact: ClassVar[bool] = True
+    name = "expand-operators"
+    exact = True
 
     def run(self, model: ir.Model, context: Context) -> PassResult:
         """Expand the nodes of the graph, of its bodies and of its functions.

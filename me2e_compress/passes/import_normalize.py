@@ -1,8 +1,9 @@
 """Bring a graph of any origin into the form that the other passes expect."""
 
 import dataclasses
+import itertools
+from collections import defaultdict
 from collections.abc import Iterator
-from typing import ClassVar
 
 import numpy as np
 import onnx_ir as ir
@@ -168,8 +169,8 @@ class ImportNormalize(Pass):
         n = me2e.plugin.RotateTRT(x)  ;  y = Mul(n, c)   with c a float32 initializer
     """
 
-    name: ClassVar[str] = "import-normalize"
-    exact: ClassVar[bool] = True
+    name = "import-normalize"
+    exact = True
 
     def run(self, model: ir.Model, context: Context) -> PassResult:
         """Rewrite the model in place."""
@@ -257,18 +258,16 @@ def _name_nodes(model: ir.Model, by: str) -> int:
         # Reserve all existing names first
         nodes = list(nodes_in(body))
         reserved = {node.name for node in nodes if node.name}
-        taken, counters = set[str](), dict[str, int]()
+        taken = set[str]()
+        counters = defaultdict[str, Iterator[int]](itertools.count)
         for node in nodes:
             if node.name and node.name not in taken:
                 taken.add(node.name)
                 continue
             # Take the first free number
             stem = node.name or node.op_type
-            number = counters.get(stem, 0)
-            while f"{stem}_{number}" in reserved:
-                number += 1
-            counters[stem] = number + 1
-            node.name = f"{stem}_{number}"
+            names = (f"{stem}_{number}" for number in counters[stem])
+            node.name = next(name for name in names if name not in reserved)
             reserved.add(node.name)
             taken.add(node.name)
             provenance.inherit(node, [node], by=by)

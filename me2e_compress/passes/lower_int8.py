@@ -2,7 +2,6 @@
 
 import dataclasses
 from pathlib import Path
-from typing import ClassVar
 
 import onnx_ir as ir
 
@@ -35,9 +34,9 @@ class LowerInt8(Pass):
         ranges: file of saved ranges instead of frames.
     """
 
-    name: ClassVar[str] = "lower-int8"
-    exact: ClassVar[bool] = False
-    reads_ranges: ClassVar[bool] = True
+    name = "lower-int8"
+    exact = False
+    reads_ranges = True
     method: str = DEFAULT_METHOD
     ranges: Path | None = None
 
@@ -50,23 +49,19 @@ class LowerInt8(Pass):
         # Ranges of tensors that TensorRT leaves in float
         missing, ranges = self.ranged_tensors(model, context), None
         if missing:
-            method, saved = self.method, self.ranges
-            ranges = context.ranges(
-                self.name, model, missing, method=method, saved=saved
-            )
+            name, method, saved = self.name, self.method, self.ranges
+            ranges = context.ranges(name, model, missing, method=method, saved=saved)
         lowered = onnxruntime.convert(model, ranges)
         provenance.sign(model, lowered, self.name)
         if plan := plan_of(model):
             stamp_plan(lowered, dataclasses.replace(plan, target="onnxruntime"))
         layers = onnxruntime.int8_layers(lowered)
-        return PassResult(
-            lowered,
-            len(layers) or int(graph.digest(lowered) != graph.digest(model)),
-            (
-                f"{plural(len(layers), 'layer')} in int8 for onnxruntime",
-                f"{plural(len(missing), 'tensor')} calibrated besides the graph's",
-            ),
+        changes = len(layers) or int(graph.digest(lowered) != graph.digest(model))
+        notes = (
+            f"{plural(len(layers), 'layer')} in int8 for onnxruntime",
+            f"{plural(len(missing), 'tensor')} calibrated besides the graph's",
         )
+        return PassResult(lowered, changes, notes)
 
     def ranged_tensors(self, model: ir.Model, context: Context) -> tuple[str, ...]:
         """Return the names of the tensors whose range is not in the graph."""

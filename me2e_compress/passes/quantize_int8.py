@@ -3,7 +3,6 @@
 import dataclasses
 import functools
 from pathlib import Path
-from typing import ClassVar
 
 import onnx_ir as ir
 
@@ -50,10 +49,10 @@ class QuantizeInt8(Pass):
         ranges: file of saved ranges instead of frames.
     """
 
-    name: ClassVar[str] = "quantize-int8"
-    exact: ClassVar[bool] = False
-    quantizes: ClassVar[bool] = True
-    reads_ranges: ClassVar[bool] = True
+    name = "quantize-int8"
+    exact = False
+    quantizes = True
+    reads_ranges = True
     scheme: str = "full"
     modules: tuple[str, ...] = ()
     rules: str | RuleSet = DEFAULT_RULES

@@ -10,36 +10,22 @@ import pytest
 
 from me2e_compress.errors import Me2eError
 from me2e_compress.graph import provenance
-from me2e_compress.graph.modules.module_map import ModuleMap
 from me2e_compress.manager import PassManager, recipe
-from me2e_compress.passes.base import Context
 from me2e_compress.passes.fold_constants import FoldConstants
 from me2e_compress.runtime.session import REFUSALS
 from tests.passes import onnx_cases
 from tests.passes.onnx_cases import Case
+from tests.passes.small import NO_MODULES
 
 pytestmark = pytest.mark.xdist_group("onnx-suite")
 
-EXACT = PassManager(
-    tuple(
-        FoldConstants(bytes_per_node=1 << 40)
-        if current.name == "fold-constants"
-        else current
-        for current in recipe.load("exact")
-    ),
-    verify_frames=0,
-)
+UNLIMITED = {"fold-constants": FoldConstants(bytes_per_node=1 << 40)}
+PASSES = tuple(UNLIMITED.get(each.name, each) for each in recipe.load("exact"))
+EXACT = PassManager(PASSES, verify_frames=0)
 """The recipe, folding whatever it costs; the cases bring inputs of their own."""
 
-NO_MODULES = Context(ModuleMap("none", ()))
-
-FAILURES: tuple[type[Exception], ...] = (
-    *REFUSALS,
-    Me2eError,
-    RuntimeError,
-    TypeError,
-    ValueError,
-)
+FAILURES: tuple[type[Exception], ...]
+FAILURES = (*REFUSALS, Me2eError, RuntimeError, TypeError, ValueError)
 
 
 Kind = tuple[tuple[object, ...], ...]
@@ -86,9 +72,8 @@ class Form:
             provenance.stamp(node, provenance.Provenance("all", (node.name,)))
         try:
             report = EXACT.run(model, NO_MODULES)
-            self.folded += any(
-                step.changes for step in report.steps if step.name == "fold-constants"
-            )
+            steps = {step.name: step.changes for step in report.steps}
+            self.folded += bool(steps["fold-constants"])
             after = ir.to_proto(report.model)
             found = onnx_cases.run(dataclasses.replace(case, model=after))
             fault = onnx_cases.differs(case, found) or onnx_cases.moved(case, found)

@@ -23,7 +23,5 @@ def test_files_are_the_paths_that_are_set() -> None:
         (QuantizeInt8(ranges=Path("r.json")), False),
     ],
 )
-def test_frames_are_needed_where_nothing_else_is_given(
-    current: Pass, needs: bool
-) -> None:
+def test_which_passes_need_frames(current: Pass, needs: bool) -> None:
     assert current.needs_frames is needs

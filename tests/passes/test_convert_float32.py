@@ -51,9 +51,7 @@ def test_where_nothing_is_to_be_done(text: str) -> None:
     ],
     ids=["a cast", "what is unread goes", "a half interface"],
 )
-def test_a_half_interface_is_cast_to_and_from(
-    x: str, body: str, left: list[str]
-) -> None:
+def test_a_half_interface_is_cast(x: str, body: str, left: list[str]) -> None:
     text = f"g ({x}[2] x) => (float16[2] y) {{ {body} }}"
 
     model = apply(ConvertFloat32(), read(HEAD + text)).model

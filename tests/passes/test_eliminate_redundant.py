@@ -70,9 +70,7 @@ def test_identities_go(call: str, weights: dict[str, Any]) -> None:
         ),
     ],
 )
-def test_what_only_looks_like_an_identity_stays(
-    call: str, weights: dict[str, Any], why: str
-) -> None:
+def test_near_identities_stay(call: str, weights: dict[str, Any], why: str) -> None:
     model = read(one(call, out="float[A,B]"), **weights)
     assert apply(EliminateRedundant(), model).changes == 0, why
 
@@ -99,9 +97,7 @@ DRAWN = TWINS.replace("Add(x, z)", "RandomNormalLike(x)").replace(
         (DRAWN, ("det", "det"), 3),
     ],
 )
-def test_equal_nodes_become_one_within_their_module(
-    text: str, modules: tuple[str, str], left: int
-) -> None:
+def test_equal_nodes_are_merged(text: str, modules: tuple[str, str], left: int) -> None:
     model = read(text)
     for node, module in zip(model.graph, (*modules, modules[1]), strict=True):
         provenance.stamp(node, provenance.Provenance(module, (node.name or "",)))

@@ -91,9 +91,7 @@ m (float[n,3] x, float[4,5] w) => (float[3,5] y) { t = Transpose(x) y = MatMul(t
         ({"n": 1}, REFUSES, "the graph refuses n=1"),
     ],
 )
-def test_sizes_that_do_not_fit_are_an_error(
-    sizes: dict[str, int], text: str, message: str
-) -> None:
+def test_sizes_that_do_not_fit(sizes: dict[str, int], text: str, message: str) -> None:
     with pytest.raises(PreconditionError, match=message):
         fixed(sizes, text)
 

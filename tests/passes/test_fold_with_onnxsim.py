@@ -8,14 +8,10 @@ import pytest
 from me2e_compress import graph
 from me2e_compress.errors import PassError
 from me2e_compress.graph import provenance
-from me2e_compress.graph.modules.module_map import ModuleMap
 from me2e_compress.graph.provenance import Provenance
-from me2e_compress.passes import Context, fold_with_onnxsim
+from me2e_compress.passes import fold_with_onnxsim
 from me2e_compress.passes.fold_with_onnxsim import FoldWithOnnxsim
-
-CONTEXT = Context(
-    ModuleMap.parse('[modules.neck]\nrole = "feature"\npatterns = ["neck"]', "one")
-)
+from tests.passes.small import NO_MODULES
 
 
 @pytest.fixture(scope="module")
@@ -35,7 +31,7 @@ def model() -> ir.Model:
 
 @pytest.fixture(scope="module")
 def folded(model: ir.Model) -> ir.Model:
-    return FoldWithOnnxsim().run(model, CONTEXT).model
+    return FoldWithOnnxsim().run(model, NO_MODULES).model
 
 
 def test_what_depends_on_no_input_is_folded(model: ir.Model, folded: ir.Model) -> None:
@@ -59,7 +55,7 @@ def test_names_pasts_and_metadata_come_back(folded: ir.Model) -> None:
     tensors = [value.const_value for value in folded.graph.initializers.values()]
     assert tensors
     assert not any(isinstance(tensor, ir.ExternalTensor) for tensor in tensors)
-    again = FoldWithOnnxsim().run(folded, CONTEXT)
+    again = FoldWithOnnxsim().run(folded, NO_MODULES)
     assert again.changes == 0
     assert graph.digest(again.model) == graph.digest(folded)
 
@@ -70,7 +66,7 @@ def test_weights_that_stay_are_shared_with_the_model() -> None:
         "g (float[2] x) => (float[2] y) <float[2] w = {1.0, 2.0}> {"
         " t = Exp (w)  z = Mul (x, t)  y = Add (z, w) }"
     )
-    result = FoldWithOnnxsim().run(kept, CONTEXT).model
+    result = FoldWithOnnxsim().run(kept, NO_MODULES).model
     assert [node.op_type for node in result.graph] == ["Mul", "Add"]
     weight = kept.graph.initializers["w"]
     assert result.graph.initializers["w"].const_value is weight.const_value
@@ -91,15 +87,12 @@ def stand_in(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, code: str) -> None
     ],
 )
 def test_a_crash_is_one_line(
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    model: ir.Model,
-    code: str,
-    reason: str,
-) -> None:
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, model: ir.Model,
+    code: str, reason: str,
+) -> None:  # fmt: skip
     stand_in(tmp_path, monkeypatch, code)
     with pytest.raises(PassError) as caught:
-        FoldWithOnnxsim().run(model, CONTEXT)
+        FoldWithOnnxsim().run(model, NO_MODULES)
     assert reason in str(caught.value)
     assert "\n" not in str(caught.value)
 
@@ -109,4 +102,4 @@ def test_a_process_that_takes_too_long_is_ended(
 ) -> None:
     stand_in(tmp_path, monkeypatch, "import time; time.sleep(60)")
     with pytest.raises(PassError, match=r"longer than 0\.2 s"):
-        FoldWithOnnxsim(timeout_s=0.2).run(model, CONTEXT)
+        FoldWithOnnxsim(timeout_s=0.2).run(model, NO_MODULES)

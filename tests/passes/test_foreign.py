@@ -10,15 +10,10 @@ import pytest
 from me2e_compress import graph
 from me2e_compress.errors import PassError
 from me2e_compress.graph import provenance
-from me2e_compress.graph.modules.module_map import ModuleMap
 from me2e_compress.graph.provenance import Provenance
-from me2e_compress.passes import Context
 from me2e_compress.passes.foreign import SurgeonFunction
 from me2e_compress.testing import check_pass
-
-CONTEXT = Context(
-    ModuleMap.parse('[modules.neck]\nrole = "feature"\npatterns = ["neck"]', "one")
-)
+from tests.passes.small import NO_MODULES
 
 
 @pytest.fixture
@@ -40,12 +35,10 @@ def drop_second_relu(surgeon: gs.Graph) -> None:
     surgeon.cleanup(recurse_functions=False)
 
 
-def test_it_is_a_frozen_dataclass_that_does_what_the_function_does(
-    model: ir.Model,
-) -> None:
+def test_the_pass_is_frozen_and_calls_the_function(model: ir.Model) -> None:
     current = SurgeonFunction(drop_second_relu, name="drop-second-relu")
     before = graph.digest(model)
-    result = current.run(model, CONTEXT)
+    result = current.run(model, NO_MODULES)
     assert graph.digest(model) == before
     assert [node.name for node in result.model.graph] == ["n_a", "n_y"]
     assert [provenance.module_of(n) for n in result.model.graph] == ["neck", "planner"]
@@ -54,9 +47,7 @@ def test_it_is_a_frozen_dataclass_that_does_what_the_function_does(
         current.name = "other"  # type: ignore[misc]
 
 
-def test_a_returned_graph_counts_and_new_nodes_join_their_neighbours(
-    model: ir.Model,
-) -> None:
+def test_new_nodes_of_a_returned_graph_have_a_module(model: ir.Model) -> None:
     def insert(surgeon: gs.Graph) -> gs.Graph:
         twin = surgeon.copy()
         last = twin.nodes[-1]
@@ -66,7 +57,7 @@ def test_a_returned_graph_counts_and_new_nodes_join_their_neighbours(
         last.inputs[0] = added
         return twin
 
-    result = SurgeonFunction(insert, name="insert-abs").run(model, CONTEXT)
+    result = SurgeonFunction(insert, name="insert-abs").run(model, NO_MODULES)
     by_name = {node.name: provenance.read(node) for node in result.model.graph}
     assert by_name["mine"] == Provenance("det", ("n_b",), ("insert-abs",))
     assert by_name["n_y"] == Provenance("planner", ("n_y",))
@@ -88,7 +79,7 @@ def test_a_node_with_another_attribute_names_the_pass() -> None:
 
 
 def test_a_function_that_does_nothing_changes_nothing(model: ir.Model) -> None:
-    result = SurgeonFunction(lambda surgeon: None, name="idle").run(model, CONTEXT)
+    result = SurgeonFunction(lambda surgeon: None, name="idle").run(model, NO_MODULES)
     assert result.changes == 0
     assert result.model is model
 
@@ -99,4 +90,4 @@ def test_a_function_that_returns_something_else_is_refused(model: ir.Model) -> N
 
     current = SurgeonFunction(count, name="count")  # pyright: ignore[reportArgumentType]
     with pytest.raises(PassError, match="count returned a int, not a graph or None"):
-        current.run(model, CONTEXT)
+        current.run(model, NO_MODULES)

@@ -100,9 +100,7 @@ def test_neither_frames_nor_inputs(tmp_path: Path) -> None:
         ("s = ReduceMax<keepdims=0>(prev_y) c = Greater(s, one)", ()),
     ],
 )
-def test_inputs_that_decide_a_branch_are_named(
-    read: str, names: tuple[str, ...]
-) -> None:
+def test_inputs_of_conditions_are_named(read: str, names: tuple[str, ...]) -> None:
     text = f"""g (int64[1] rate, bool flag, bool other, float[4,9] x, float[4] prev_y)
         => (float[4] next_y) <int64 two = {{2}}, float one = {{1}}> {{
         {read}

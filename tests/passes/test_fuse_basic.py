@@ -29,19 +29,16 @@ def statistics(channels: int) -> dict[str, Any]:
     }
 
 
+BIAS = {"bias": normal(8)}
 LAYERS = [
     ("Conv<pads = [1, 1, 1, 1]>(x, weight)", {"weight": normal(8, 4, 3, 3)}, 8),
-    ("Conv(x, weight, bias)", {"weight": normal(8, 4, 1, 1), "bias": normal(8)}, 8),
+    ("Conv(x, weight, bias)", BIAS | {"weight": normal(8, 4, 1, 1)}, 8),
     ("Conv<group = 2>(x, weight)", {"weight": normal(8, 2, 1, 1)}, 8),
-    (
-        "ConvTranspose(x, weight, bias)",
-        {"weight": normal(4, 8, 2, 2), "bias": normal(8)},
-        8,
-    ),
+    ("ConvTranspose(x, weight, bias)", BIAS | {"weight": normal(4, 8, 2, 2)}, 8),
     ("ConvTranspose<group = 2>(x, weight)", {"weight": normal(4, 3, 2, 2)}, 6),
     (
         "Gemm<alpha = 0.5, beta = 2.0, transB = 1>(x, weight, bias)",
-        {"weight": normal(8, 4), "bias": normal(8)},
+        BIAS | {"weight": normal(8, 4)},
         8,
     ),
 ]
@@ -63,9 +60,7 @@ def test_a_normalization_goes_into_the_layer(
 
 @pytest.mark.parametrize("op", ["Add", "Sub", "Mul", "Div"])
 @pytest.mark.parametrize("shape", [(8, 1, 1), (1, 8, 1, 1), (1,), ()])
-def test_a_constant_per_channel_goes_into_the_convolution(
-    op: str, shape: tuple[int, ...]
-) -> None:
+def test_constants_per_channel_are_folded(op: str, shape: tuple[int, ...]) -> None:
     text = (
         f"g ({IMAGE} x) => (float[1,8,6,6] y) {{ a = Conv(x, weight) y = {op}(a, c) }}"
     )
@@ -223,9 +218,7 @@ COUNT = (
         ("<noop_with_empty_axes = 1>", "", "bool[2,3,4]"),
     ],
 )
-def test_conditions_are_not_counted_as_integers(
-    options: str, axes: str, y: str
-) -> None:
+def test_conditions_are_counted_as_floats(options: str, axes: str, y: str) -> None:
     text = text_of(COUNT.format(options, axes), x="float[2,3,4]", y=y)
     weights = {"zero": np.float32(0), "nothing": np.int64(0), "last": np.array([-1])}
     model, before = read(text, **weights), read(text, **weights)

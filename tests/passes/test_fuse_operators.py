@@ -250,9 +250,7 @@ def test_what_is_none_is_left_with_the_reason(case: str) -> None:
     assert reason in note
 
 
-def test_what_the_body_does_not_agree_with_stays(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_match_whose_body_differs_stays(monkeypatch: pytest.MonkeyPatch) -> None:
     right = DeformableAttention.body
 
     def wrong(self: Any, call: Any, inputs: Any, attributes: Any) -> Any:

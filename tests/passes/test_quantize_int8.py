@@ -77,10 +77,7 @@ SAFE = {"target": "tensorrt"}
                 "2 tensors calibrated on 4 frames",
             ],
         ),
-        (
-            SAFE,
-            ["1 of 10 nodes int8; attention-weights 2, layer 1, small-product 1"],
-        ),
+        (SAFE, ["1 of 10 nodes int8; attention-weights 2, layer 1, small-product 1"]),
         (
             SAFE | {"rules": "safe{without=[small-product, attention-weights]}"},
             ["4 of 10 nodes int8; attention 2, layer 2"],
@@ -105,7 +102,7 @@ def test_notes_say_what_was_decided_by_which_rule(
         ({"modules": ("backbone", "head")}, 4),
     ],
 )
-def test_schemes_and_modules_choose(
+def test_schemes_and_modules(
     context: Context, options: dict[str, object], changes: int
 ) -> None:
     chosen = QuantizeInt8(rules="paper", target="tensorrt", **options)  # type: ignore[arg-type]
@@ -113,9 +110,7 @@ def test_schemes_and_modules_choose(
     assert chosen.run(conv_attention(), context).changes == changes
 
 
-def test_frames_and_graphs_that_do_not_fit_are_refused(
-    context: Context, tmp_path: Path
-) -> None:
+def test_unfit_frames_and_graphs_are_refused(context: Context, tmp_path: Path) -> None:
     bare, model = Context(MODULES), conv_attention()
     with pytest.raises(FramesError, match=r"needs recorded frames .* never made up"):
         QuantizeInt8(rules="paper").run(model, bare)
@@ -231,19 +226,11 @@ def test_overrides_are_read_from_a_file(context: Context, tmp_path: Path) -> Non
     [
         ({"scheme": "fp8"}, RecipeError, "no scheme fp8; there are feature-ext"),
         ({"modules": ("occ",)}, ModuleMapError, "occ: no such module"),
-        (
-            {"rules": "safe{without=[speed]}"},
-            RecipeError,
-            "rule speed cannot be switched off",
-        ),
+        ({"rules": "safe{without=[speed]}"}, RecipeError, "speed cannot be switched "),
         ({"rules": "int4"}, RecipeError, "no rule set 'int4'; there are safe, paper"),
         ({"target": "qnn"}, RecipeError, "no target 'qnn'; there are tensorrt"),
         ({"overrides": Path("none.toml")}, RecipeError, "none.toml: no such file"),
-        (
-            {"method": "median", "rules": "paper"},
-            RecipeError,
-            "no calibration method 'median'",
-        ),
+        ({"method": "median", "rules": "paper"}, RecipeError, "no calibration method"),
     ],
 )
 def test_what_is_not_there_is_named(
@@ -261,11 +248,8 @@ def test_saved_ranges_give_the_same_graph_without_frames(
     Calibrator("max-min").run(model, TENSORS, frames).save(path)
 
     measured = PAPER.run(conv_attention(), context).model
-    read = (
-        QuantizeInt8(rules="paper", target="tensorrt", ranges=path)
-        .run(model, Context(MODULES))
-        .model
-    )
+    saved = QuantizeInt8(rules="paper", target="tensorrt", ranges=path)
+    read = saved.run(model, Context(MODULES)).model
 
     assert graph.digest(read) == graph.digest(measured)
 
@@ -285,9 +269,7 @@ def test_the_rules_choose_the_method_unless_it_is_asked_for(
     assert QuantizeInt8(**options).method_of_ranges == method  # type: ignore[arg-type]
 
 
-def test_ranges_of_another_graph_are_refused(
-    frames: CalibrationSet, tmp_path: Path
-) -> None:
+def test_stale_ranges_are_refused(frames: CalibrationSet, tmp_path: Path) -> None:
     path = tmp_path / "r.json"
     Calibrator().run(conv_attention(seed=1), TENSORS, frames).save(path)
 
@@ -295,12 +277,9 @@ def test_ranges_of_another_graph_are_refused(
         QuantizeInt8(rules="paper", ranges=path).run(conv_attention(), Context(MODULES))
 
 
-def test_what_the_target_keeps_in_float_is_not_counted_as_int8(
-    context: Context,
-) -> None:
-    result = QuantizeInt8(rules="paper", target="onnxruntime").run(
-        conv_attention(), context
-    )
+def test_layers_that_the_target_keeps_in_float_do_not_count(context: Context) -> None:
+    paper = QuantizeInt8(rules="paper", target="onnxruntime")
+    result = paper.run(conv_attention(), context)
 
     assert result.changes == len(int8_layers(result.model)) == 2
     with pytest.raises(PreconditionError, match="only symmetric int8"):
@@ -343,9 +322,7 @@ def scales(model: ir.Model) -> set[str]:
     }
 
 
-def test_scales_are_of_the_type_of_the_graph_and_so_if_float16_comes_behind(
-    context: Context,
-) -> None:
+def test_scales_of_a_float16_graph_are_float16(context: Context) -> None:
     wide = half(19, context)
     placed = check_pass(PAPER, wide, context).model
     found = compare(Session(wide), Session(placed), list(context.frames or ()))
@@ -369,9 +346,7 @@ def test_scales_are_of_the_type_of_the_graph_and_so_if_float16_comes_behind(
         ("onnxruntime", "onnxruntime has int8 kernels for float32 alone"),
     ],
 )
-def test_the_refusal_names_the_way_out(
-    target: str, reason: str, context: Context
-) -> None:
+def test_refusals_name_the_remedy(target: str, reason: str, context: Context) -> None:
     step = QuantizeInt8(rules="paper", target=target)
 
     with pytest.raises(PreconditionError, match=re.escape(reason)) as raised:
@@ -381,7 +356,7 @@ def test_the_refusal_names_the_way_out(
     assert check_pass(step, wide, context).changes > 0
 
 
-def test_what_was_placed_for_tensorrt_is_lowered(
+def test_a_graph_for_tensorrt_is_lowered(
     context: Context, frames: CalibrationSet
 ) -> None:
     model = conv_attention()

@@ -6,7 +6,6 @@ import itertools
 import math
 from collections import Counter
 from collections.abc import Collection, Mapping
-from typing import ClassVar
 
 import numpy as np
 import onnx_ir as ir
@@ -127,8 +126,8 @@ class ConvertFloat16(Pass):
         keep: globs over nodes that stay in float32, by name, operator or module.
     """
 
-    name: ClassVar[str] = "convert-float16"
-    exact: ClassVar[bool] = False
+    name = "convert-float16"
+    exact = False
     keep: tuple[str, ...] = ()
 
     def run(self, model: ir.Model, context: Context) -> PassResult:

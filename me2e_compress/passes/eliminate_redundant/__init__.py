@@ -2,7 +2,6 @@
 
 import dataclasses
 from collections import Counter
-from typing import ClassVar
 
 import onnx_ir as ir
 import onnx_ir.passes.common as common
@@ -87,8 +86,8 @@ class EliminateRedundant(Pass):
     Exact to the bit: x + 0.0 stays, since it turns -0.0 into +0.0.
     """
 
-    name: ClassVar[str] = "eliminate-redundant"
-    exact: ClassVar[bool] = True
+    name = "eliminate-redundant"
+    exact = True
 
     def run(self, model: ir.Model, context: Context) -> PassResult:
         """Apply the rules until none applies, then drop unread nodes."""

@@ -14,7 +14,6 @@ import dataclasses
 import math
 from collections import Counter
 from collections.abc import Container, Iterable
-from typing import ClassVar
 
 import onnx_ir as ir
 
@@ -204,8 +203,8 @@ class FoldConstants(Pass):
             keeps every named layer, e.g. to ablate it later.
     """
 
-    name: ClassVar[str] = "fold-constants"
-    exact: ClassVar[bool] = True
+    name = "fold-constants"
+    exact = True
     bytes_per_node: int = LIMIT_BYTES
     through_compute: bool = True
 

@@ -60,15 +60,12 @@ def evaluate(
 
     Nodes run in one session, or each in its own if that fails.
     """
-    # What they need, in order
+    # The expressions that they need, in order
     wanted = {known.maker[value] for value in values}
     for one in reversed(known.expressions):
         if one in wanted:
-            wanted.update(
-                known.maker[value]
-                for value in one.inputs
-                if value in known.maker and value not in known.arrays
-            )
+            unknown = known.maker.keys() & {*one.inputs} - known.arrays.keys()
+            wanted.update(known.maker[value] for value in unknown)
     needed = [one for one in known.expressions if one in wanted]
     if not needed:
         return {}, []
@@ -102,14 +99,9 @@ def run(
     feeds: dict[str, Any] = {}
     nodes = [_node(one, names, feeds, arrays) for one in expressions]
     # Write the expressions as a model of their own
-    ports = [
-        onnx.helper.make_tensor_value_info(
-            name,
-            onnx.helper.np_dtype_to_tensor_dtype(np.dtype(array.dtype)),
-            array.shape,
-        )
-        for name, array in feeds.items()
-    ]
+    kind_of = onnx.helper.np_dtype_to_tensor_dtype
+    port = onnx.helper.make_tensor_value_info
+    ports = [port(n, kind_of(np.dtype(a.dtype)), a.shape) for n, a in feeds.items()]
     made = [onnx.ValueInfoProto(name=names[value]) for value in values]
     model = onnx.helper.make_model(
         onnx.helper.make_graph(nodes, "constants", ports, made),
@@ -118,9 +110,8 @@ def run(
     )
     # No optimization: run exactly the nodes as written
     options = onnxruntime.SessionOptions()
-    options.graph_optimization_level = (
-        onnxruntime.GraphOptimizationLevel.ORT_DISABLE_ALL
-    )
+    disabled = onnxruntime.GraphOptimizationLevel.ORT_DISABLE_ALL
+    options.graph_optimization_level = disabled
     options.intra_op_num_threads = 1
     options.enable_cpu_mem_arena = False  # it would live as long as a constant does
     options.log_severity_level = SILENT
@@ -193,15 +184,13 @@ def branch_fits(node: ir.Node, branch: ir.Graph, opset: int) -> bool:
     """
     instead = dict(zip(node.outputs, branch.outputs, strict=True))
     readers = dict.fromkeys(use.node for value in instead for use in value.uses())
+
+    def known(value: ir.Value) -> Array | None:
+        return array_of(unrenamed(instead.get(value, value)))
+
     for reader in readers:
-        arrays = {
-            value: array
-            for value in reader.inputs
-            if value is not None
-            and (array := array_of(unrenamed(instead.get(value, value)))) is not None
-        }
         try:
-            shapes.infer_node(reader, opset, known=arrays.get, instead=instead)
+            shapes.infer_node(reader, opset, known=known, instead=instead)
         except shapes.REFUSALS:
             return False
     return True

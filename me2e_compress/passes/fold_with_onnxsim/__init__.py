@@ -4,7 +4,6 @@ import dataclasses
 import subprocess
 import tempfile
 from pathlib import Path
-from typing import ClassVar
 
 import onnx_ir as ir
 
@@ -44,8 +43,8 @@ class FoldWithOnnxsim(Pass):
         RecipeError: it is not a finite number above 0.
     """
 
-    name: ClassVar[str] = "fold-with-onnxsim"
-    exact: ClassVar[bool] = True
+    name = "fold-with-onnxsim"
+    exact = True
 
     timeout_s: float = 600.0
 

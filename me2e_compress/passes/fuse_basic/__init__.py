@@ -1,7 +1,6 @@
 """Fuse patterns that one standard operator can express."""
 
 import dataclasses
-from typing import ClassVar
 
 import onnx_ir as ir
 
@@ -27,8 +26,8 @@ class FuseBasic(Pass):
     and onnxruntime fuse with the next activation.
     """
 
-    name: ClassVar[str] = "fuse-basic"
-    exact: ClassVar[bool] = True
+    name = "fuse-basic"
+    exact = True
 
     def run(self, model: ir.Model, context: Context) -> PassResult:
         """Try every fusion on every node until none applies."""

@@ -3,7 +3,6 @@
 import collections
 import dataclasses
 from collections.abc import Callable, Mapping
-from typing import ClassVar
 
 import onnx_ir as ir
 
@@ -58,8 +57,8 @@ class FuseKernels(Pass):
     with ``attach-bodies`` behind it runs everywhere.
     """
 
-    name: ClassVar[str] = "fuse-kernels"
-    exact: ClassVar[bool] = True
+    name = "fuse-kernels"
+    exact = True
 
     def run(self, model: ir.Model, context: Context) -> PassResult:
         """Try every node of the graph and of its bodies."""

@@ -4,7 +4,6 @@ import contextlib
 import dataclasses
 import functools
 from collections.abc import Callable, Iterator, Sequence
-from typing import ClassVar
 
 import onnx_ir as ir
 
@@ -67,8 +66,8 @@ class FuseOperators(Pass):
     never stored (BEVFormer's and VAD's encoders).
     """
 
-    name: ClassVar[str] = "fuse-operators"
-    exact: ClassVar[bool] = True
+    name = "fuse-operators"
+    exact = True
 
     def run(self, model: ir.Model, context: Context) -> PassResult:
         """Try every GridSample that is read, in the graph and its bodies."""

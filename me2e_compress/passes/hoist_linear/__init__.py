@@ -1,7 +1,6 @@
 """Multiply fewer rows: move products before nodes that repeat or add up rows."""
 
 import dataclasses
-from typing import ClassVar
 
 import onnx_ir as ir
 
@@ -45,8 +44,8 @@ class HoistLinear(Pass):
         bytes_per_node: how many bytes of new weights the work of one node may cost.
     """
 
-    name: ClassVar[str] = "hoist-linear"
-    exact: ClassVar[bool] = True
+    name = "hoist-linear"
+    exact = True
     bytes_per_node: int = BYTES_PER_NODE
 
     def run(self, model: ir.Model, context: Context) -> PassResult:
