@@ -20,9 +20,7 @@ def weighted(rows: int = 64) -> ir.Model:
     return stored(parsed(f"m {ports} {{ y = MatMul(x, w) }}"), {"w": draws})
 
 
-def test_a_saved_graph_comes_back_and_external_weights_stay_on_disk(
-    tmp_path: Path,
-) -> None:
+def test_a_saved_graph_loads_and_weights_stay_on_disk(tmp_path: Path) -> None:
     graph.save(weighted(), f"{tmp_path}/all.onnx")
     assert graph.digest(graph.load(f"{tmp_path}/all.onnx")) == graph.digest(weighted())
     assert [file.name for file in tmp_path.iterdir()] == ["all.onnx"]
@@ -39,7 +37,7 @@ def test_a_saved_graph_comes_back_and_external_weights_stay_on_disk(
         graph.save(back, tmp_path / "m.onnx")  # would lose what it reads
 
 
-def test_a_failed_save_keeps_the_old_file(
+def test_a_failed_save_keeps_the_file(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = tmp_path / "m.onnx"
@@ -73,7 +71,7 @@ CUT = onnx.helper.make_model(
     ],
     ids=["missing", "empty", "zip", "binary", "text", "truncated"],
 )
-def test_what_is_not_onnx_is_said_so(
+def test_files_that_are_not_onnx(
     tmp_path: Path, junk: bytes | None, message: str
 ) -> None:
     if junk is not None:
@@ -93,9 +91,7 @@ def test_external_data_cut_short_or_missing_are_named(tmp_path: Path) -> None:
         graph.load(tmp_path / "m.onnx")
 
 
-def test_a_model_of_ir_version_3_is_raised_to_where_weights_are_no_inputs(
-    tmp_path: Path,
-) -> None:
+def test_a_model_of_ir_version_3_is_raised_to_4(tmp_path: Path) -> None:
     proto = onnx.parser.parse_model(
         """
         <ir_version: 3, opset_import: ["" : 13]>

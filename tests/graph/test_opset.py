@@ -9,6 +9,7 @@ import pytest
 from me2e_compress import graph
 from me2e_compress.calibration.dataset import CalibrationSet, draw_frames
 from me2e_compress.errors import FramesError, GraphError
+from me2e_compress.graph.nodes import Array
 from me2e_compress.graph.opset import read_as
 from me2e_compress.graph.runtime_operators import newest_ir, newest_opset
 from me2e_compress.runtime.session import Session
@@ -31,9 +32,7 @@ def written(folder: Path, body: str, *, opset: int = 28, version: int = 15) -> P
 
 
 @pytest.mark.parametrize("body", ["y = Relu(x)", "y = trt.Rotate(x)"])
-def test_an_operator_that_did_not_change_is_written_in_the_older_opset(
-    tmp_path: Path, body: str
-) -> None:
+def test_unchanged_operators_are_in_the_older_opset(tmp_path: Path, body: str) -> None:
     model = graph.load(written(tmp_path, body))
     assert (model.opset_imports[""], model.ir_version) == (newest_opset(), newest_ir())
     assert read_as(model) == (
@@ -56,9 +55,7 @@ def test_an_operator_that_did_not_change_is_written_in_the_older_opset(
         "r = Range<stash_type=1>(a, a, a) y = Add(x, x)",
     ],
 )
-def test_an_operator_that_changed_is_converted_and_runs(
-    tmp_path: Path, body: str
-) -> None:
+def test_changed_operators_are_converted_and_run(tmp_path: Path, body: str) -> None:
     assert list(Session(written(tmp_path, body)).outputs) == ["y"]
 
 
@@ -82,7 +79,7 @@ def test_names_and_metadata_of_a_node_that_is_converted_stay(tmp_path: Path) -> 
         ),
     ],
 )
-def test_what_the_older_opset_cannot_say_is_one_line(
+def test_operators_that_no_older_opset_has(
     tmp_path: Path, body: str, reason: str
 ) -> None:
     with pytest.raises(GraphError, match=rf"new\.onnx: opset 28: .*, and {reason}"):
@@ -141,41 +138,40 @@ def test_lint_judges_the_file_as_it_lies_on_disk(tmp_path: Path) -> None:
     assert "onnxruntime has no Swish in opset 18" in found.message
 
 
-def test_an_input_that_holds_a_value_is_a_constant_and_that_is_said(
-    tmp_path: Path,
-) -> None:
+def test_an_input_with_a_value_becomes_a_constant(tmp_path: Path) -> None:
     path = written(tmp_path, "y = Mul(x, a)", opset=17, version=8)
-    model = ir.load(path)
-    held = ir.tensor(np.array(2.0, np.float32), name="a")
-    a = model.graph.inputs[2]
-    a.const_value = held
-    model.graph.register_initializer(a)
-    ir.save(model, path)
+    two = np.array(2.0, np.float32)
 
-    found = graph.load(path)
+    model = with_value(path, 2, two)
 
-    assert [each.name for each in found.graph.inputs] == ["x", "x4", "c", "i"]
-    assert "a held a value: no input any more, but a constant; what" in read_as(found)
+    assert [port.name for port in model.graph.inputs] == ["x", "x4", "c", "i"]
+    assert "a held a value: no input any more, but a constant; what" in read_as(model)
     # frames that were recorded with it hold that value
-    (frame,) = (dict(each.arrays) for each in draw_frames(found, seed=0, count=1))
-    CalibrationSet(record(tmp_path / "2", [frame | {"a": held.numpy()}])).check(found)
-    other = CalibrationSet(record(tmp_path / "3", [frame | {"a": held.numpy() + 1}]))
+    (frame,) = (dict(each.arrays) for each in draw_frames(model, seed=0, count=1))
+    CalibrationSet(record(tmp_path / "2", [frame | {"a": two}])).check(model)
+    other = CalibrationSet(record(tmp_path / "3", [frame | {"a": two + 1}]))
     with pytest.raises(FramesError, match="a is not the one that the graph was made"):
-        other.check(found)
+        other.check(model)
+
+
+def with_value(path: Path, index: int, array: Array, **metadata: str) -> ir.Model:
+    """Give an input of a file a value, and load that."""
+    model = ir.load(path)
+    port = model.graph.inputs[index]
+    port.const_value = ir.tensor(array, name=port.name)
+    model.graph.register_initializer(port)
+    model.metadata_props.update(metadata)
+    ir.save(model, path)
+    return graph.load(path)
 
 
 def test_a_state_that_holds_a_value_stays_an_input(tmp_path: Path) -> None:
     path = written(tmp_path, "y = Mul(x, x)", opset=17, version=8)
-    model = ir.load(path)
-    model.metadata_props["me2e.recurrent"] = '{"x": "y"}'
-    x = model.graph.inputs[0]
-    x.const_value = ir.tensor(np.eye(4, dtype=np.float32), name="x")
-    model.graph.register_initializer(x)
-    ir.save(model, path)
+    state = {"me2e.recurrent": '{"x": "y"}'}
 
-    found = graph.load(path)
+    model = with_value(path, 0, np.eye(4, dtype=np.float32), **state)
 
-    assert [each.name for each in found.graph.inputs] == ["x", "x4", "a", "c", "i"]
-    assert not found.graph.initializers
-    assert found.graph.inputs[0].const_value is None
-    assert read_as(found) == "state x held a value, and begins as zeros"
+    assert [port.name for port in model.graph.inputs] == ["x", "x4", "a", "c", "i"]
+    assert not model.graph.initializers
+    assert model.graph.inputs[0].const_value is None
+    assert read_as(model) == "state x held a value, and begins as zeros"

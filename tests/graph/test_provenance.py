@@ -97,9 +97,7 @@ def test_a_past_that_is_no_table_is_named(text: str) -> None:
         provenance.unpack(model)
 
 
-def test_a_text_of_more_than_its_bound_is_refused(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_text_beyond_the_bound_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     text = "abc" * 1000
     assert provenance.decompressed(provenance.compressed(text)) == text
     monkeypatch.setattr(provenance, "_LARGEST", 2999)

@@ -60,7 +60,7 @@ def test_ports_that_do_not_fit_are_named_with_what_they_are() -> None:
         ("img", {"plan": STATE}, "^$"),
     ],
 )
-def test_why_an_input_is_not_fed_back(
+def test_why_an_input_is_no_state(
     name: str, outputs: dict[str, SessionPort], why: str
 ) -> None:
     assert re.search(why, not_fed_back(name, {name: STATE}, outputs))

@@ -30,9 +30,7 @@ six (float[BATCH,6,8] x) => (float["Addy_dim_0","Addy_dim_1",8] y, float[one,48]
 @pytest.mark.parametrize(
     ("batch", "shape"), [("1", "[1,6,8]"), ("batch", "[Addy_dim_0,6,8]")]
 )
-def test_an_output_s_symbol_stays_where_the_size_is_open(
-    batch: str, shape: str
-) -> None:
+def test_a_symbol_of_an_open_output_stays(batch: str, shape: str) -> None:
     model = parsed(CHAIN.replace("BATCH", batch))
     graph.infer_shapes(model)
     assert str(model.graph.outputs[0].shape) == shape

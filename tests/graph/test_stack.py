@@ -106,9 +106,7 @@ def images(count: int = 5) -> list[Frame]:
     ]
 
 
-def test_the_joined_graph_tells_names_apart_and_answers_as_its_parts(
-    tmp_path: Path,
-) -> None:
+def test_the_joined_graph_answers_as_its_parts(tmp_path: Path) -> None:
     path = write_dense(tmp_path)
     stack = JoinedStack.load(path)
     weights = stack.model.graph.initializers

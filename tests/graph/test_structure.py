@@ -59,9 +59,7 @@ def test_a_fault_is_named_where_the_graph_is_read(tmp_path: Path, fault: str) ->
 
 
 @pytest.mark.parametrize("seed", [seed_graph, branch_graph])
-def test_nodes_in_no_order_are_put_in_order(
-    tmp_path: Path, seed: Callable[[], onnx.ModelProto]
-) -> None:
+def test_nodes_are_sorted(tmp_path: Path, seed: Callable[[], onnx.ModelProto]) -> None:
     model = seed()
     onnx.save(model, tmp_path / "in-order.onnx")
     nodes = list(model.graph.node)[::-1]
@@ -103,9 +101,7 @@ DATA: dict[str, Callable[[bytes], onnx.TensorProto]] = {
 
 @pytest.mark.parametrize("kind", [onnx.TensorProto.INT2, onnx.TensorProto.UINT2])
 @pytest.mark.parametrize("field", DATA)
-def test_weights_of_two_bits_lie_four_in_a_byte(
-    tmp_path: Path, kind: int, field: str
-) -> None:
+def test_weights_of_two_bits(tmp_path: Path, kind: int, field: str) -> None:
     model = onnx.parser.parse_model("""<ir_version: 13, opset_import: ["" : 25]>
         m (float[1,3] x, float s) => (float[1,3] y)
         { w = DequantizeLinear(q, s) y = MatMul(x, w) }""")

@@ -112,9 +112,7 @@ def test_a_matmul_whose_weight_lost_its_name_goes_by_its_bias() -> None:
 @pytest.mark.parametrize(
     ("stamp", "place"), [("plan", ("plan", "stamp")), ("occ", ("det", "scope"))]
 )
-def test_an_imported_graph_says_it_itself_by_its_map(
-    stamp: str, place: tuple[str, str]
-) -> None:
+def test_stamps_decide_in_an_imported_graph(stamp: str, place: tuple[str, str]) -> None:
     model = read(ONE, '["/det/Relu"] y = Relu(x)')
     model.graph[0].metadata_props[MODULE] = stamp
     assert placed(assign(model, MAP)) == {"y": place}

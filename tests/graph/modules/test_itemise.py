@@ -4,14 +4,7 @@ import onnx_ir as ir
 import pytest
 
 from me2e_compress.graph.modules.assign import Item, assign, itemise
-from me2e_compress.graph.modules.module_map import ModuleMap
-
-MAP = ModuleMap.parse(
-    '[modules.neck]\nrole = "feature"\noptional = ["neck"]\n'
-    '[modules.det]\nrole = "prediction"\noptional = ["det"]\n'
-    '[modules.occ]\nrole = "prediction"\noptional = ["occ"]',
-    "three",
-)
+from tests.graph.modules.test_assign import MAP
 
 
 def model() -> ir.Model:
@@ -34,7 +27,7 @@ def test_shared_weights_count_once_and_sizes_are_no_parameters() -> None:
     # nodes, parameters, bytes of weights, MACs, nodes of unknown MACs
     assert found == (
         *(Item("neck", 1, 2, 8, 2, 0), Item("det", 3, 2, 16, 6, 0)),
-        Item("occ", 0, 0, 0, 0, 0),
+        Item("plan", 0, 0, 0, 0, 0),
     )
 
 

@@ -74,9 +74,7 @@ def test_a_file_is_named_after_itself(tmp_path: Path) -> None:
         ('role = "feature"\n[modules.a]\nrole = "feature"\npatterns = ["a"]', "role: "),
     ],
 )
-def test_a_malformed_map_is_one_line_that_names_the_place(
-    text: str, complaint: str
-) -> None:
+def test_a_malformed_map_is_named_in_one_line(text: str, complaint: str) -> None:
     with pytest.raises(ModuleMapError) as caught:
         ModuleMap.parse(text, "mine", "mine.toml")
     message = str(caught.value)

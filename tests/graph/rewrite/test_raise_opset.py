@@ -108,9 +108,7 @@ def test_what_the_converter_would_change_stays_in_its_opset(
         ),
     ],
 )
-def test_a_function_is_taken_along_or_its_graph_stays(
-    body: str, opset: int, note: str
-) -> None:
+def test_functions_are_converted_too(body: str, opset: int, note: str) -> None:
     model = ir.from_onnx_text(
         '<ir_version: 9, opset_import: ["" : 12, "f" : 1]> g (float[2,2] x) =>'
         " (float[2,2] y) { h = f.F(x) y = MatMul(h, x) }"

@@ -79,7 +79,7 @@ def test_bypass_and_remove_dead(model: ir.Model) -> None:
 
 
 @given(models(), st.data())
-def test_replace_value_refuses_what_would_change_the_interface(
+def test_replace_value_keeps_the_interface(
     model: ir.Model, data: st.DataObject
 ) -> None:
     ports, expected = graph.interface(model), answers(model)
