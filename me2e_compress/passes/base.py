@@ -7,11 +7,8 @@ from typing import ClassVar
 
 import onnx_ir as ir
 
-from me2e_compress import graph
-from me2e_compress.calibration.calibrator import Calibrator
 from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.calibration.ranges import Ranges
-from me2e_compress.errors import FramesError
 from me2e_compress.graph.modules.module_map import ModuleMap
 from me2e_compress.runtime.providers import CPU, Provider
 
@@ -32,42 +29,6 @@ class Context:
     measured: dict[str, Ranges] = dataclasses.field(
         default_factory=dict, compare=False, repr=False
     )
-
-    def ranges(
-        self,
-        name: str,
-        model: ir.Model,
-        tensors: tuple[str, ...],
-        *,
-        method: str,
-        saved: Path | None,
-    ) -> Ranges:
-        """Load the ranges of tensors from ``saved``, or measure them on the frames.
-
-        Raises:
-            FramesError: neither frames nor a file, or they are of another graph.
-        """
-        # Saved ranges must belong to this graph and these frames
-        if saved is not None:
-            ranges, frames = Ranges.load(saved), self.frames
-            source = None if frames is None else frames.fingerprint
-            digest = graph.digest(model)
-            ranges.check(
-                model=digest, tensors=tensors, method=method, source=source, named=saved
-            )
-            return ranges
-        if self.frames is None:
-            raise FramesError(
-                f"{name} needs recorded frames (--frames) or saved ranges (--ranges):"
-                " int8 ranges are never made up"
-            )
-        # Measure only what an earlier run has not measured
-        known = self.measured.get(name)
-        if known is None or not known.hold_for(graph.digest(model), tensors, method):
-            calibrator = Calibrator(method, provider=self.provider)
-            known = calibrator.run(model, tensors, self.frames)
-            self.measured[name] = known
-        return known
 
 
 @dataclasses.dataclass(frozen=True)
@@ -97,16 +58,11 @@ class Pass(abc.ABC):
         exact: True promises equal outputs, and the manager checks it by running the
             graph before and after; False is judged by fidelity and driving scores.
         changes_interface: True if the pass may change inputs and outputs.
-        quantizes: True if it quantizes a float graph to int8.
-        reads_ranges: True if it calibrates tensors; it then has the options ``ranges``
-            (a file that replaces frames) and ``method``.
     """
 
     name: ClassVar[str]
     exact: ClassVar[bool]
     changes_interface: ClassVar[bool] = False
-    quantizes: ClassVar[bool] = False
-    reads_ranges: ClassVar[bool] = False
 
     @abc.abstractmethod
     def run(self, model: ir.Model, context: Context) -> PassResult:
@@ -116,10 +72,6 @@ class Pass(abc.ABC):
     def needs_frames(self) -> bool:
         """Whether the pass, with these options, measures on recorded frames."""
         return False
-
-    def ranged_tensors(self, model: ir.Model, context: Context) -> tuple[str, ...]:
-        """Return the names of the tensors it calibrates; shapes must be inferred."""
-        return ()
 
     def files(self) -> tuple[Path, ...]:
         """Return the files that its options name."""

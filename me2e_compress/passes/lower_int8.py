@@ -9,13 +9,14 @@ from me2e_compress import graph
 from me2e_compress.calibration.observers import DEFAULT_METHOD
 from me2e_compress.display import plural
 from me2e_compress.graph import provenance
-from me2e_compress.passes.base import Context, Pass, PassResult
+from me2e_compress.passes.base import Context, PassResult
+from me2e_compress.passes.quantizer import Quantizer
 from me2e_compress.quantization.decision import plan_of, stamp_plan
 from me2e_compress.targets import onnxruntime
 
 
 @dataclasses.dataclass(frozen=True)
-class LowerInt8(Pass):
+class LowerInt8(Quantizer):
     """Rewrite a graph quantized for TensorRT so that a CPU runs it fast.
 
     Given:   y = Conv(DequantizeLinear(QuantizeLinear(x)), DequantizeLinear(w_int8), b)
@@ -36,7 +37,6 @@ class LowerInt8(Pass):
 
     name = "lower-int8"
     exact = False
-    reads_ranges = True
     method: str = DEFAULT_METHOD
     ranges: Path | None = None
 
@@ -49,8 +49,7 @@ class LowerInt8(Pass):
         # Ranges of tensors that TensorRT leaves in float
         missing, ranges = self.ranged_tensors(model, context), None
         if missing:
-            name, method, saved = self.name, self.method, self.ranges
-            ranges = context.ranges(name, model, missing, method=method, saved=saved)
+            ranges = self.read_ranges(model, missing, context, self.ranges)
         lowered = onnxruntime.convert(model, ranges)
         provenance.sign(model, lowered, self.name)
         if plan := plan_of(model):
@@ -62,6 +61,11 @@ class LowerInt8(Pass):
             f"{plural(len(missing), 'tensor')} calibrated besides the graph's",
         )
         return PassResult(lowered, changes, notes)
+
+    @property
+    def method_of_ranges(self) -> str:
+        """The method that was asked for."""
+        return self.method
 
     def ranged_tensors(self, model: ir.Model, context: Context) -> tuple[str, ...]:
         """Return the names of the tensors whose range is not in the graph."""

@@ -9,7 +9,8 @@ import onnx_ir as ir
 from me2e_compress.calibration.review import review
 from me2e_compress.display import plural
 from me2e_compress.errors import PreconditionError
-from me2e_compress.passes.base import Context, Pass, PassResult
+from me2e_compress.passes.base import Context, PassResult
+from me2e_compress.passes.quantizer import Quantizer
 from me2e_compress.quantization.decision import (
     METADATA,
     Overrides,
@@ -25,7 +26,7 @@ from me2e_compress.targets.quantized import describe_quantized
 
 
 @dataclasses.dataclass(frozen=True)
-class QuantizeInt8(Pass):
+class QuantizeInt8(Quantizer):
     """Quantize the layers and short attentions of some modules to int8.
 
     Given:   y = Conv(x, w, b)
@@ -51,8 +52,7 @@ class QuantizeInt8(Pass):
 
     name = "quantize-int8"
     exact = False
-    quantizes = True
-    reads_ranges = True
+    takes_float = True
     scheme: str = "full"
     modules: tuple[str, ...] = ()
     rules: str | RuleSet = DEFAULT_RULES
@@ -86,8 +86,7 @@ class QuantizeInt8(Pass):
                 refuse_quantized(model)
             return PassResult(model, 0, ("nothing to quantize", plan.headline))
         # Calibrate
-        method, saved = self.method_of_ranges, self.ranges
-        ranges = context.ranges(self.name, model, tensors, method=method, saved=saved)
+        ranges = self.read_ranges(model, tensors, context, self.ranges)
         # Place the quantizers and record the plan
         placed = target.place(model, plan, ranges)
         stamp_plan(placed, plan)
@@ -115,7 +114,7 @@ class QuantizeInt8(Pass):
 
     @property
     def method_of_ranges(self) -> str:
-        """Return the method that was asked for, or the one of the rules."""
+        """The method that was asked for, else the one of the rules."""
         return self.method or self._rules().method
 
     @functools.cached_property

@@ -23,6 +23,7 @@ from me2e_compress.passes.fix_shapes import with_sizes
 from me2e_compress.passes.freeze_inputs import advice
 from me2e_compress.passes.import_normalize import with_own_domains
 from me2e_compress.passes.quantize_int8 import QuantizeInt8
+from me2e_compress.passes.quantizer import Quantizer, quantizes_float
 from me2e_compress.quantization.decision import plan_of, save_plan
 from me2e_compress.registry import drafts
 from me2e_compress.runtime.atomic import write_document
@@ -196,7 +197,7 @@ def passes_of(recipe: Recipe | None, options: CompressOptions) -> tuple[Pass, ..
             " TEXT or --scheme"
         )
     # a graph is quantized once
-    quantizers = [each for each in passes if each.quantizes]
+    quantizers = [each for each in passes if quantizes_float(each)]
     if len(quantizers) + (options.scheme is not None) > 1:
         raise RecipeError(
             f"{QuantizeInt8.name} is twice in the pipeline, a graph is quantized"
@@ -216,8 +217,8 @@ def _set_int8(passes: tuple[Pass, ...], options: CompressOptions) -> tuple[Pass,
     if not chosen:
         return passes
     # an option that no pass takes would be ignored without a word
-    readers = [each for each in passes if each.quantizes] or [
-        each for each in passes if each.reads_ranges
+    readers = [each for each in passes if quantizes_float(each)] or [
+        each for each in passes if isinstance(each, Quantizer)
     ]
     known = {name for each in readers for name in each.option_names()}
     if unknown := [name for name in chosen if name not in known]:

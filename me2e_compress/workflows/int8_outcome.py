@@ -12,6 +12,7 @@ from me2e_compress.graph import WEIGHTED
 from me2e_compress.manager import Report
 from me2e_compress.passes import Context
 from me2e_compress.passes.quantize_int8 import QuantizeInt8
+from me2e_compress.passes.quantizer import quantizes_float
 from me2e_compress.quantization.decision import FLOAT, QuantPlan, plan_of
 from me2e_compress.runtime.providers import CPU
 
@@ -85,7 +86,7 @@ class Int8Outcome:
     @classmethod
     def of(cls, report: Report, context: Context) -> Self | None:
         """Read the outcome from a run of the manager; None where no pass quantizes."""
-        quantizer = next((e for e in report.lossy if e.applied.quantizes), None)
+        quantizer = next((e for e in report.lossy if quantizes_float(e.applied)), None)
         if quantizer is None:
             return None
         name, changes = quantizer.applied.name, quantizer.changes

@@ -19,6 +19,7 @@ from me2e_compress.manager import Report
 from me2e_compress.passes import Pass
 from me2e_compress.passes.lower_int8 import LowerInt8
 from me2e_compress.passes.quantize_int8 import QuantizeInt8
+from me2e_compress.passes.quantizer import Quantizer
 from me2e_compress.quantization.decision import plan_of
 from me2e_compress.runtime.frames import Frames
 from me2e_compress.runtime.latency_trace import cpu_seconds
@@ -194,7 +195,7 @@ def split_frames(
         return SplitFrames(None, samples, reason, samples)
     run = RUN_FRAMES if recurrent_inputs(model) else 1
     calibration, measured = hold_out(recording, most, run)
-    if any(each.reads_ranges and not each.needs_frames for each in passes):
+    if any(isinstance(each, Quantizer) and not each.needs_frames for each in passes):
         return SplitFrames(recording, measured, PERHAPS_SHARED)
     if len(recording) == 1:
         return SplitFrames(calibration, measured, SHARED)

@@ -17,8 +17,8 @@ from me2e_compress.graph.modules.module_map import ModuleMap
 from me2e_compress.manager import PassManager, recipe
 from me2e_compress.passes import Context, Pass
 from me2e_compress.passes.freeze_inputs import advice
-from me2e_compress.passes.lower_int8 import LowerInt8
 from me2e_compress.passes.quantize_int8 import QuantizeInt8, refuse_quantized
+from me2e_compress.passes.quantizer import Quantizer
 from me2e_compress.quantization.decision import (
     METADATA,
     QuantPlan,
@@ -53,7 +53,7 @@ class PreparedGraph:
     file: Path
     model: ir.Model
     modules: ModuleMap
-    reader: Pass | None
+    reader: Quantizer | None
 
     @classmethod
     def of(
@@ -70,11 +70,11 @@ class PreparedGraph:
         PreconditionError.
         """
         chosen = tuple(recipe.load("exact") if passes is None else passes)
-        at = next((at for at, each in enumerate(chosen) if each.reads_ranges), None)
-        reader = None if at is None else chosen[at]
+        readers = (each for each in chosen if isinstance(each, Quantizer))
+        reader = next(readers, None)
+        at = None if reader is None else chosen.index(reader)
         # what a plan quantized may only be rewritten, not quantized again
-        quantizes = reader is None or reader.quantizes
-        if quantizes and METADATA in loaded.metadata_props:
+        if (reader is None or reader.takes_float) and METADATA in loaded.metadata_props:
             refuse_quantized(loaded)
         if not isinstance(module_map, ModuleMap):
             module_map = load_map(module_map, loaded)
@@ -94,11 +94,7 @@ class PreparedGraph:
     @property
     def method(self) -> str:
         """Return how the pass that reads ranges wants them measured."""
-        if isinstance(self.reader, QuantizeInt8):
-            return self.reader.method_of_ranges
-        return (
-            self.reader.method if isinstance(self.reader, LowerInt8) else DEFAULT_METHOD
-        )
+        return DEFAULT_METHOD if self.reader is None else self.reader.method_of_ranges
 
     def tensors(self) -> tuple[str, ...]:
         """Return every tensor that any scheme, rule set or target needs a range of.
@@ -107,7 +103,7 @@ class PreparedGraph:
         it. If there is none, PreconditionError is raised.
         """
         context, names = Context(self.modules), dict[str, None]()
-        if self.reader is not None and not self.reader.quantizes:
+        if self.reader is not None and not self.reader.takes_float:
             names |= dict.fromkeys(self.reader.ranged_tensors(self.model, context))
             none = (
                 f"it tells every range that {self.reader.name} needs: none to measure"
