@@ -102,7 +102,7 @@ def _demoted(node: ir.Node, attribute: ir.Attr) -> ir.Attr | None:
         double = attribute.as_int() == ir.DataType.DOUBLE.value
         return ir.AttrInt64(name, ir.DataType.FLOAT.value) if double else None
     if kind == ir.AttributeType.TENSOR:
-        tensor = attribute.as_tensor()
+        tensor = attribute.value  # as_tensor() checks a protocol: slow
         if tensor.dtype == ir.DataType.DOUBLE:
             return ir.AttrTensor(name, _as_float32(tensor, tensor.name))
     return None

@@ -188,11 +188,8 @@ def remove_dead(graph: ir.Graph) -> int:
 
 
 def _idle(graph: ir.Graph) -> list[ir.Value]:
-    return [
-        value
-        for value in graph.initializers.values()
-        if not is_read(value) and not value.is_graph_input()
-    ]
+    values = graph.initializers.values()
+    return [v for v in values if not is_read(v) and not v.is_graph_input()]
 
 
 def sweep(model: ir.Model) -> None:

@@ -91,7 +91,8 @@ def moves_nothing(node: ir.Node) -> bool:
 
 def _slice(node: ir.Node, opset: int) -> ir.Value | None:
     steps = input_at(node, 4)
-    if steps is not None and {*(integers_of(steps) or (0,))} != {1}:
+    known = [] if steps is None else integers_of(steps)
+    if known is None or {*known} - {1}:
         return None
     return _if_same_shape(node, opset) or _sliced_part(node)
 
