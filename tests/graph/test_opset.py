@@ -109,8 +109,8 @@ def test_a_graph_is_written_in_the_nearest_opset_that_has_all_its_operators(
     model = graph.load(written(tmp_path, body, opset=opset, version=10))
     assert model.opset_imports[""] == instead
     why = f"onnxruntime has no {model.graph[0].op_type} in {opset}"
-    said = f"opset {opset} became {instead}: {why}" if opset != instead else ""
-    assert read_as(model) == said
+    message = f"opset {opset} became {instead}: {why}" if opset != instead else ""
+    assert read_as(model) == message
     assert list(Session(model).outputs) == ["y"]
 
 
@@ -128,14 +128,14 @@ def test_lint_judges_the_file_as_it_lies_on_disk(tmp_path: Path) -> None:
     model = graph.load(written(tmp_path, "y = Relu(x)"))
 
     for target, severity in ((OnnxRuntime(), "error"), (TensorRT(), "warning")):
-        (found,) = target.lint(model)
-        assert (found.severity, found.rule) == (severity, "opset")
-        assert "opset 28" in found.message
+        (result,) = target.lint(model)
+        assert (result.severity, result.rule) == (severity, "opset")
+        assert "opset 28" in result.message
     # what is written of it is in the older one
     assert not OnnxRuntime().lint(model.clone())
     older = graph.load(written(tmp_path, "y = Swish(x)", opset=18, version=10))
-    (found,) = OnnxRuntime().lint(older)
-    assert "onnxruntime has no Swish in opset 18" in found.message
+    (result,) = OnnxRuntime().lint(older)
+    assert "onnxruntime has no Swish in opset 18" in result.message
 
 
 def test_an_input_with_a_value_becomes_a_constant(tmp_path: Path) -> None:

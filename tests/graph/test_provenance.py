@@ -58,8 +58,8 @@ def test_a_file_holds_few_bytes_of_the_past_and_loses_but_passes(
     ]
     assert not model.metadata_props
     written = onnx.load(tmp_path / "m.onnx")
-    held = [{each.key for each in node.metadata_props} for node in written.graph.node]
-    assert [ORIGINS in keys for keys in held] == [False, False, True, True]
+    stored = [{each.key for each in node.metadata_props} for node in written.graph.node]
+    assert [ORIGINS in keys for keys in stored] == [False, False, True, True]
     read = graph.load(tmp_path / "m.onnx")
     kept = [PASSES in keys for keys in held]
     assert kept == [False, False, True, True]

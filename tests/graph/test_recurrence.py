@@ -22,17 +22,17 @@ def pairs(inputs: str, outputs: str, metadata: str | None = None) -> dict[str, s
 
 def test_a_pair_in_the_metadata_leaves_the_naming_rule_to_the_others() -> None:
     tracks = [f"prev_track{i}" for i in range(15)]
-    found = pairs(
+    result = pairs(
         " ".join(["img", "prev_bev", *tracks]),
         " ".join(["bev_embed", *(f"{name}_out" for name in tracks)]),
         '{"prev_bev": "bev_embed"}',
     )
     named = {name: f"{name}_out" for name in tracks}
-    assert found == {"prev_bev": "bev_embed", **named}
+    assert result == {"prev_bev": "bev_embed", **named}
 
 
 @pytest.mark.parametrize(
-    ("inputs", "outputs", "metadata", "found"),
+    ("inputs", "outputs", "metadata", "result"),
     [
         ("img prev_bev", "plan next_bev", None, {"prev_bev": "next_bev"}),
         ("prev_bev", "next_bev prev_bev_out", None, {"prev_bev": "prev_bev_out"}),
@@ -41,9 +41,9 @@ def test_a_pair_in_the_metadata_leaves_the_naming_rule_to_the_others() -> None:
     ],
 )
 def test_names_and_metadata_say_what_is_fed_back(
-    inputs: str, outputs: str, metadata: str | None, found: dict[str, str]
+    inputs: str, outputs: str, metadata: str | None, result: dict[str, str]
 ) -> None:
-    assert pairs(inputs, outputs, metadata) == found
+    assert pairs(inputs, outputs, metadata) == result
 
 
 def test_ports_that_do_not_fit_are_named_with_what_they_are() -> None:

@@ -30,8 +30,8 @@ from tests.support.stacks import (
 
 def bevs(path: Path, *starts: bool) -> list[float]:
     """Replay frames of ones; return the first element of the state behind each."""
-    found = replay(joined(path), ones(*starts))
-    return [float(each["next_bev"][0, 0]) for each in found]
+    result = replay(joined(path), ones(*starts))
+    return [float(each["next_bev"][0, 0]) for each in result]
 
 
 def test_equal_names_are_joined_and_state_runs_by_its_names(tmp_path: Path) -> None:
@@ -252,8 +252,8 @@ def test_functions_and_bodies_of_one_name_are_told_apart(
     made = again(JoinedStack.load(path), tmp_path / "again")
 
     for each in (path, made):
-        (found,) = replay(joined(each), ones(True))
-        assert found["plan"][0, 0] == 4.0
+        (result,) = replay(joined(each), ones(True))
+        assert result["plan"][0, 0] == 4.0
     assert len(JoinedStack.load(path).model.functions) == functions
 
 
@@ -286,8 +286,8 @@ def test_what_a_pass_took_away_is_missing_from_its_part(tmp_path: Path) -> None:
 
     made = again(stack, tmp_path / "small")
 
-    found = JoinedStack.load(made)
-    assert [each.name for each in found.model.graph.inputs] == ["img"]
-    assert found.recurrent == {}
+    result = JoinedStack.load(made)
+    assert [each.name for each in result.model.graph.inputs] == ["img"]
+    assert result.recurrent == {}
     (answer,) = replay(joined(made), ones(True))
     assert answer["next_bev"][0, 0] == 2.0

@@ -16,7 +16,7 @@ backbone (float[1,4] img, float[1,4] next_bev) => (float[1,4] feats)
 
 
 @pytest.mark.parametrize(
-    ("toml", "texts", "said"),
+    ("toml", "texts", "message"),
     [
         (
             TWO_PARTS,
@@ -100,12 +100,12 @@ backbone (float[1,4] img, float[1,4] next_bev) => (float[1,4] feats)
     ],
 )
 def test_files_that_do_not_fit_each_other_are_one_line(
-    tmp_path: Path, toml: str, texts: dict[str, str], said: str
+    tmp_path: Path, toml: str, texts: dict[str, str], message: str
 ) -> None:
     path = write_stack(tmp_path, toml, **texts)
 
     with pytest.raises(GraphError) as caught:
         JoinedStack.load(path)
 
-    assert said in str(caught.value)
+    assert message in str(caught.value)
     assert "\n" not in str(caught.value)

@@ -67,10 +67,10 @@ def test_nodes_are_sorted(tmp_path: Path, seed: Callable[[], onnx.ModelProto]) -
     model.graph.node.extend(nodes)
     onnx.save(model, tmp_path / "reversed.onnx")
 
-    found = graph.load(tmp_path / "reversed.onnx")
+    result = graph.load(tmp_path / "reversed.onnx")
 
-    onnx.checker.check_model(ir.to_proto(found))
-    assert {node.name for node in found.graph} == {node.name for node in nodes}
+    onnx.checker.check_model(ir.to_proto(result))
+    assert {node.name for node in result.graph} == {node.name for node in nodes}
 
 
 def test_a_size_below_zero_is_an_open_one_and_none_is_none(tmp_path: Path) -> None:

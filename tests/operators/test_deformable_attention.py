@@ -240,9 +240,9 @@ def test_the_domain_and_the_version_tell_the_dialect(
         node = node_of("tensorrt")
         node.domain = domain
         node.attributes["plugin_version"] = ir.AttrString("plugin_version", version)
-    found = find(node)
-    assert found is not None
-    assert found[1].name == name
+    result = find(node)
+    assert result is not None
+    assert result[1].name == name
     assert find(ir.node("GridSample", [])) is None
 
 

@@ -223,19 +223,19 @@ def _read(value: onnxruntime.OrtValue) -> Any:
     )
 
 
-def differs(case: Case, found: Sequence[Any]) -> str | None:
+def differs(case: Case, result: Sequence[Any]) -> str | None:
     """Say where outputs differ beyond the case's own tolerance; None if nowhere."""
     return _first(
         _unlike(left, right, case.rtol, case.atol)
-        for left, right in _pairs(found, case.outputs)
+        for left, right in _pairs(result, case.outputs)
     )
 
 
-def moved(case: Case, found: Sequence[Any]) -> str | None:
+def moved(case: Case, result: Sequence[Any]) -> str | None:
     """Say where more than rounding moved an output; None if nowhere."""
     return _first(
         _unlike(left, right, 0.0, _rounding(right))
-        for left, right in _pairs(found, case.outputs)
+        for left, right in _pairs(result, case.outputs)
     )
 
 
@@ -243,8 +243,8 @@ def _first(faults: Iterator[str | None]) -> str | None:
     return next((fault for fault in faults if fault), None)
 
 
-def _pairs(found: Sequence[Any], wanted: Sequence[Any]) -> Iterator[tuple[Any, Any]]:
-    for left, right in zip(found, wanted, strict=True):
+def _pairs(result: Sequence[Any], wanted: Sequence[Any]) -> Iterator[tuple[Any, Any]]:
+    for left, right in zip(result, wanted, strict=True):
         if isinstance(right, list):
             yield from _pairs(left, right)
         else:

@@ -135,8 +135,8 @@ def test_what_stands_in_a_function_is_expanded_there() -> None:
     apply(ExpandOperators(), model)
 
     given = {name: array for name, array in drawn().items() if name != "u"}
-    (found,) = compute(model, given)
-    np.testing.assert_allclose(found, reference("v", SIZES, STARTS), atol=1e-5)
+    (result,) = compute(model, given)
+    np.testing.assert_allclose(result, reference("v", SIZES, STARTS), atol=1e-5)
 
 
 OPSET = """<ir_version: 9, opset_import: ["" : 17, "trt.plugins" : 1, "mmdeploy" : 1]>

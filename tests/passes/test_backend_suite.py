@@ -75,8 +75,8 @@ class Form:
             steps = {step.name: step.changes for step in report.steps}
             self.folded += bool(steps["fold-constants"])
             after = ir.to_proto(report.model)
-            found = onnx_cases.run(dataclasses.replace(case, model=after))
-            fault = onnx_cases.differs(case, found) or onnx_cases.moved(case, found)
+            result = onnx_cases.run(dataclasses.replace(case, model=after))
+            fault = onnx_cases.differs(case, result) or onnx_cases.moved(case, result)
         except FAILURES as error:
             fault = f"{type(error).__name__} {str(error).splitlines()[0][:160]}"
         if fault is None:
@@ -122,10 +122,10 @@ class Suite:
     scope="module", params=["kinds", pytest.param("cases", marks=pytest.mark.slow)]
 )
 def suite(request: pytest.FixtureRequest) -> Suite:
-    found = Suite(kinds=set() if request.param == "kinds" else None)
+    result = Suite(kinds=set() if request.param == "kinds" else None)
     for case in onnx_cases.load():
-        found.check(case)
-    return found
+        result.check(case)
+    return result
 
 
 def test_every_case_goes_through_the_passes(suite: Suite) -> None:

@@ -30,16 +30,16 @@ HALF, FLOAT = ir.DataType.FLOAT16, ir.DataType.FLOAT
 
 def test_weights_are_half_and_the_interface_is_as_it_was() -> None:
     source = conv_attention()
-    found = check_pass(ConvertFloat16(), source)
-    initializers = found.model.graph.initializers
+    result = check_pass(ConvertFloat16(), source)
+    initializers = result.model.graph.initializers
 
     assert initializers["w"].dtype == initializers["l"].dtype == HALF
-    assert graph.interface(found.model) == graph.interface(source)
-    assert found.notes[0] == "10 nodes in float16, 0 stay in float32"
-    assert "was not measured" in found.notes[-1]
-    assert ConvertFloat16().run(found.model, Context(MODULES)).changes == 0
+    assert graph.interface(result.model) == graph.interface(source)
+    assert result.notes[0] == "10 nodes in float16, 0 stay in float32"
+    assert "was not measured" in result.notes[-1]
+    assert ConvertFloat16().run(result.model, Context(MODULES)).changes == 0
     drawn = fed(source, 3)
-    wide, half = (run_once(each, drawn)["y"] for each in (source, found.model))
+    wide, half = (run_once(each, drawn)["y"] for each in (source, result.model))
     assert 0 < relative_error(wide, half) < 3e-3
 
 
@@ -49,10 +49,10 @@ def test_numbers_that_the_frames_show_to_be_too_large(tmp_path: Path) -> None:
     )
     folder = record(tmp_path / "frames", [{"x": np.full(4, 300, np.float32)}])
     context = Context(ModuleMap.whole(), CalibrationSet(folder))
-    found = check_pass(ConvertFloat16(), model, context)
+    result = check_pass(ConvertFloat16(), model, context)
 
-    assert types_of(found.model) == {"Relu": "FLOAT16", "Mul": "FLOAT"}
-    assert "numbers up to 9e+04 1" in found.notes[1]
+    assert types_of(result.model) == {"Relu": "FLOAT16", "Mul": "FLOAT"}
+    assert "numbers up to 9e+04 1" in result.notes[1]
 
 
 @pytest.mark.parametrize(
@@ -63,8 +63,8 @@ def test_a_softmax_that_stays_says_why(opset: int, shape: str, reason: str) -> N
     text = f'<ir_version: 9, opset_import: ["" : {opset}]> g (float[{shape}] x)'
     model = parsed(text + f" => (float[{shape}] y) {{ y = Softmax(x) }}")
     graph.infer_shapes(model)
-    found = ConvertFloat16().run(model, Context(ModuleMap.whole()))
-    assert f"a softmax {reason} 1" in found.notes[1]
+    result = ConvertFloat16().run(model, Context(ModuleMap.whole()))
+    assert f"a softmax {reason} 1" in result.notes[1]
 
 
 def test_the_frames_run_on_the_provider(tmp_path: Path) -> None:
@@ -82,10 +82,10 @@ def test_the_frames_run_on_the_provider(tmp_path: Path) -> None:
 @pytest.mark.parametrize("pattern", ["Conv", "backbone", "/b*"])
 def test_what_the_option_keeps(pattern: str) -> None:
     step = ConvertFloat16(keep=(pattern,))
-    found = check_pass(step, conv_attention(), Context(MODULES))
+    result = check_pass(step, conv_attention(), Context(MODULES))
 
-    assert found.model.graph.initializers["w"].dtype == FLOAT
-    assert found.model.graph.initializers["l"].dtype == HALF
+    assert result.model.graph.initializers["w"].dtype == FLOAT
+    assert result.model.graph.initializers["l"].dtype == HALF
 
 
 def test_what_keep_does_not_find_is_an_error() -> None:

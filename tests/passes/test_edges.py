@@ -27,8 +27,8 @@ CAMERA = np.random.default_rng(1).normal(size=(1, 5, 8)).astype("f")
 
 
 def answers(model: ir.Model, camera: Numbers = CAMERA) -> Mapping[str, Numbers]:
-    found = run_once(model, {"camera": camera})
-    return {name: array.astype("f") for name, array in found.items()}
+    result = run_once(model, {"camera": camera})
+    return {name: array.astype("f") for name, array in result.items()}
 
 
 def attended(query: Numbers, keys: Numbers) -> Numbers:
@@ -169,8 +169,8 @@ def test_what_does_not_depend_on_the_reader_stays(
 def test_what_is_stretched_can_be_broadcast(have: list[int], want: list[int]) -> None:
     padded = stretched(tuple(have), tuple(want))
     if padded is not None:
-        held = np.zeros(have).reshape(padded)
-        assert np.broadcast_to(held, want).shape == tuple(want)
+        stored = np.zeros(have).reshape(padded)
+        assert np.broadcast_to(stored, want).shape == tuple(want)
 
 
 def test_a_broadcast_of_more_than_one_meaning_is_none() -> None:

@@ -49,8 +49,8 @@ def test_merged_casts_say_what_happens_beyond_the_range() -> None:
     )
     apply(EliminateRedundant(), model)
     assert ops(model) == ["Cast", "Cast"]
-    [found] = compute(model, {"x": np.array([10000], np.float16)})
-    np.testing.assert_array_equal(found, [np.nan])
+    [result] = compute(model, {"x": np.array([10000], np.float16)})
+    np.testing.assert_array_equal(result, [np.nan])
 
 
 @pytest.mark.parametrize(

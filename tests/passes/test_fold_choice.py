@@ -199,9 +199,11 @@ def test_a_value_beyond_the_limit_stays(monkeypatch: pytest.MonkeyPatch) -> None
         return {}, []
 
     monkeypatch.setattr(knowledge, "evaluate", evaluate)
-    found = FoldConstants(bytes_per_node=0).run(model, Context(ModuleMap.whole())).model
+    result = (
+        FoldConstants(bytes_per_node=0).run(model, Context(ModuleMap.whole())).model
+    )
     assert max(rows) * 16 == knowledge.LARGEST
-    assert [node.op_type for node in found.graph][-2:] == ["ReduceMax", "Add"]
+    assert [node.op_type for node in result.graph][-2:] == ["ReduceMax", "Add"]
 
 
 def test_memory_that_runs_out_is_a_refusal() -> None:

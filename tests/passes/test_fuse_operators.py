@@ -295,9 +295,9 @@ def test_the_way_to_a_plugin_of_tensorrt_is_checked() -> None:
     passes = recipe.parse("fuse-operators,translate-plugins{dialect=tensorrt}")
     model = decomposed(Sizes(n=3), merge="ReduceSum", masked=True)
     report = PassManager(passes).run(model, NO_MODULES)
-    (found,) = report.verifications
-    assert found.passes == ("fuse-operators", "translate-plugins")
-    assert found.errors["y"] < 1e-4
+    (result,) = report.verifications
+    assert result.passes == ("fuse-operators", "translate-plugins")
+    assert result.errors["y"] < 1e-4
     assert "MultiscaleDeformableAttnPlugin_TRT" in ops(report.model)
 
 

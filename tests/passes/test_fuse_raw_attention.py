@@ -57,7 +57,7 @@ def model_of(c: Case, *, also: str = "") -> ir.Model:
         "six": f"{n}, {q}, {m}, {cams}, {k}, {p}",
         "full": full,
     }
-    held = ", ".join(
+    stored = ", ".join(
         f"int64[{len(dims.split(','))}] {name} = {{{dims}}}"
         for name, dims in shapes.items()
     )
@@ -69,7 +69,7 @@ def model_of(c: Case, *, also: str = "") -> ir.Model:
              double[{n},{q},{m * k * p * 2}] moved, double[{n},{q},{m * k * p}] scores,
              double[{cams},{n},{q}] mask)
             => (double[{n},{q},{m},3] y{outputs})
-        <{held}, double scale = {{{c.scale}}}> {{
+        <{stored}, double scale = {{{c.scale}}}> {{
             turned = Transpose<perm = [1, 2, 0, 3, 4]>(points)
             near = Reshape(turned, near_of)
             away = Reshape(moved, away_of)

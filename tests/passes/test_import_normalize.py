@@ -190,9 +190,9 @@ def test_a_double_grid_that_onnxruntime_refuses_runs_afterwards() -> None:
         "g (float[1, 1, 4, 4] x, float[1, 3, 3, 2] g) => (float[1, 1, 3, 3] y) {"
         " y = GridSample (x, g) }"
     )
-    (found,) = compute(model, {"x": x, "p": p})
+    (result,) = compute(model, {"x": x, "p": p})
     (wanted,) = compute(reference, {"x": x, "g": p / np.float32(2)})
-    np.testing.assert_allclose(found, wanted, rtol=0, atol=1e-6)
+    np.testing.assert_allclose(result, wanted, rtol=0, atol=1e-6)
     assert settled(model)
 
 
@@ -234,8 +234,8 @@ def test_resize_scales_computed_in_double_become_float32() -> None:
     )
     normalise(model)
     x = np.arange(4, dtype=np.float32).reshape(1, 1, 2, 2)
-    (found,) = compute(model, {"x": x})
-    np.testing.assert_array_equal(found, x.repeat(2, axis=2).repeat(2, axis=3))
+    (result,) = compute(model, {"x": x})
+    np.testing.assert_array_equal(result, x.repeat(2, axis=2).repeat(2, axis=3))
 
 
 def test_numbers_beyond_float32_stay_finite_and_infinities_stay_infinite() -> None:

@@ -89,8 +89,10 @@ def test_notes_say_what_was_decided_by_which_rule(
 ) -> None:
     chosen = QuantizeInt8(**options)  # type: ignore[arg-type]
 
-    said = chosen.run(conv_attention(), context).notes
-    assert [any(note in line for line in said) for note in notes] == [True] * len(notes)
+    message = chosen.run(conv_attention(), context).notes
+    assert [any(note in line for line in message) for note in notes] == [True] * len(
+        notes
+    )
 
 
 @pytest.mark.parametrize(
@@ -325,8 +327,8 @@ def scales(model: ir.Model) -> set[str]:
 def test_scales_of_a_float16_graph_are_float16(context: Context) -> None:
     wide = half(19, context)
     placed = check_pass(PAPER, wide, context).model
-    found = compare(Session(wide), Session(placed), list(context.frames or ()))
-    assert min(each.sqnr_db for each in found.outputs) > 20
+    result = compare(Session(wide), Session(placed), list(context.frames or ()))
+    assert min(each.sqnr_db for each in result.outputs) > 20
     source = conv_attention()
     source.opset_imports[""] = 19
     int8 = check_pass(PAPER, source, context).model

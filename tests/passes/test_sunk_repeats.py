@@ -66,8 +66,8 @@ GIVEN = {
 
 def rows_of(model: ir.Model, *op_types: str) -> set[int | None]:
     """Return the sizes of the first axis of what some operators make."""
-    found = [node.outputs[0] for node in model.graph if node.op_type in op_types]
-    return {(static_shape(value) or (None,))[0] for value in found}
+    result = [node.outputs[0] for node in model.graph if node.op_type in op_types]
+    return {(static_shape(value) or (None,))[0] for value in result}
 
 
 @pytest.mark.parametrize("form", FORMS)
@@ -155,8 +155,8 @@ def test_what_differs_by_camera_is_computed_for_each(case: str) -> None:
 
     model = hoist(text, **GIVEN)
 
-    found = {kind: rows_of(model, kind) for kind in rows}
-    assert found == {kind: {size} for kind, size in rows.items()}
+    result = {kind: rows_of(model, kind) for kind in rows}
+    assert result == {kind: {size} for kind, size in rows.items()}
     if case == "few rows that others read, too":
         note = "left 1 node behind what repeats: others read it too, or it is small"
         assert apply(HoistLinear(), read(text, **GIVEN)).notes == (note,)

@@ -27,10 +27,10 @@ def read(signature: str, body: str) -> ir.Model:
     return model
 
 
-def placed(found: Assignment) -> dict[str | None, tuple[str, str]]:
+def placed(result: Assignment) -> dict[str | None, tuple[str, str]]:
     return {
         node.outputs[0].name: (place.module, place.rule)
-        for node, place in found.placements.items()
+        for node, place in result.placements.items()
     }
 
 
@@ -120,11 +120,11 @@ def test_stamps_decide_in_an_imported_graph(stamp: str, place: tuple[str, str]) 
 
 def test_the_result_tells_nodes_and_rules() -> None:
     model = read(ONE, '["/neck/Relu"] a = Relu(x) ["/det/Neg"] b = Neg(a) y = Abs(b)')
-    found = assign(model, MAP)
-    assert found.rules() == {"scope": 2, "neighbour": 1}
-    assert [node.outputs[0].name for node in found.nodes("det")] == ["b", "y"]
-    assert found.module_of(model.graph[0]) == "neck"
-    assert found.placements[model.graph[2]].rule == "neighbour"
+    result = assign(model, MAP)
+    assert result.rules() == {"scope": 2, "neighbour": 1}
+    assert [node.outputs[0].name for node in result.nodes("det")] == ["b", "y"]
+    assert result.module_of(model.graph[0]) == "neck"
+    assert result.placements[model.graph[2]].rule == "neighbour"
 
 
 MISSING = '[modules.det]\nrole = "prediction"\npatterns = ["det", "det.cls"]'

@@ -23,9 +23,9 @@ def model() -> ir.Model:
 
 def test_shared_weights_count_once_and_sizes_are_no_parameters() -> None:
     graph = model()
-    found = itemise(graph, MAP, assign(graph, MAP).module_of, lambda node: 2)
+    result = itemise(graph, MAP, assign(graph, MAP).module_of, lambda node: 2)
     # nodes, parameters, bytes of weights, MACs, nodes of unknown MACs
-    assert found == (
+    assert result == (
         *(Item("neck", 1, 2, 8, 2, 0), Item("det", 3, 2, 16, 6, 0)),
         Item("plan", 0, 0, 0, 0, 0),
     )

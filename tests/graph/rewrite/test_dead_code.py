@@ -74,10 +74,10 @@ def test_a_dead_reader_hides_no_pattern() -> None:
     text = "g (float[2] x) => (float[2] y) { a = Relu(x) y = Relu(a) dead = Neg(a) }"
     model = read(text)
 
-    found = fuse(model, [ONCE], by="test")
+    result = fuse(model, [ONCE], by="test")
 
     assert ops(model) == ["Relu"]
-    assert found.notes() == ("fused: Relu of Relu (1)", "removed: 1 unread")
+    assert result.notes() == ("fused: Relu of Relu (1)", "removed: 1 unread")
     assert fuse(model, [ONCE], by="test").changes == 0
 
 
@@ -93,10 +93,10 @@ def test_what_a_fusion_in_a_body_frees_is_fused_too() -> None:
         }"""
     )
 
-    found = fuse(model, [ONCE, DROP], by="test")
+    result = fuse(model, [ONCE, DROP], by="test")
 
     assert ops(model) == ["Relu", "If"]
-    assert (found.changes, fuse(model, [ONCE, DROP], by="test").changes) == (2, 0)
+    assert (result.changes, fuse(model, [ONCE, DROP], by="test").changes) == (2, 0)
 
 
 FORMS = ("Relu({})", "Neg({})", "Identity({})", "Transpose({})", "Add({}, {})",

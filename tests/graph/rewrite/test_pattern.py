@@ -45,9 +45,9 @@ def last(pattern: Pattern, *lines: str, **weights: Any) -> Match | None:
     ],
 )
 def test_operands(op_type: str, line: str, matches: bool) -> None:
-    found = last(op(op_type, X, op("Sigmoid", X)), "a = Sigmoid(x)", line)
-    assert (found is not None) == matches
-    assert found is None or found[X].name == "x"
+    result = last(op(op_type, X, op("Sigmoid", X)), "a = Sigmoid(x)", line)
+    assert (result is not None) == matches
+    assert result is None or result[X].name == "x"
 
 
 def test_one_operator_object_is_one_node() -> None:
@@ -61,9 +61,9 @@ def test_a_wrong_first_choice_is_taken_back() -> None:
     # the first Neg fits the first operand; only the other order fits both
     pattern = op("Add", op("Neg", X), op("Neg", op("Relu", Y)))
     lines = ("r = Relu(z)", "a = Neg(r)", "b = Neg(x)", "y = Add(a, b)")
-    found = last(pattern, *lines)
-    assert found is not None
-    assert (found[X].name, found[Y].name) == ("x", "z")
+    result = last(pattern, *lines)
+    assert result is not None
+    assert (result[X].name, result[Y].name) == ("x", "z")
 
 
 TWICE = op("Relu", op("Relu", X))
@@ -86,8 +86,8 @@ def test_what_others_read_is_not_inner() -> None:
 )
 def test_constants(pattern: Pattern, value: Any, matches: bool) -> None:
     weights = {"c": np.array(value, np.float32)}
-    found = last(op("Mul", X, pattern), "y = Mul(c, x)", **weights)
-    assert (found is not None) == matches
+    result = last(op("Mul", X, pattern), "y = Mul(c, x)", **weights)
+    assert (result is not None) == matches
 
 
 def test_a_variable_can_ask_for_what_is_computed() -> None:
@@ -130,7 +130,7 @@ def test_a_node_whose_other_outputs_are_read_ends_nothing() -> None:
 
 
 def test_a_pattern_ends_in_an_operator() -> None:
-    nothing = Fusion("nothing", either(op("Relu", X), X), lambda found, kit: None)
+    nothing = Fusion("nothing", either(op("Relu", X), X), lambda result, kit: None)
     with pytest.raises(GraphError, match="a fusion ends in an operator, not in Varia"):
         fuse(graph_of("y = Relu(x)"), [nothing], by="test")
 
@@ -142,10 +142,10 @@ def test_what_a_rewrite_refuses_is_counted_with_its_reason() -> None:
     refused = dataclasses.replace(ONCE, rewrite=lambda match, kit: "no Relu today")
     model = graph_of("a = Relu(x)", "y = Relu(a)")
 
-    found = fuse(model, [refused], by="test")
+    result = fuse(model, [refused], by="test")
 
     assert ops(model) == ["Relu", "Relu"]
-    assert found.notes() == ("left 1: no Relu today",)
+    assert result.notes() == ("left 1: no Relu today",)
 
 
 def test_a_fusion_may_complete_another() -> None:

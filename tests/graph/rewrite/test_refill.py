@@ -20,7 +20,7 @@ def refilled(text: str, index: int) -> ir.Model:
     )
     gemm = next(node for node in model.graph if node.op_type == "Gemm")
 
-    def refill(found: Match, kit: Kit) -> str:
+    def refill(result: Match, kit: Kit) -> str:
         kit.refill(gemm, index, NEW, "new")
         return "once is enough"
 
@@ -45,9 +45,9 @@ def test_the_operand_holds_the_new_numbers(text: str, initializers: str) -> None
     model = refilled(text, 2)
 
     gemm = next(node for node in model.graph if node.op_type == "Gemm")
-    held = array_of(gemm.inputs[2])
-    assert held is not None
-    np.testing.assert_array_equal(held, NEW)
+    stored = array_of(gemm.inputs[2])
+    assert stored is not None
+    np.testing.assert_array_equal(stored, NEW)
     assert sorted(model.graph.initializers) == initializers.split()
     others = [node for node in model.graph if node.op_type == "Add"]
     assert all(not np.any(array_of(node.inputs[1])) for node in others)

@@ -65,9 +65,9 @@ def test_it_answers_its_reference(
 ) -> None:  # fmt: skip
     arrays = drawn(batch, queries, keys, heads * channels, seed=seed, large=large)
 
-    found = ran(arrays, heads)
+    result = ran(arrays, heads)
 
-    assert np.allclose(found, expected(arrays, heads), rtol=1e-4, atol=2e-5)
+    assert np.allclose(result, expected(arrays, heads), rtol=1e-4, atol=2e-5)
 
 
 @pytest.mark.parametrize(("width", "called"), [(8, ["MultiHeadAttention"]), (300, [])])
@@ -87,32 +87,32 @@ def test_scores_that_would_overflow_without_the_maximum() -> None:
     arrays["key"] = np.sort(arrays["key"], axis=1)  # later blocks have larger scores
     arrays["query"][:] = np.abs(arrays["query"])
 
-    found = ran(arrays, 2)
+    result = ran(arrays, 2)
 
-    assert np.isfinite(found).all()
-    assert np.allclose(found, expected(arrays, 2), rtol=1e-3, atol=1e-3)
+    assert np.isfinite(result).all()
+    assert np.allclose(result, expected(arrays, 2), rtol=1e-3, atol=1e-3)
 
 
 def test_powers_are_accurate() -> None:
     x = np.linspace(-80, 0, 5000, dtype=np.float32).reshape(1, -1, 1)
     key = np.array([[[0], [1]]], np.float32)
 
-    found = ran({"query": x, "key": key, "value": key}, 1)
+    result = ran({"query": x, "key": key, "value": key}, 1)
 
     power = np.exp(x.astype(np.float64))
-    assert np.allclose(found, power / (1 + power), rtol=1e-5, atol=0)
+    assert np.allclose(result, power / (1 + power), rtol=1e-5, atol=0)
     near = x > -4  # further below, the rounding of x log2(e) is most of it
-    assert np.allclose(found[near], (power / (1 + power))[near], rtol=6e-7, atol=0)
+    assert np.allclose(result[near], (power / (1 + power))[near], rtol=6e-7, atol=0)
 
 
 def test_a_query_that_is_no_number_is_none_afterwards() -> None:
     arrays = drawn(1, 60, 300, 16)
     arrays["query"][0, 7, 3] = np.nan
 
-    found = ran(arrays, 1)
+    result = ran(arrays, 1)
 
-    assert np.isnan(found[0, 7]).all()
-    assert np.isfinite(np.delete(found, 7, axis=1)).all()
+    assert np.isnan(result[0, 7]).all()
+    assert np.isfinite(np.delete(result, 7, axis=1)).all()
 
 
 def test_two_threads_answer_what_one_does() -> None:

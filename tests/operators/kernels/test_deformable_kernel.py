@@ -58,10 +58,10 @@ def test_every_dialect_answers_its_reference(
     _, needed = runnable.replace_fused(model, compiled=True)
     assert needed
 
-    found = Session(model, threads=1).run(arrays)["result"]
+    result = Session(model, threads=1).run(arrays)["result"]
 
     expected = dialect_reference(OPERATOR, dialect, DrawnCall(arrays))
-    assert np.allclose(found, expected, rtol=1e-4, atol=1e-4)
+    assert np.allclose(result, expected, rtol=1e-4, atol=1e-4)
 
 
 def test_aggregation_over_cameras_takes_the_same_kernel() -> None:
@@ -82,10 +82,10 @@ def test_aggregation_over_cameras_takes_the_same_kernel() -> None:
     _, needed = runnable.replace_fused(model, compiled=True)
     assert [each.op_type for each in needed] == ["MultiScaleDeformableAttention"]
 
-    found = Session(model, threads=1).run(arrays)["result"]
+    result = Session(model, threads=1).run(arrays)["result"]
 
     expected = operator.reference(list(arrays.values()), {})
-    assert np.allclose(found, expected, rtol=1e-4, atol=1e-4)
+    assert np.allclose(result, expected, rtol=1e-4, atol=1e-4)
 
 
 def test_what_has_no_weight_is_not_read() -> None:
@@ -164,11 +164,11 @@ def test_int8_values_with_raw_offsets_and_scores() -> None:
 
     names = [str(port.name) for port in model.graph.inputs]
     feeds = dict(zip(names, [stored, *list(arrays.values())[1:]], strict=True))
-    found = Session(model, threads=1).run(feeds)["y"]
+    result = Session(model, threads=1).run(feeds)["y"]
 
     real = (stored.astype(np.float64) - 119) * 0.02
     expected = dialect_reference(OPERATOR, RAW, DrawnCall({**arrays, "value": real}))
-    assert np.allclose(found, expected, rtol=1e-4, atol=1e-4)
+    assert np.allclose(result, expected, rtol=1e-4, atol=1e-4)
 
 
 STORED = """
@@ -214,13 +214,13 @@ def test_int8_values_are_read_as_they_are(kind: str, made: str) -> None:
     ]
     assert not {"DequantizeLinear", "Cast"} & {node.op_type for node in ready.graph}
 
-    found = Session(model, threads=1).run(feeds)["y"]
+    result = Session(model, threads=1).run(feeds)["y"]
 
     stored = feeds["stored"].astype(np.float64)
     plain = "by_channel" in made
     real = stored * feeds["by_channel"] if plain else (stored - int(zero)) * 0.02
     inputs = [real.reshape(2, 63, 3, 8), *list(feeds.values())[1:5]]
-    assert np.allclose(found, OPERATOR.reference(inputs, {}), rtol=1e-4, atol=1e-4)
+    assert np.allclose(result, OPERATOR.reference(inputs, {}), rtol=1e-4, atol=1e-4)
 
 
 def test_scales_that_the_kernel_does_not_know_stay_in_float() -> None:

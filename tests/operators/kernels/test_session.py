@@ -54,14 +54,14 @@ def test_sessions_and_threads_answer_alike() -> None:
     sessions = [Session(model, threads=2) for _ in range(2)]
 
     with ThreadPoolExecutor(4) as pool:
-        found = list(pool.map(lambda each: each.run(arrays)["result"], sessions * 4))
+        result = list(pool.map(lambda each: each.run(arrays)["result"], sessions * 4))
 
-    assert all(np.array_equal(each, first) for each in found)
+    assert all(np.array_equal(each, first) for each in result)
 
 
 @needs_kernels
 @pytest.mark.parametrize(
-    ("name", "wrong", "said"),
+    ("name", "wrong", "message"),
     [
         ("attention_weights", lambda a: a[:, :-1], "the inputs do not fit each other"),
         ("spatial_shapes", lambda a: a + 1, "a level lies outside of value"),
@@ -70,16 +70,16 @@ def test_sessions_and_threads_answer_alike() -> None:
     ],
 )
 def test_inputs_that_do_not_fit_are_a_sentence(
-    name: str, wrong: Callable[[Any], Any], said: str
+    name: str, wrong: Callable[[Any], Any], message: str
 ) -> None:
     model, arrays = call(open_dims=True)
     session = Session(model, threads=1)
 
-    with pytest.raises(FramesError, match=said):
+    with pytest.raises(FramesError, match=message):
         session.run({**arrays, name: wrong(arrays[name])})
 
-    found = session.run(arrays)["result"]  # and it lives
-    assert np.allclose(found, expected(arrays), atol=1e-4)
+    result = session.run(arrays)["result"]  # and it lives
+    assert np.allclose(result, expected(arrays), atol=1e-4)
 
 
 @needs_kernels
@@ -88,10 +88,10 @@ def test_places_that_are_no_numbers_are_outside() -> None:
     places = np.array(arrays["sampling_locations"])
     places[:, ::3], places[:, 1::3, ..., 0] = np.nan, np.inf
 
-    found = Session(model, threads=1).run({**arrays, "sampling_locations": places})
+    result = Session(model, threads=1).run({**arrays, "sampling_locations": places})
 
-    assert not found["result"][:, ::3].any()
-    assert not found["result"][:, 1::3].any()
+    assert not result["result"][:, ::3].any()
+    assert not result["result"][:, 1::3].any()
 
 
 @needs_kernels
@@ -101,10 +101,10 @@ def test_a_plugin_of_the_default_domain_in_a_file(tmp_path: Path) -> None:
     arrays = arrays_of(autoware, LARGE)
     graph.save(graph_of(autoware, arrays, opset=13), tmp_path / "m.onnx")
 
-    found = Session(tmp_path / "m.onnx", threads=1).run(arrays)["result"]
+    result = Session(tmp_path / "m.onnx", threads=1).run(arrays)["result"]
 
     rows = expected(arrays)
-    assert np.allclose(found, rows.reshape(*rows.shape[:2], -1), atol=1e-4)
+    assert np.allclose(result, rows.reshape(*rows.shape[:2], -1), atol=1e-4)
 
 
 @needs_kernels
@@ -117,8 +117,8 @@ def test_a_kernel_goes_before_a_body_of_the_own_form(kept: str, tmp_path: Path) 
 
     session = Session(model if kept == "in memory" else tmp_path / "m.onnx", threads=1)
 
-    found = session.run(arrays)["result"]
-    assert np.allclose(found, expected(arrays), atol=1e-4)
+    result = session.run(arrays)["result"]
+    assert np.allclose(result, expected(arrays), atol=1e-4)
 
 
 def test_a_body_that_came_with_a_plugin_decides() -> None:
@@ -170,8 +170,8 @@ def test_another_library_may_have_the_operator(monkeypatch: pytest.MonkeyPatch) 
 
     session, _ = open_graph(model, options)
 
-    found = session.run(None, arrays)[0]
-    assert np.allclose(np.asarray(found), expected(arrays), atol=1e-4)
+    result = session.run(None, arrays)[0]
+    assert np.allclose(np.asarray(result), expected(arrays), atol=1e-4)
 
 
 def test_what_a_library_of_the_user_names_is_left_to_it(tmp_path: Path) -> None:
@@ -187,7 +187,7 @@ def test_what_a_library_of_the_user_names_is_left_to_it(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("why", "said"),
+    ("why", "message"),
     [
         ("numba", "numba is not installed: pip install 'me2e-compress[fast]'"),
         ("platform", "there are kernels on Linux only, not on darwin"),
@@ -196,7 +196,7 @@ def test_what_a_library_of_the_user_names_is_left_to_it(tmp_path: Path) -> None:
     ],
 )
 def test_without_kernels_bodies_run_and_doctor_says_why(
-    why: str, said: str | None, monkeypatch: pytest.MonkeyPatch
+    why: str, message: str | None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def refuses(*_: object) -> None:
         raise (ImportError if why == "unloaded" else OSError)("no")
@@ -210,15 +210,15 @@ def test_without_kernels_bodies_run_and_doctor_says_why(
     else:
         monkeypatch.setattr(trampoline, "trampoline", refuses)
     model, arrays = call()
-    assert kernels.why_not() == said
-    if said is not None:
+    assert kernels.why_not() == message
+    if message is not None:
         checkups = {each.what: each for each in doctor().checkups}
         assert checkups["compiled kernels"].found is None
-        assert checkups["compiled kernels"].advice.endswith(said)
+        assert checkups["compiled kernels"].advice.endswith(message)
 
-    found = Session(model, threads=1).run(arrays)["result"]
+    result = Session(model, threads=1).run(arrays)["result"]
 
-    assert np.allclose(found, expected(arrays), atol=1e-4)
+    assert np.allclose(result, expected(arrays), atol=1e-4)
     model.graph[0].attributes["levels"] = ir.AttrInt64("levels", 2)
     with pytest.raises(GraphError, match=r"node fused: .* no attribute 'levels'"):
         Session(model)
