@@ -120,7 +120,7 @@ class AblateModules(Pass):
         modules = context.modules
         if self.fill == "substitute":
             wanted = [one for module in known for one in module.substitutes]
-            notes += [self._substitute(model, one, modules) for one in wanted]
+            notes += [self._rewire(model, one, modules) for one in wanted]
         for edge in self.edges:
             notes.append(add_edge(model, edge, modules, self._is_dropped, self.name))
         # Fill what is left after the first sweep, then sweep again
@@ -195,9 +195,7 @@ class AblateModules(Pass):
             outputs.remove(value)
         return names
 
-    def _substitute(
-        self, model: ir.Model, wanted: Substitute, modules: ModuleMap
-    ) -> str:
+    def _rewire(self, model: ir.Model, wanted: Substitute, modules: ModuleMap) -> str:
         if wanted.reader is not None and wanted.by is not None:
             reader = Part.of(wanted.reader, modules)
             if all(self._is_dropped(n) for n in model.graph if reader.holds(n)):

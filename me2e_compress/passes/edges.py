@@ -26,9 +26,7 @@ from me2e_compress.passes.parts import (
 )
 
 
-def propagate_growth(
-    model: ir.Model, grown: ir.Value, old: ir.Value, what: str
-) -> None:
+def propagate_size(model: ir.Model, grown: ir.Value, old: ir.Value, what: str) -> None:
     """Infer the shapes behind a value that grew along one axis, in place.
 
     A Reshape gets a new constant shape. Raises PreconditionError where an operator or a
@@ -168,7 +166,7 @@ def add_edge(
         node.replace_input_with(index, joined)
     model.graph.sort()
     if edge.how == "append":
-        propagate_growth(model, joined, old, f"edge {edge.label}: {listed([new])}")
+        propagate_size(model, joined, old, f"edge {edge.label}: {listed([new])}")
     how = {"append": "behind", "add": "added to", "replace": "in the place of"}
     return f"{edge.reader} reads {listed([new])} {how[edge.how]} {listed([old])}"
 

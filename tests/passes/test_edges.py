@@ -14,7 +14,7 @@ from me2e_compress.errors import ModuleMapError, PreconditionError, RecipeError
 from me2e_compress.manager import PassManager, recipe
 from me2e_compress.passes import PASSES
 from me2e_compress.passes.ablate_modules import AblateModules
-from me2e_compress.passes.edges import Edge, propagate_growth
+from me2e_compress.passes.edges import Edge, propagate_size
 from me2e_compress.passes.parts import stretched
 from me2e_compress.runtime.session import run_once
 from tests.passes.hoisted import integers
@@ -294,7 +294,7 @@ def grown(
     for node, index in tuple(old.uses()):
         if node is not model.graph[1]:
             node.replace_input_with(index, new)
-    propagate_growth(model, new, old, "more queries")
+    propagate_size(model, new, old, "more queries")
     return model
 
 

@@ -63,11 +63,7 @@ X, Y = var("x"), var("y")
 ONCE = Fusion(
     "Relu of Relu", op("Relu", op("Relu", X)), lambda m, kit: kit.put("Relu", [m[X]])
 )
-DROP = Fusion(
-    "Mul",
-    op("Mul", X, Y),
-    lambda m, kit: kit.put("Abs", [m[X]]),
-)
+DROP = Fusion("Mul", op("Mul", X, Y), lambda m, kit: kit.put("Abs", [m[X]]))
 
 
 def test_a_dead_reader_hides_no_pattern() -> None:
