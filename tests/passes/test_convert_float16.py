@@ -1,6 +1,5 @@
 """What becomes float16 and what stays, and where the casts between them stand."""
 
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -71,9 +70,8 @@ def test_the_frames_run_on_the_provider(tmp_path: Path) -> None:
     model = bare(OPSET + "b (float[4] x) => (float[4] y) { y = Relu(x) }", {})
     frames = CalibrationSet(record(tmp_path / "f", [{"x": np.ones(4, np.float32)}]))
     library = tmp_path / "gone.so"
-    context = Context(
-        ModuleMap.whole(), frames, provider=CpuProvider(plugins=(library,))
-    )
+    provider = CpuProvider(plugins=(library,))
+    context = Context(ModuleMap.whole(), frames, provider=provider)
 
     with pytest.raises(ProviderError, match=f"plugins library {library}: no such"):
         ConvertFloat16().run(model, context)
@@ -197,12 +195,8 @@ def test_no_two_nodes_have_one_name() -> None:
     assert len(set(names)) == len(names)
 
 
-def converted(
-    text: str,
-    weights: Mapping[str, npt.ArrayLike] | None = None,
-) -> ir.Model:
-    arrays = {n: np.array(each, np.float32) for n, each in (weights or {}).items()}
-    return check_pass(ConvertFloat16(), bare(OPSET + text, arrays)).model
+def converted(text: str, **weights: npt.NDArray[np.float32]) -> ir.Model:
+    return check_pass(ConvertFloat16(), bare(OPSET + text, weights)).model
 
 
 TYPES: dict[str, tuple[str, dict[str, str]]] = {
@@ -348,7 +342,7 @@ def test_a_weight_that_float32_reads_too_is_stored_in_both() -> None:
             y = GridSample(f, grid)
             u = MatMul(z, w)
         }""",
-        {"w": np.ones((8, 2))},
+        w=np.ones((8, 2), np.float32),
     )
     stored = {v.dtype for v in half.graph.initializers.values()}
 

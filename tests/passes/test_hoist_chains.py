@@ -41,16 +41,11 @@ def repetitions(draw: st.DrawFn) -> tuple[str, dict[str, Any]]:
             call = f"Tile(v{at}, {name})"
         elif step in ("merge", "split"):
             if step == "merge":
-                shape = [
-                    *shape[:axis],
-                    math.prod(shape[axis : axis + 2]),
-                    *shape[axis + 2 :],
-                ]
+                shape[axis : axis + 2] = [math.prod(shape[axis : axis + 2])]
             else:
-                low = draw(
-                    st.sampled_from([n for n in (1, 2, 3) if shape[axis] % n == 0])
-                )
-                shape = [*shape[:axis], shape[axis] // low, low, *shape[axis + 1 :]]
+                divisors = [n for n in (1, 2, 3) if shape[axis] % n == 0]
+                low = draw(st.sampled_from(divisors))
+                shape[axis : axis + 1] = [shape[axis] // low, low]
             weights[name] = integers(*shape)
             call = f"Reshape(v{at}, {name})"
         elif step == "turn":
@@ -61,9 +56,8 @@ def repetitions(draw: st.DrawFn) -> tuple[str, dict[str, Any]]:
             call = f"Tanh(v{at})"
         elif step == "sum":
             sizes = [draw(st.sampled_from([1, size])) for size in shape]
-            weights[name] = RANDOM.normal(
-                size=sizes[draw(st.integers(0, len(shape))) :]
-            )
+            del sizes[: draw(st.integers(0, len(shape)))]
+            weights[name] = RANDOM.normal(size=sizes)
             call = f"Sub({name}, v{at})"
         elif step == "softmax":
             call = f"Softmax<axis = -1>(v{at})"
