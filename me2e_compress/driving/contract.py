@@ -59,7 +59,7 @@ DEFAULT_IMAGE_SIZE = (96, 160)
 """Rows and columns for a model that takes any size."""
 
 
-def fed(array: Array, port: SessionPort) -> Array:
+def shaped(array: Array, port: SessionPort) -> Array:
     """Return an array with the rank and type of a port."""
     missing = len(port.shape) - array.ndim
     sides = (1,) * missing + array.shape if missing >= 0 else array.shape[-missing:]

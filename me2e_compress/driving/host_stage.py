@@ -152,13 +152,10 @@ class CollisionOptimizer(HostStage):
         # UniAD's weight is of its own cells
         reference = np.asarray(plan, np.float64)
         weight = self.weight * (self.cell_m / UNIAD_CELL_M) ** 2
-        problem = reference, cells, step, self.sigma_m, weight
-        solution = minimize(
-            cost, reference.ravel(), problem, jac=True, method=self.solver
-        )
-        return HostWork(
-            solution.x.reshape(reference.shape), int(solution.nit), len(cells)
-        )
+        problem, how = (reference, cells, step, self.sigma_m, weight), self.solver
+        solution = minimize(cost, reference.ravel(), problem, how, jac=True)
+        plan = solution.x.reshape(reference.shape)
+        return HostWork(plan, int(solution.nit), len(cells))
 
     def near(
         self, plan: Floats, occupancy: Floats

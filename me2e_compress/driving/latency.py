@@ -325,7 +325,7 @@ class LayeredLatency(LatencySource):
 
     def to_json(self) -> dict[str, Any]:
         """Return the options, and the source below."""
-        named = (each.name for each in fields(self) if each.name != "source")
+        named = (field.name for field in fields(self) if field.name != "source")
         own = {name: getattr(self, name) for name in named}
         return {**own, "of": self.source.to_json()}
 
@@ -378,10 +378,7 @@ class HostStageLatency(LayeredLatency):
 
     def layered(self, latency_us: int, facts: DecisionFacts) -> int:
         """Charge for iterations, cells and the call."""
-        called = self.per_call_us if facts.host_iterations else 0
-        return (
-            latency_us
-            + called
-            + self.per_iteration_us * facts.host_iterations
-            + self.per_cell_us * facts.host_cells
-        )
+        calls = int(facts.host_iterations > 0)
+        work_us = self.per_iteration_us * facts.host_iterations
+        work_us += self.per_cell_us * facts.host_cells + self.per_call_us * calls
+        return latency_us + work_us

@@ -52,10 +52,10 @@ class FirstValues:
                 continue
             where = f"first value of {name}: {source}"
             if source not in ports or source in recurrent:
-                there = ", ".join(each for each in ports if each not in recurrent)
+                others = ", ".join(port for port in ports if port not in recurrent)
                 raise EvaluationError(
                     f"{where} is neither {ZEROS} nor an input that is not recurrent;"
-                    f" those are {there or 'none'}"
+                    f" those are {others or 'none'}"
                 )
             port, other = ports[name], ports[source]
             if other.type != port.type or not fits(other.shape, port.shape):
@@ -64,10 +64,9 @@ class FirstValues:
                     f" {port.type} {list(port.shape)}"
                 )
             given[name] = source
-        # all others start from zeros
-        known = {*given, *session.recurrent}
-        others = [name for name in recurrent if name not in known]
-        return cls(given, {name: zero_state(name, ports[name]) for name in others})
+        # All others start from zeros
+        unset = [name for name in recurrent if name not in {*given, *session.recurrent}]
+        return cls(given, {name: zero_state(name, ports[name]) for name in unset})
 
     def at(self, feeds: Mapping[str, Array]) -> dict[str, Array]:
         """Return those that are not zeros, given the feeds of the first decision."""
@@ -134,7 +133,7 @@ class OnnxPolicy:
         reads = plan_read(session, adapter)
         first = FirstValues.of(session, adapter.recurrent, recurrent)
         policy = cls(session, adapter, inputs, reads, recurrent, first, stage)
-        # a misfit that only a run shows
+        # Find a misfit that only a run shows
         policy.reset(None)
         policy.plan(inputs.nothing(command=0))
         for name, answer in recurrent.items():
@@ -161,19 +160,19 @@ class OnnxPolicy:
         self._begins = True
         known = self.session.first_state({})
         self.inputs.reset()
-        own = {name: each for name, each in known.items() if name in self.recurrent}
+        own = {name: known[name] for name in known if name in self.recurrent}
         self._state = {**self.first.zeros, **own}
 
     def plan(self, observation: Observation) -> Trajectory:
         """Run the model once."""
-        # run the model, with first values where a route begins
+        # Run the model, with first values where a route begins
         feeds = self.inputs.feeds(observation)
         if self._begins:
             self._state |= self.first.at(feeds)
         outputs = self.session.run({**self._state, **feeds})
         self._begins = False
         self._state = {name: outputs[to] for name, to in self.recurrent.items()}
-        # the plan in the ego frame, and what the host makes of it
+        # Convert the plan to the ego frame; the host stage may change it
         plan = self.trajectory(outputs, feeds, observation)
         if self.stage is not None:  # it changes six waypoints every 0.5 s
             work = self.stage.work(six_waypoints(plan), outputs)
@@ -208,7 +207,6 @@ def recurrent_of(session: Session, adapter: Adapter) -> dict[str, str]:
     if entries is not None:
         fed_otherwise |= set(contract_names(adapter).values())
     own = {k: v for k, v in session.recurrent.items() if k not in fed_otherwise}
-    answers: dict[str, str] = {}
     for name, entry in (entries or {}).items():
         answer = entry.answer or own.get(name)
         if answer is None:
@@ -216,5 +214,5 @@ def recurrent_of(session: Session, adapter: Adapter) -> dict[str, str]:
                 f"recurrent input {name}: no output answers it by its name; say from ="
                 f" one of {', '.join(session.outputs)}"
             )
-        answers[name] = answer
-    return {**own, **answers}
+        own[name] = answer
+    return own

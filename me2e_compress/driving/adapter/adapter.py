@@ -101,18 +101,15 @@ class FeedPart(BaseModel):
         array = self.source.value(seen)
         if self.mean == 0.0 and self.std == 1.0:
             return array
+        name = self.source.name
         try:
             scaled: Array = (array - np.array(self.mean)) / np.array(self.std)
         except ValueError as error:
-            raise EvaluationError(
-                f"{self.source.name}: mean or std: {error}"
-            ) from error
+            raise EvaluationError(f"{name}: mean or std: {error}") from error
         # numpy may have broadcast to a larger shape
         if scaled.shape != array.shape:
-            raise EvaluationError(
-                f"{self.source.name}: mean and std make {list(scaled.shape)} of its "
-                f"shape {list(array.shape)}"
-            )
+            shapes = f"{list(scaled.shape)} of its shape {list(array.shape)}"
+            raise EvaluationError(f"{name}: mean and std make {shapes}")
         return scaled
 
 
@@ -146,7 +143,7 @@ class Feed(BaseModel):
         arrays = [part.value(seen) for part in self.parts]
         if not self.joined:
             return arrays[0]
-        return np.concatenate([each.reshape(-1) for each in arrays])
+        return np.concatenate([array.reshape(-1) for array in arrays])
 
     def sizes(self, seen: Observed) -> str:
         """Name the sources with their element counts, for messages."""
@@ -208,13 +205,12 @@ class Adapter(BaseModel):
         ``own`` is the graph's own metadata, which holds for what the adapter does not
         name.
         """
-        named = (self.recurrent or {}).items()
-        pairs = {
-            **(declared_pairs(own) or {}),
-            **dict.fromkeys((*self.feeds, *self.images)),
-            **{name: each.answer for name, each in named if each.answer is not None},
-        }
-        # the plan's mode may be picked by an input of another name
+        pairs = {**(declared_pairs(own) or {})}
+        pairs |= dict.fromkeys((*self.feeds, *self.images))
+        for name, entry in (self.recurrent or {}).items():
+            if entry.answer is not None:
+                pairs[name] = entry.answer
+        # The plan's mode may be picked by an input of another name
         metadata = {RECURRENT: json.dumps(pairs)} if pairs else {}
         if self.plan is not None:
             picks = self.plan.command_input

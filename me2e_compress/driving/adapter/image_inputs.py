@@ -15,7 +15,7 @@ from pydantic import (
     model_validator,
 )
 
-from me2e_compress.driving.contract import DEFAULT_IMAGE_SIZE, Shape
+from me2e_compress.driving.contract import DEFAULT_IMAGE_SIZE, Shape, fits
 from me2e_compress.errors import EvaluationError
 from me2e_compress.extras import with_install_hint
 from me2e_compress.registry import documents
@@ -135,12 +135,9 @@ class ImageInput(BaseModel):
         if (self.mean is None) != (self.std is None):
             raise ValueError("mean and std belong together")
         # c, h and w, each letter once
-        letters = self.layout
-        if letters is not None and (
-            set(letters) - set("bnchw")
-            or len(set(letters)) != len(letters)
-            or not set("chw") <= set(letters)
-        ):
+        letters = "chw" if self.layout is None else self.layout
+        known = set("chw") <= set(letters) <= set("bnchw")
+        if not known or len(set(letters)) != len(letters):
             raise ValueError(
                 f"layout {letters!r} must be the letters c, h and w, with b and n if "
                 "there are such dimensions"
@@ -154,10 +151,9 @@ class ImageInput(BaseModel):
                 raise ValueError(f"{len(crops)} crops for {len(self.cameras)} cameras")
             for left, top, right, bottom in crops:
                 if not (0 <= left < right <= columns and 0 <= top < bottom <= rows):
-                    raise ValueError(
-                        f"crop {[left, top, right, bottom]} does not lie in {rows} rows"
-                        f" of {columns} columns"
-                    )
+                    crop = [left, top, right, bottom]
+                    place = f"{rows} rows of {columns} columns"
+                    raise ValueError(f"crop {crop} does not lie in {place}")
         return self
 
     @property
@@ -194,39 +190,30 @@ class ImagePort:
     @classmethod
     def of(cls, name: str, shape: Shape, table: ImageInput) -> Self:
         """Read a port's shape."""
-        # without a layout in the table, the rank of the shape tells it
+        # Without a layout in the table, the rank of the shape tells it
         pictures = 1 if table.stitch else len(table.cameras)
         single = {5: "bnchw", 4: "bchw", 3: "chw"}
         several = {5: "bnchw", 4: "nchw"}
         usual = (single if pictures == 1 else several).get(len(shape), "bnchw")
         layout = table.layout or usual
         known = {"b": 1, "n": pictures, "c": 3}
-        wanted = [known.get(letter, "any") for letter in layout]
-        if (
-            len(shape) != len(layout)
-            or any(
-                isinstance(side, int) and isinstance(must, int) and side != must
-                for side, must in zip(shape, wanted, strict=True)
-            )
-            or ("n" not in layout and pictures > 1)
-        ):
+        wanted = tuple(known.get(letter, "any") for letter in layout)
+        if not fits(shape, wanted) or ("n" not in layout and pictures > 1):
             problem = f"input {name} has shape {list(shape)}, it must be "
             if table == ImageInput():
                 raise EvaluationError(
                     f"{problem}[1, 6, 3, 'any', 'any'], or [images.{name}] say which"
                     " cameras it shows"
                 )
-            raise EvaluationError(f"{problem}{wanted}")
-        # open sides take the table's size, or the default
-        rows, columns = (shape[layout.index(letter)] for letter in "hw")
-        usual_rows, usual_columns = table.size or DEFAULT_IMAGE_SIZE
-        return cls(
-            layout,
-            (
-                rows if isinstance(rows, int) else usual_rows,
-                columns if isinstance(columns, int) else usual_columns,
-            ),
+            raise EvaluationError(f"{problem}{list(wanted)}")
+        # Open sides take the table's size, or the default
+        sides = zip("hw", table.size or DEFAULT_IMAGE_SIZE, strict=True)
+        fixed = {letter: shape[layout.index(letter)] for letter in "hw"}
+        rows, columns = (
+            side if isinstance(side := fixed[letter], int) else default
+            for letter, default in sides
         )
+        return cls(layout, (rows, columns))
 
 
 def rendered_size(name: str, table: ImageInput, port: ImagePort) -> tuple[int, int]:
@@ -237,11 +224,11 @@ def rendered_size(name: str, table: ImageInput, port: ImagePort) -> tuple[int, i
             f"input {name} has {port.size[0]} rows and {port.size[1]} columns: a size "
             f"of {rows} x {columns} does not fit"
         )
-    # without stitching, the cameras are rendered as the input is
-    asked = table.rendered or table.camera_size
-    if asked is not None or not table.stitch:
-        return asked or (rows, columns)
-    # stitched cameras share the columns
+    # Without stitching, the cameras are rendered as the input is
+    own = table.rendered or table.camera_size
+    if own is not None or not table.stitch:
+        return own or (rows, columns)
+    # Stitched cameras share the columns
     if columns % len(table.cameras):
         raise EvaluationError(
             f"input {name}: {columns} columns of {len(table.cameras)} cameras: "
@@ -280,18 +267,14 @@ class InputImages:
         rows, columns = self.rendered
         if (crops := self.table.crops) is None:
             return ((0, 0, columns, rows),) * len(self.indices)
-        # crops count pixels of the camera's own size
+        # Crops count pixels of the camera's own size
         full_rows, full_columns = self.table.camera_size or self.rendered
         across, down = columns / full_columns, rows / full_rows
-        return tuple(
-            (
-                round(left * across),
-                round(top * down),
-                round(right * across),
-                round(bottom * down),
-            )
-            for left, top, right, bottom in crops
-        )
+        windows = list[Crop]()
+        for left, top, right, bottom in crops:
+            begin = round(left * across), round(top * down)
+            windows.append((*begin, round(right * across), round(bottom * down)))
+        return tuple(windows)
 
     def check(self, name: str) -> None:
         """Check that no crop is empty, and that crops to stitch have one height."""
@@ -313,19 +296,19 @@ class InputImages:
 
     def apply(self, images: Bytes) -> Array:
         """Return the input in the graph's layout, from uint8 RGB [6, H, W, 3]."""
-        taken = self._taken(images)
+        pictures = self._pictures(images)
         if self.normalization is None:
-            planes: Array = np.moveaxis(taken, -1, 1)
+            planes: Array = np.moveaxis(pictures, -1, 1)
             planes = planes[:, ::-1] if self.table.order == "bgr" else planes
         else:
-            planes = self.normalization.apply(taken)[0]
-        # zeros below and to the right of pictures that are smaller than the input
+            planes = self.normalization.apply(pictures)[0]
+        # Put zeros below and to the right of pictures that are smaller than the input
         height, width = planes.shape[-2:]
         if (height, width) != self.port.size:
             padded = np.zeros((*planes.shape[:2], *self.port.size), planes.dtype)
             padded[..., :height, :width] = planes
             planes = padded
-        # [n, c, h, w] in the graph's layout
+        # Bring [n, c, h, w] into the graph's layout
         letters, layout = "nchw", self.port.layout
         if "n" not in layout:
             planes, letters = planes[0], "chw"
@@ -340,7 +323,7 @@ class InputImages:
     ) -> npt.NDArray[np.float32]:
         """Convert [6, 4, 4] to rendered pixels into [cameras, 4, 4] to this input's."""
         chosen = lidar2img[list(self.indices)]
-        # from rendered pixels of a camera to those of this input: move, then scale
+        # From rendered pixels of a camera to those of this input: move, then scale
         widths = [right - left for left, _, right, _ in self.windows]
         moves = np.tile(np.eye(4), (len(widths), 1, 1))
         for at, (left, top, _, bottom) in enumerate(self.windows):
@@ -354,29 +337,28 @@ class InputImages:
             return chosen
         return np.asarray(moves @ chosen, np.float32)
 
-    def _taken(self, images: Bytes) -> Bytes:
-        """Return uint8 RGB [pictures, h, w, 3]."""
+    def _pictures(self, images: Bytes) -> Bytes:
+        """Crop, stitch and resize: return uint8 RGB [pictures, h, w, 3]."""
         rows, columns = self.rendered
-        # pictures taken as they are need no copy
-        whole = all(each == (0, 0, columns, rows) for each in self.windows)
+        # Whole pictures of the right size need no copy
+        whole = set(self.windows) == {(0, 0, columns, rows)}
         if whole and self.size == self.rendered and not self.table.stitch:
             every = self.indices == tuple(range(len(images)))
             return images if every else images[list(self.indices)]
-        parts = [
-            images[index, top:bottom, left:right]
-            for index, (left, top, right, bottom) in zip(
-                self.indices, self.windows, strict=True
-            )
-        ]
+        # Crop and stitch
+        parts = list[Bytes]()
+        for index, window in zip(self.indices, self.windows, strict=True):
+            left, top, right, bottom = window
+            parts.append(images[index, top:bottom, left:right])
         if self.table.stitch:
             parts = [np.concatenate(parts, axis=1)]
         if all(part.shape[:2] == self.size for part in parts):
             return np.stack(parts)
+        # Resize bilinearly, by pixel centres; a picture of that size stays as it is
         try:
             import cv2
         except ImportError as error:
             raise with_install_hint(error) from error
-        # bilinear, by pixel centres; a picture of that size stays as it is
         size, how = self.size[::-1], cv2.INTER_LINEAR
-        made = [cv2.resize(part, size, interpolation=how) for part in parts]
-        return np.stack(made).astype(np.uint8, copy=False)
+        resized = [cv2.resize(part, size, interpolation=how) for part in parts]
+        return np.stack(resized).astype(np.uint8, copy=False)

@@ -21,8 +21,8 @@ from me2e_compress.driving.contract import (
     EgoKinematics,
     Observation,
     Shape,
-    fed,
     fits,
+    shaped,
 )
 from me2e_compress.driving.input_sources import INPUT_SOURCES, EgoTrack, Observed
 from me2e_compress.errors import EvaluationError
@@ -74,27 +74,24 @@ class ModelInputs:
     ) -> tuple[Self, dict[str, str]]:
         """Return what can be fed, and by input why the rest cannot."""
         ports = {k: v for k, v in session.inputs.items() if k not in recurrent}
-        # every input is fed by something
+        # Images and feeds: those of the contract that the adapter does not name, too
+        named, names = {*adapter.images, *adapter.feeds}, contract_names(adapter)
         tables = {k: v for k, v in adapter.images.items() if k in ports}
-        usual = adapter.inputs.get(IMAGES, IMAGES)
-        if usual in ports and usual not in {**adapter.images, **adapter.feeds}:
-            tables = {usual: ImageInput(), **tables}
-        named, names = {**adapter.images, **adapter.feeds}, contract_names(adapter)
+        if names[IMAGES] in ports and names[IMAGES] not in named:
+            tables = {names[IMAGES]: ImageInput(), **tables}
         given = {
             names[ours]: Feed.by(INPUT_SOURCES.build(source, {}))
             for ours, source in CONTRACT.items()
             if names[ours] in ports and names[ours] not in named
         } | {k: v for k, v in adapter.feeds.items() if k in ports}
-        fed_by = {**tables, **given}
-        sources = ", ".join(INPUT_SOURCES.names())
-        problems = {
-            name: f"input {name} is none of {', '.join((IMAGES, *CONTRACT))}, no output"
-            f" is known to feed it back, and the adapter has no [feeds.{name}]"
-            f" (sources: {sources}) or [images.{name}]"
-            for name in ports
-            if name not in fed_by
-        }
-        # and by something that fits
+        # Check that every input has a source, and one that fits
+        sources, problems = ", ".join(INPUT_SOURCES.names()), dict[str, str]()
+        for name in [name for name in ports if name not in {**tables, **given}]:
+            problems[name] = (
+                f"input {name} is none of {', '.join((IMAGES, *CONTRACT))}, no output"
+                f" is known to feed it back, and the adapter has no [feeds.{name}]"
+                f" (sources: {sources}) or [images.{name}]"
+            )
         images, size, faults = _images(session, adapter, tables)
         opened = cls(session.inputs, adapter, tables, images, given, size)
         return opened, {**problems, **faults, **opened.faults()}
@@ -102,9 +99,7 @@ class ModelInputs:
     @property
     def cameras(self) -> tuple[int, ...]:
         """Indices among the six cameras of those that the model sees, ascending."""
-        return tuple(
-            sorted({at for each in self.images.values() for at in each.indices})
-        )
+        return tuple(sorted({at for e in self.images.values() for at in e.indices}))
 
     def reset(self) -> None:
         """Begin a route: forget the last one."""
@@ -113,16 +108,15 @@ class ModelInputs:
     def feeds(self, observation: Observation) -> dict[str, Array]:
         """Convert an observation to the graph's inputs; call it once per decision."""
         arrays: dict[str, Array] = {}
-        if self.images:
+        for name, image in self.images.items():
             if observation.images is None:
                 raise EvaluationError("the model needs images, and none were rendered")
-            for name, each in self.images.items():
-                arrays[name] = each.apply(observation.images)
-        # inputs that are no images may need the ego's track
+            arrays[name] = image.apply(observation.images)
+        # Inputs that are no images may need the ego's track
         self._track.note(observation.time_us, observation.motion)
         seen = self._seen(observation)
         arrays |= {name: feed.value(seen) for name, feed in self.given.items()}
-        return {name: fed(array, self.ports[name]) for name, array in arrays.items()}
+        return {name: shaped(array, self.ports[name]) for name, array in arrays.items()}
 
     def nothing(self, command: int) -> Observation:
         """Return an observation of zeros, for a dry run."""
@@ -139,19 +133,15 @@ class ModelInputs:
         )
 
     def _seen(self, observation: Observation) -> Observed:
-        lidar2img = observation.lidar2img
-        projections = {
-            name: each.projections(lidar2img) for name, each in self.images.items()
-        }
-        return Observed(
-            observation, self.adapter.axes, self._track, projections or {"": lidar2img}
-        )
+        images, lidar2img = self.images.items(), observation.lidar2img
+        projections = {name: image.projections(lidar2img) for name, image in images}
+        projections = projections or {"": lidar2img}
+        return Observed(observation, self.adapter.axes, self._track, projections)
 
     def faults(self) -> dict[str, str]:
         """Return the reason for each input that cannot be fed, in feed order."""
         nothing = self.nothing(0)
         self._track.note(0, nothing.motion)
-        # what feeds an input must be there, and fit
         seen, faults = self._seen(nothing), dict[str, str]()
         for name, feed in self.given.items():
             try:
@@ -175,11 +165,9 @@ def _images(
     session: Session, adapter: Adapter, tables: Mapping[str, ImageInput]
 ) -> tuple[dict[str, InputImages], tuple[int, int], dict[str, str]]:
     """Return the image inputs, the size of the cameras, and what does not fit."""
-    ports: dict[str, ImagePort] = {}
-    sizes: list[tuple[int, int]] = []
-    images: dict[str, InputImages] = {}
-    faults: dict[str, str] = {}
-    # one rendered size serves all inputs: the largest that any of them asks for
+    ports, sizes = dict[str, ImagePort](), list[tuple[int, int]]()
+    images, faults = dict[str, InputImages](), dict[str, str]()
+    # One rendered size serves all inputs: the largest that any of them asks for
     for name, table in tables.items():
         try:
             port = ImagePort.of(name, session.inputs[name].shape, table)
@@ -191,15 +179,15 @@ def _images(
     rendered = max(rows), max(columns)
     for name, port in ports.items():
         try:
-            # inputs of bytes are not normalised
+            # Inputs of bytes are not normalised
             norm, usual = None, adapter.image
             if session.inputs[name].type != BYTES:
                 if usual is None and tables[name].mean is None:
                     usual = ImageNormalization.of(session.metadata)
                 norm = tables[name].normalization(name, usual)
-            made = InputImages(tables[name], port, rendered, norm)
-            made.check(name)
-            images[name] = made
+            image = InputImages(tables[name], port, rendered, norm)
+            image.check(name)
+            images[name] = image
         except EvaluationError as error:
             faults[name] = str(error)
     return images, rendered, faults
@@ -234,13 +222,11 @@ def _exists(name: str, ports: Mapping[str, SessionPort], kind: str) -> None:
 def _fault(name: str, port: SessionPort, array: Array, sizes: str) -> str:
     """Say how an array does not fit a port, which may have a batch of one before it."""
     shape: Shape = port.shape
-    batch = shape[: max(0, len(shape) - array.ndim)]
-    if any(isinstance(side, int) and side != 1 for side in batch) or not fits(
-        shape[len(batch) :], array.shape
-    ):
+    batch = (1,) * (len(shape) - array.ndim)
+    if not fits(shape, (*batch, *array.shape)):
         fault = f"input {name} has shape {list(shape)}, it must be {[1, *array.shape]}"
         return f"{fault}: it is {sizes}" if sizes else fault
-    # the types must agree
+    # The types must agree
     if not np.can_cast(array.dtype, DTYPES[port.type], "same_kind"):
         return f"input {name} is {port.type}, and what feeds it {array.dtype}"
     return ""

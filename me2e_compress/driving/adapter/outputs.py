@@ -26,7 +26,7 @@ from me2e_compress.graph.recurrence import (
     sides,
 )
 from me2e_compress.runtime.plan_adapter import PLAN, PlanAdapter
-from me2e_compress.runtime.session import DTYPES, Session, zero_state
+from me2e_compress.runtime.session import DTYPES, Session, SessionPort, zero_state
 
 COMMAND = "command"
 """Name of the navigator's command among the inputs."""
@@ -92,7 +92,7 @@ def adapted(
             metadata |= _of_map(model, modules, ports, metadata)
     if adapter is not None:
         adapter_of = Adapter.load(adapter_file(Path(adapter)))
-        inputs = [str(each.name) for each in model.graph.inputs]
+        inputs = [str(value.name) for value in model.graph.inputs]
         # every input that the adapter names must exist
         for name in (*adapter_of.feeds, *adapter_of.images):
             if name not in inputs:
@@ -119,7 +119,7 @@ def state_and_plan(
     `others`, if the graph has what they name. It is written into the graph's metadata
     and returned; see :func:`adapted`.
     """
-    # in the order in which one overrides the others
+    # In the order in which one overrides the others
     sources = [(f"metadata of {path.name}", dict(model.metadata_props))]
     for other, metadata in others.items():
         lent = _lent(model, metadata)
@@ -129,7 +129,7 @@ def state_and_plan(
         named = Path(str(given[0] or given[1])).name
         sources.append((f"{origin} {named}", adapted(model, *given)))
     added = {key: text for _, own in sources[1:] for key, text in own.items()}
-    # what is known, by where it stands last
+    # What is known, by the source that states it last
     pairs, plan = dict[str, tuple[str | None, str]](), ("", "its name")
     for origin, own in sources:
         for name, answer in (declared_pairs(own) or {}).items():
@@ -142,25 +142,20 @@ def state_and_plan(
         _, origin = pairs.get(name, ("", "its name"))
         there = known.setdefault(origin, [])
         there.append(name if there else f"state {name}")
-    outputs = [str(each.name) for each in model.graph.outputs]
+    outputs = [str(output.name) for output in model.graph.outputs]
     if (own_plan := PlanAdapter.of(model.metadata_props, outputs)) is not None:
         known.setdefault(plan[1], []).append(f"plan {own_plan.output}")
-    line = "; ".join(f"{', '.join(each)}: {origin}" for origin, each in known.items())
-    return added, line
+    return added, "; ".join(f"{', '.join(own)}: {at}" for at, own in known.items())
 
 
 def _lent(model: ir.Model, metadata: Mapping[str, str]) -> dict[str, str]:
     """Return what another graph's metadata state, and this one's lack, that fits it."""
     (inputs, outputs), own = sides(model), model.metadata_props
-    lent = dict[str, str]()
+    lent, ends = dict[str, str](), (None, *outputs)
     if RECURRENT not in own and (pairs := declared_pairs(metadata)) is not None:
-        there = {
-            name: answer
-            for name, answer in pairs.items()
-            if name in inputs and answer in (None, *outputs)
-        }
-        if there or not pairs:
-            lent[RECURRENT] = json.dumps(there)
+        fit = {k: end for k, end in pairs.items() if k in inputs and end in ends}
+        if fit or not pairs:
+            lent[RECURRENT] = json.dumps(fit)
     if PLAN in metadata and PLAN not in own:
         with contextlib.suppress(GraphError):  # it reads outputs that are not here
             plan = PlanAdapter.of(metadata, list(outputs))
@@ -177,10 +172,9 @@ def _of_map(
     pairs, is_optional = dict(ports.recurrent), ports is not modules.ports
     if is_optional:  # the graph's own metadata come first
         declared, plan = declared_pairs(own), None if PLAN in own else plan
-        free = {
-            name: out for name, out in pairs.items() if name not in (declared or {})
-        }
-        pairs = {} if declared == {} else free
+        known = declared or {}
+        pairs = {name: out for name, out in pairs.items() if name not in known}
+        pairs = {} if declared == {} else pairs
     sets = {} if SETS in own or not ports.sets else {SETS: json.dumps(ports.sets)}
     if plan is None and not pairs and not sets:
         return {}
@@ -189,12 +183,13 @@ def _of_map(
     metadata = adapter.metadata(own) | sets
     try:
         _check_fit(model, origin, adapter.plan, metadata)
-        outputs = [str(each.name) for each in model.graph.outputs]
+        outputs = [str(output.name) for output in model.graph.outputs]
         for name in np.hstack([np.array([], str), *ports.sets.values()]):
             if name not in outputs:
                 raise EvaluationError(f"{origin}: sets: no output {name}")
         if adapter.plan is not None:
-            check_command(adapter.plan, [str(each.name) for each in model.graph.inputs])
+            inputs = [str(value.name) for value in model.graph.inputs]
+            check_command(adapter.plan, inputs)
     except EvaluationError as error:
         if is_optional:
             return {}
@@ -206,14 +201,14 @@ def _of_map(
 def _check_fit(
     model: ir.Model, origin: str, plan: PlanAdapter | None, metadata: Mapping[str, str]
 ) -> None:
-    """Check that plan and recurrent state are found under the new metadata."""
-    outputs = [str(each.name) for each in model.graph.outputs]
+    """Check that the graph has the plan and recurrent state of the new metadata."""
+    outputs = [str(output.name) for output in model.graph.outputs]
     try:
         if plan is not None:
             plan_of(plan, {}, outputs)
         recurrence({**model.metadata_props, **metadata}, *sides(model))
     except (EvaluationError, GraphError) as error:
-        # the map or adapter is to blame, not the graph
+        # The map or adapter is to blame, not the graph
         words = str(error).replace(f"metadata {RECURRENT}", "[recurrent]")
         raise EvaluationError(f"{origin}: {words}") from error
 
@@ -246,17 +241,15 @@ def input_uses(
 ) -> tuple[PortUse, ...]:
     """List the inputs of a graph, in its order, with what each is fed."""
     inputs, problems = ModelInputs.opened(session, adapter, recurrent)
-    # each input's feed in words
-    words = {
-        name: f"{answer} of the frame before" for name, answer in recurrent.items()
-    }
+    # Each input's feed in words
+    words = {name: f"{own} of the frame before" for name, own in recurrent.items()}
     for name, table in inputs.tables.items():
         cameras = ", ".join(table.cameras)
         words[name] = "the six cameras" if len(table.cameras) == 6 else cameras
         words[name] += ", side by side" if table.stitch else ""
     for name, feed in inputs.given.items():
         words[name] = ", ".join(INPUT_SOURCES.text(part.source) for part in feed.parts)
-    # faults of types and first values
+    # Faults of types and first values
     for name, port in session.inputs.items():
         if port.type not in DTYPES:
             problems[name] = f"input {name} is {port.type}: it cannot be fed"
@@ -267,16 +260,19 @@ def input_uses(
                     zero_state(name, port)
                 except GraphError as error:
                     problems[name] = str(error)
-    return tuple(
-        PortUse(
-            name,
-            port.shape,
-            element_type(port.type),
-            words.get(name),
-            problems.get(name, ""),
-        )
-        for name, port in session.inputs.items()
-    )
+    return _uses(session.inputs, words, problems)
+
+
+def _uses(
+    ports: Mapping[str, SessionPort],
+    words: Mapping[str, str],
+    problems: Mapping[str, str],
+) -> tuple[PortUse, ...]:
+    uses = list[PortUse]()
+    for name, port in ports.items():
+        what = element_type(port.type), words.get(name), problems.get(name, "")
+        uses.append(PortUse(name, port.shape, *what))
+    return tuple(uses)
 
 
 def output_uses(
@@ -296,9 +292,4 @@ def output_uses(
         uses[plan.output] = "the plan"
         if plan.scores is not None:
             uses[plan.scores] = "scores, which pick the plan's mode"
-    ports = session.outputs.items()
-    listed = (
-        PortUse(name, port.shape, element_type(port.type), uses.get(name))
-        for name, port in ports
-    )
-    return tuple(listed), problem
+    return _uses(session.outputs, uses, {}), problem

@@ -117,13 +117,12 @@ class EgoTrack:
         Interpolates between decisions, constant before the first; needs one pose or
         more.
         """
-        # what is older than all of them is not looked at: a route has thousands
+        # Ignore what is older than all of them: a route has thousands of states
         first = max(0, bisect_right(self._times_us, float(np.min(times_us))) - 1)
         states = np.array(self._states[first:], np.float64)
         states[:, 2] = np.unwrap(states[:, 2])
         known = self._times_us[first:]
-        columns = [np.interp(times_us, known, each) for each in states.T]
-        return np.stack(columns, axis=1)
+        return np.stack([np.interp(times_us, known, c) for c in states.T], axis=1)
 
 
 @dataclass(frozen=True, eq=False, slots=True)

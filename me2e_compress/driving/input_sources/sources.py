@@ -293,7 +293,7 @@ class ConstantInput(InputSource):
 
     def value(self, seen: Observed) -> Array:
         """Return float64, or int64 where all values are whole numbers."""
-        whole = all(each.is_integer() for each in self.values)
+        whole = all(value.is_integer() for value in self.values)
         array = np.array(self.values, np.int64 if whole else np.float64)
         return array.reshape(self.shape) if self.shape else array
 
