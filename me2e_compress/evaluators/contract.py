@@ -93,10 +93,8 @@ class Drive:
                 "only a study knows each model's own latencies"
             )
         if self.dt_us <= 0 or FRAME_US % self.dt_us:
-            raise EvaluationError(
-                f"a step of {self.dt_us / 1e3:g} ms: it must divide "
-                f"{FRAME_US // 1000} ms"
-            )
+            words = f"it must divide {FRAME_US // 1000} ms"
+            raise EvaluationError(f"a step of {self.dt_us / 1e3:g} ms: {words}")
 
     @classmethod
     def of_words(
@@ -113,19 +111,14 @@ class Drive:
             EvaluationError: An option is invalid.
         """
         if latency_model not in list(LatencyModel):
-            there = ", ".join(LatencyModel)
-            raise EvaluationError(
-                f"no latency model {latency_model!r}; there are {there}"
-            )
+            words = f"no latency model {latency_model!r}; there are"
+            raise EvaluationError(f"{words} {', '.join(LatencyModel)}")
         if not 0 < dt_ms <= FRAME_US / 1000:  # a product of inf is no integer
-            raise EvaluationError(
-                f"a step of {dt_ms:g} ms: it must divide {FRAME_US // 1000} ms"
-            )
-        return cls(
-            dt_us=round(dt_ms * 1000),
-            weather=_weather_of(weather),
-            latency_model=LatencyModel(latency_model),
-        )
+            words = f"it must divide {FRAME_US // 1000} ms"
+            raise EvaluationError(f"a step of {dt_ms:g} ms: {words}")
+        model, conditions = LatencyModel(latency_model), _weather_of(weather)
+        dt_us = round(dt_ms * 1000)
+        return cls(dt_us=dt_us, weather=conditions, latency_model=model)
 
     def conditions(self) -> dict[str, Any]:
         """Return everything but routes that decides episodes, as JSON."""
@@ -252,7 +245,7 @@ class Evaluator(abc.ABC):
         """
         for option in options:
             if option not in self.takes:
-                takes = ", ".join(each for each in ABILITIES if each in self.takes)
+                takes = ", ".join(name for name in ABILITIES if name in self.takes)
                 raise EvaluationError(
                     f"{whose}{self.name} takes no {option.replace('_', '-')}; it takes"
                     f" {takes or 'none'}, and options of its own: name{{option=value}}"
@@ -301,7 +294,6 @@ def with_abilities(evaluator: Evaluator) -> Evaluator:
             )
         for method in METHODS.get(ability, ()):
             if getattr(cls, method) is getattr(Evaluator, method):
-                raise EvaluationError(
-                    f"{name} declares {ability}, but has no {method}()"
-                )
+                words = f"{name} declares {ability}, but has no {method}()"
+                raise EvaluationError(words)
     return evaluator

@@ -46,27 +46,26 @@ class ResultsFolder:
         ``measured`` is the number of samples of the trace that latencies are drawn
         from; None if none are drawn.
         """
-        # claim an empty folder
+        # Claim an empty folder
         with drafts.writing_errors(path, EvaluationError):
             path.mkdir(parents=True, exist_ok=True)
             if not (path / MANIFEST).exists():
-                # a killed run of ours leaves only drafts
-                there = [each.name for each in path.iterdir()]
-                there = [name for name in there if not name.startswith(".")]
-                if any(name != ROUTES for name in there):
+                # A killed run of ours leaves only drafts
+                names = {file.name for file in path.iterdir()}
+                names = {name for name in names if not name.startswith(".")}
+                if names - {ROUTES}:
                     why = f"not empty, and holds no {MANIFEST}"
                     raise EvaluationError(f"{path}: {why}")
-                if there and any((path / ROUTES).iterdir()):
+                if names and any((path / ROUTES).iterdir()):
                     raise EvaluationError(f"{path}: holds routes but no {MANIFEST}")
             (path / ROUTES).mkdir(exist_ok=True)
             if not (path / MANIFEST).exists():
                 drawn = {} if measured is None else {MEASURED: measured}
                 write_json(path / MANIFEST, made_by | drawn, indent=1)
         folder = cls.open(path)
-        # all that decides the results must agree
-        both = folder.made_by, made_by
+        # All that decides the results must agree
         for key in sorted({*made_by, *folder.made_by} - {MEASURED}):
-            old, new = (each.get(key) for each in both)
+            old, new = folder.made_by.get(key), made_by.get(key)
             if old != new:
                 raise EvaluationError(
                     f"{path}: holds the results of another evaluation: its {key} is "
@@ -118,10 +117,8 @@ class ResultsFolder:
             return None
         try:
             record = documents.from_json(documents.read_bytes(path))
-            if (
-                not isinstance(record, dict)
-                or record.get("fingerprint") != self._digest
-            ):
+            own = record.get("fingerprint") if isinstance(record, dict) else None
+            if own != self._digest:
                 raise ValueError("of another evaluation")
             episode = Episode.from_json(record["episode"])
             if episode.route != route:
@@ -202,9 +199,9 @@ def drive_routes(
         EvaluationError: The policy cannot be opened, the folder belongs to another
             evaluation or cannot be written, or the evaluator yields what it must not.
     """
-    # fail early on a policy or folder that cannot be used
+    # Fail early on a policy or folder that cannot be used
     made_by = evaluator.made_by(policy, drive)
-    routes, measured = [each.id for each in drive.routes], drive.latency.measured
+    routes, measured = [route.id for route in drive.routes], drive.latency.measured
     results, done = None, dict[str, Episode]()
     if routes:
         made_by |= {"set_size": drive.set_size, "routes": routes}
@@ -212,7 +209,7 @@ def drive_routes(
         done = results.episodes()
         for path, reason in results.corrupt.items():
             listener.on_warning(f"{path}: {reason}: driven again")
-    # keep and report each route as soon as it is driven
+    # Keep and report each route as soon as it is driven
     missing = replace(drive, routes=[e for e in drive.routes if e.id not in done])
     total = len(routes) or evaluator.set_size
     _report(listener, stage, done, total)
@@ -223,7 +220,7 @@ def drive_routes(
             if results is not None:
                 results.keep(episode)
             _report(listener, stage, done, max(total, len(done)))
-    # routes that the evaluator alone knows are kept once all are there
+    # Routes that the evaluator alone knows are kept once all are driven
     if lost := [route for route in routes if route not in done]:
         raise EvaluationError(f"{evaluator.name} did not drive route {lost[0]}")
     if not done:

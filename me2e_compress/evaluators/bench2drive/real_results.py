@@ -43,7 +43,7 @@ def _ids(routes: Path) -> frozenset[str]:
             root = ElementTree.fromstring(documents.read_bytes(routes))
         except ElementTree.ParseError as error:
             raise documents.MalformedError(str(error)) from error
-    ids = frozenset(each.attrib.get("id", "") for each in root.iter("route")) - {""}
+    ids = frozenset(route.attrib.get("id", "") for route in root.iter("route")) - {""}
     if not ids:
         raise EvaluationError(f"{routes}: no <route id=...> stands in it")
     return ids
@@ -92,20 +92,20 @@ class CollectedResults:
 
         One of the files must hold a record. `routes` names the set; None finds it.
         """
-        # what the results files are, whole or not
+        # Sort the records of all results files by route
         made, by_route = cls(broken=files.broken), dict[str, list[RouteRecord]]()
         for file in files.results:
             for record in file.records:
                 by_route.setdefault(record.episode.route, []).append(record)
             if not file.records and not file.broken:
                 made.unfinished.append(file.path)
-        # one record of each route, in order
-        records = [made._chosen(route, each) for route, each in by_route.items()]
+        # Choose one record of each route, in order
+        records = [made._chosen(route, copies) for route, copies in by_route.items()]
         for record in records:
             made.notes += (f"{record.episode.route}: {note}" for note in record.notes)
-        records.sort(key=lambda each: (_by_number(each.number), each.content))
-        made.crashed = [each.episode.route for each in records if each.crashed]
-        # episodes with frames and decisions
+        records.sort(key=lambda record: (_by_number(record.number), record.content))
+        made.crashed = [record.episode.route for record in records if record.crashed]
+        # Build episodes with frames and decisions
         others = list(files.recordings)
         for record in records:
             paths = recordings_of(record, files.recordings, files.results)
@@ -117,8 +117,8 @@ class CollectedResults:
         if others:
             more = f" and {len(others) - 1} others" if len(others) > 1 else ""
             made.notes.insert(0, f"{others[0]}{more}: of no record")
-        # which routes of the set are missing, and which are foreign
-        times = Counter(each.number for each in records)
+        # Find which routes of the set are missing, and which are foreign
+        times = Counter(record.number for record in records)
         made.repetitions = max(times.values())
         sets = dict(ROUTE_SETS) if routes is None else {routes.stem: _ids(routes)}
         best = max(sets, key=lambda name: len(sets[name] & set(times)))
@@ -127,8 +127,8 @@ class CollectedResults:
         if whole & set(times):
             made.route_set = best
             made.missing = sorted(whole - set(times), key=_by_number)
-            foreign = (each for each in records if each.number not in whole)
-            made.foreign = [each.episode.route for each in foreign]
+            foreign = (record for record in records if record.number not in whole)
+            made.foreign = [record.episode.route for record in foreign]
         return made
 
     def _chosen(self, route: str, records: Sequence[RouteRecord]) -> RouteRecord:
@@ -138,12 +138,12 @@ class CollectedResults:
         different results the lowest score counts: taking the best would bias the
         evaluation.
         """
-        # identical copies count once
-        distinct = list({each.content: each for each in records}.values())
+        # Identical copies count once
+        distinct = list({record.content: record for record in records}.values())
         if len(distinct) < len(records):
             self.repeated.append(route)
-        # crashes count only without a drive
-        drives = [each for each in distinct if not each.crashed]
+        # Crashes count only without a drive
+        drives = [record for record in distinct if not record.crashed]
         if drives and len(drives) < len(distinct):
             self.rerun.append(route)
         counted = drives or distinct
@@ -225,13 +225,13 @@ class Bench2DriveResults(Evaluator):
         yield from self.collect().episodes
 
     def collect(self) -> CollectedResults:
-        """Read everything, and report what was files besides the episodes."""
+        """Read all files: the episodes, and what was wrong with the files."""
         files = find_files(self.folder)
         if self.metrics is not None:
             apart = find_files(self.metrics)
             files.recordings += apart.recordings
             files.decisions += apart.decisions
-        # one folder may lie in the other
+        # One folder may lie in the other
         for paths in (files.recordings, files.decisions):
             paths[:] = {path.resolve(): path for path in paths}.values()
         if not any(file.records for file in files.results):

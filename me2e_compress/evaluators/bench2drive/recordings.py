@@ -62,7 +62,7 @@ class RecordedRoute:
         The speed is the derivative of the position. Route progress is not recorded:
         ``route_m`` is the distance driven.
         """
-        # one column per field of a frame
+        # One column per field of a frame
         moved = _lengths(np.diff(self.position_m, axis=0))
         speeds = np.zeros(len(self.steps))
         if len(speeds) > 1:
@@ -78,16 +78,13 @@ class RecordedRoute:
             "route_m": np.concatenate([[0.0], moved.cumsum()]),
             "acceleration_norm_mps2": _lengths(self.acceleration_mps2),
         }
+        frames = list[EgoFrame]()
+        unknown: dict[str, Any] = {"steering_rad": None, "traffic_speed_mps": None}
         rows = zip(*(column.tolist() for column in columns.values()), strict=True)
-        return tuple(
-            EgoFrame(
-                time_us=round(1e6 * interval_s * index),
-                steering_rad=None,
-                traffic_speed_mps=None,
-                **dict(zip(columns, row, strict=True)),
-            )
-            for index, row in enumerate(rows)
-        )
+        for index, row in enumerate(rows):
+            own = dict(zip(columns, row, strict=True)) | unknown
+            frames.append(EgoFrame(time_us=round(1e6 * interval_s * index), **own))
+        return tuple(frames)
 
     def interval_s(self, duration_s: float | None = None) -> float:
         """Return the seconds from one step to the next.
@@ -97,8 +94,8 @@ class RecordedRoute:
         """
         if duration_s is not None:
             mean_s = duration_s / len(self.steps)
-            nearest = min(INTERVALS_S, key=lambda each: abs(np.log(each / mean_s)))
-            if abs(np.log(nearest / mean_s)) < _EQUALS:
+            away, nearest = min((abs(np.log(s / mean_s)), s) for s in INTERVALS_S)
+            if away < _EQUALS:
                 return nearest
         between = np.diff(self.steps)
         ticks = float(np.median(between)) if between.size else 1.0
@@ -111,13 +108,13 @@ def _lengths(vectors: Any) -> Floats:
 
 def read_recording(raw: object) -> RecordedRoute:
     """Read a parsed ``metric_info.json``; its numbers may be infinite or NaN."""
-    # steps are keyed by their number
+    # Check that steps are keyed by their number
     if not isinstance(raw, dict) or not raw:
         raise BrokenRecordingError("no step is recorded")
     steps = [key for key in raw if not _STEP.fullmatch(key)]
     if steps:
         raise BrokenRecordingError(f"{steps[0][:60]!r} is not the number of a step")
-    # CARLA's left-handed world becomes right-handed
+    # Turn CARLA's left-handed world into a right-handed one
     acceleration, turning, forward, right = (_column(raw, part) for part in _PARTS)
     location = _column(raw, _LOCATION)
     ahead, aside, push = forward[:, :2], right[:, :2], acceleration[:, :2]
@@ -140,9 +137,10 @@ def _column(raw: dict[str, object], part: str) -> Floats:
         vector = values.get(part) if isinstance(values, dict) else None
         if not isinstance(vector, list) or len(vector) < 3:
             raise BrokenRecordingError(f"step {step}: no {part}")
-        if not all(type(each) in (int, float) for each in vector):
+        if not {type(number) for number in vector} <= {int, float}:
             raise BrokenRecordingError(f"step {step}: {part} is not made of numbers")
-        if not all(abs(each) <= LARGEST for each in vector):  # NaN compares as false
+        # NaN compares as false
+        if not all(abs(number) <= LARGEST for number in vector):
             raise BrokenRecordingError(f"step {step}: {part} is not finite")
         rows.append(vector[:3])
     return np.array(rows, np.float64)

@@ -6,7 +6,6 @@ from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from types import MappingProxyType
 from typing import Annotated, Any
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
@@ -33,21 +32,19 @@ _NUMBER = re.compile(r"_\d+$")
 _ROUTE = re.compile(r"[\w.-]{1,200}")
 _OUTSIDE_LANES = InfractionKind.OUTSIDE_ROUTE_LANES
 
-ENDINGS: Mapping[str, Ending] = MappingProxyType(
-    {
-        "Completed": Ending.COMPLETED,
-        "Perfect": Ending.COMPLETED,
-        "Failed - Agent deviated from the route": Ending.DEVIATION,
-        "Failed - Agent got blocked": Ending.BLOCKED,
-        "Failed - Agent timed out": Ending.TIMEOUT,
-        "Failed - TickRuntime": Ending.TIMEOUT,
-        "Failed - Agent crashed": Ending.POLICY_FAILED,
-        "Failed - Agent couldn't be set up": Ending.POLICY_FAILED,
-        "Failed - Agent's sensors were invalid": Ending.POLICY_FAILED,
-        "Failed - Simulation crashed": Ending.SIMULATOR_FAILED,
-        "Failed": Ending.SIMULATOR_FAILED,
-    }
-)
+ENDINGS: Mapping[str, Ending] = {
+    "Completed": Ending.COMPLETED,
+    "Perfect": Ending.COMPLETED,
+    "Failed - Agent deviated from the route": Ending.DEVIATION,
+    "Failed - Agent got blocked": Ending.BLOCKED,
+    "Failed - Agent timed out": Ending.TIMEOUT,
+    "Failed - TickRuntime": Ending.TIMEOUT,
+    "Failed - Agent crashed": Ending.POLICY_FAILED,
+    "Failed - Agent couldn't be set up": Ending.POLICY_FAILED,
+    "Failed - Agent's sensors were invalid": Ending.POLICY_FAILED,
+    "Failed - Simulation crashed": Ending.SIMULATOR_FAILED,
+    "Failed": Ending.SIMULATOR_FAILED,
+}
 """By status. Bench2Drive repeats a route whose status is just ``Failed``,
 as after a crash."""
 
@@ -93,41 +90,37 @@ def read_record(raw: object) -> RouteRecord:
         raise BrokenRecordError(_complaint(error, "record")) from error
     if not _ROUTE.fullmatch(record.route_id):
         raise BrokenRecordError(f"route_id: {record.route_id[:60]!r} is no name")
-    # infractions, ending and scenario
+    # Read infractions, ending and scenario
     infractions = _infractions(record)
     ratios, notes = list[float](), list[str]()
-    for each in infractions:
-        speed = each.kind is InfractionKind.MIN_SPEED
-        if each.percent is not None and speed:
-            ratios.append(each.percent)
-        if each.percent is None and (speed or each.kind is _OUTSIDE_LANES):
-            words = f"no percentage in {each.detail[:60]!r}: left out"
-            notes.append(f"{each.kind.value}: {words}")
+    for infraction in infractions:
+        speed = infraction.kind is InfractionKind.MIN_SPEED
+        if infraction.percent is not None and speed:
+            ratios.append(infraction.percent)
+        if infraction.percent is None and (speed or infraction.kind is _OUTSIDE_LANES):
+            words = f"no percentage in {infraction.detail[:60]!r}: left out"
+            notes.append(f"{infraction.kind.value}: {words}")
     ending = ENDINGS.get(record.status)
     if ending is None:
         status = record.status[:60]
         raise BrokenRecordError(f"status {status!r} is not that of a finished route")
-    scenario = _NUMBER.sub("", record.scenario_name or "")
+    scenario, scores = _NUMBER.sub("", record.scenario_name or ""), record.scores
+    completion, composed = scores.score_route, scores.score_composed
     episode = Episode(
         route=record.route_id,
         scenario=scenario,
         abilities=SCENARIO_ABILITIES.get(scenario, ()),
         route_length_m=record.meta.route_length,
-        completion_percent=record.scores.score_route,
+        completion_percent=completion,
         ending=ending,
         failure=record.status if ending in FAILURES else None,
         infractions=tuple(infractions),
         frames=(),
         decisions=(),
         speed_ratios_percent=tuple(ratios),
-        given=Given(
-            record.status,
-            record.scores.score_route,
-            record.scores.score_penalty,
-            record.scores.score_composed,
-        ),
+        given=Given(record.status, completion, scores.score_penalty, composed),
     )
-    # metadata that tells copies from other drives
+    # Metadata that tell copies from other drives
     duration_s = record.meta.duration_game
     return RouteRecord(
         episode,
@@ -191,7 +184,7 @@ def _infractions(record: _Record) -> list[Infraction]:
         for message in messages:
             place = _PLACE.search(message)
             x, y = (float(part) for part in place.groups()) if place else (None, None)
-            # the share outside the lanes, or the speed relative to the traffic's
+            # The share outside the lanes, or the speed relative to the traffic's
             share = percent = None
             if kind is _OUTSIDE_LANES:
                 share = _OUTSIDE.search(message) or _PERCENT.search(message)
@@ -278,7 +271,7 @@ def _files(folder: Path) -> Iterator[Path]:
         seen.add(place)
         folders.sort()
         paths = (Path(where, name) for name in sorted(names))
-        yield from (each for each in paths if ".json" in each.suffix and each.is_file())
+        yield from (path for path in paths if ".json" in path.suffix and path.is_file())
 
 
 def _is_checkpoint(path: Path) -> bool:
@@ -332,11 +325,11 @@ def recordings_of(
     for path in paths if record.recording else ():
         if record.recording in path.parent.parts:
             exact.append(path)
-        elif any(each.endswith(f"_{record.recording}") for each in path.parent.parts):
+        elif any(part.endswith(f"_{record.recording}") for part in path.parent.parts):
             prefixed.append(path)
     if exact or prefixed:
         return (*exact, *prefixed)
-    # the only record of its folder
+    # Without such a folder: the only record of its folder
     holders = [file for file in results if record in file.records]
     folders = {file.path.parent for file in holders if len(file.records) == 1}
     alone = Counter(file.path.parent for file in results)

@@ -49,7 +49,7 @@ CHUNK = 256
 
 def conflicts_of(scenes: Sequence[Scene]) -> ConflictRecord:
     """Return distances, times and encounters of a route's frames, 50 ms apart."""
-    # rows of all actors, each with the number of its frame
+    # Rows of all actors, each with the number of its frame
     kinds = {actor.id: actor.kind for scene in scenes for actor in scene.actors}
     counts = [len(scene.actors) for scene in scenes]
     frame = np.repeat(np.arange(len(counts)), counts)
@@ -57,16 +57,16 @@ def conflicts_of(scenes: Sequence[Scene]) -> ConflictRecord:
     actors = np.array(rows).reshape(-1, 7)
     boxes = [(*box_of(scene.ego), scene.ego.speed_mps) for scene in scenes]
     egos = np.array(boxes).reshape(-1, 6)
-    # every actor against the ego of the same frame
+    # Compare every actor with the ego of the same frame
     one, other = egos[frame], actors[:, :6]
     distance = gaps(one[:, :5], other[:, :5])
     velocity = _velocity(other) - _velocity(one)
     seconds = contact_times(one[:, :5], other[:, :5], velocity)
-    # the smallest value of each frame
+    # Find the smallest value of each frame
     nearest, soonest = np.full((2, len(counts)), np.inf)
     np.minimum.at(nearest, frame, distance)
     np.minimum.at(soonest, frame, seconds)
-    # where both came to one place, of every actor that moved
+    # Find where the ego and an actor that moved came to one place
     encounters = list[Encounter]()
     for number in np.unique(actors[:, 6]).astype(int).tolist():
         own = actors[:, 6] == number
@@ -77,11 +77,9 @@ def conflicts_of(scenes: Sequence[Scene]) -> ConflictRecord:
                 pet_s = abs(ego_at - at) * FRAME_US / 1e6
                 what = number, kind, time_us, pet_s, round(angle, 3), ego_at < at
                 encounters.append(Encounter(*what))
-    return ConflictRecord(
-        _known(nearest, math.inf),
-        _known(soonest, TTC_HORIZON_S),
-        tuple(sorted(encounters, key=lambda each: (each.time_us, each.actor))),
-    )
+    encounters.sort(key=lambda met: (met.time_us, met.actor))
+    columns = _known(nearest, math.inf), _known(soonest, TTC_HORIZON_S)
+    return ConflictRecord(*columns, tuple(encounters))
 
 
 def contact_of(ego: Ego, actor: Actor) -> Contact:
@@ -116,8 +114,8 @@ def at_fault(contact: Contact, ego: Ego, roadmap: Roadmap) -> bool:
     driven = [lane for lane in roadmap.lanes if not lane.shoulder]
     for lane in driven:
         end = lane.centre[-1]
-        led_to = (each for each in driven if np.allclose(each.centre[0], end))
-        if not Roadmap((lane, *led_to)).outside_all(four).any():
+        following = (other for other in driven if np.allclose(other.centre[0], end))
+        if not Roadmap((lane, *following)).outside_all(four).any():
             return False
     return True
 
@@ -130,11 +128,11 @@ def _same_place(
     There are at most two: one at 30 degrees or more, one below. Boxes that overlap at
     two times share a place, so the fewest frames between such times are the PET.
     """
-    # boxes farther apart than this cannot overlap
+    # Boxes farther apart than this cannot overlap
     reach = (np.hypot(*egos[0, 3:5]) + np.hypot(*actor[:, 3:5].T).max()) / 2
     best: dict[bool, tuple[int, int, int, float]] = {}
     for start in range(0, len(egos), CHUNK):
-        # candidate pairs of frames, at most LATEST apart, where the ego comes at all
+        # Candidate pairs of frames, at most LATEST apart, where the ego comes at all
         ego = egos[start : start + CHUNK]
         low, high = ego[:, :2].min(axis=0) - reach, ego[:, :2].max(axis=0) + reach
         near = (frame >= start - LATEST) & (frame < start + CHUNK + LATEST)
@@ -147,7 +145,7 @@ def _same_place(
         i, j = np.nonzero((apart <= LATEST) & (away <= reach))
         hit = overlaps(ego[i, :5], other[j, :5])
         i, j = i[hit], j[hit]
-        # the closest pair of crossing paths, and of following ones
+        # The closest pair of crossing paths, and of following ones
         turn = np.abs(np.angle(np.exp(1j * (ego[i, 2] - other[j, 2]))))
         for crossing in (True, False):
             kind = np.flatnonzero((turn >= CROSSING_RAD) == crossing)
@@ -166,7 +164,6 @@ def _velocity(rows: Floats) -> Floats:
 
 def _known(values: Floats, most: float) -> tuple[float | None, ...]:
     """Round to the millimetre or millisecond; None beyond the limit."""
-    return tuple(
-        round(value, 3) if math.isfinite(value) and value <= most else None
-        for value in values.tolist()
-    )
+    known = (values <= most) & np.isfinite(values)
+    pairs = zip(values.tolist(), known.tolist(), strict=True)
+    return tuple(round(value, 3) if finite else None for value, finite in pairs)

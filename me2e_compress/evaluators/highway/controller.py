@@ -74,11 +74,9 @@ class AnchoredPlan:
     def of(cls, plan: Plan | Trajectory, ego: Ego, time_us: int) -> Self:
         """Anchor a plan (ego frame) at the ego's pose."""
         trajectory = timed(plan)
-        points = np.vstack(
-            [np.zeros((1, 2)), np.asarray(trajectory.points, np.float64)]
-        )
+        waypoints = np.asarray(trajectory.points, np.float64)
         times = np.concatenate([[0.0], trajectory.times_s])
-        knots, travel = _advance_only(points)
+        knots, travel = _advance_only(np.vstack([np.zeros((1, 2)), waypoints]))
         local = _smooth(knots, slip_of(ego.steering_rad))
         return cls(time_us, ego.placed(local), travel, times)
 
@@ -121,25 +119,24 @@ class AnchoredPlan:
         model says when the control acts and for how long (`driving.realtime`). It does
         not steer between two decisions.
         """
-        # acceleration: the least-squares fit to the positions in 0.5 s and 1 s
+        # Acceleration: the least-squares fit to the positions in 0.5 s and 1 s
         age_s = (time_us - self.time_us) / 1e6
         here, speed = self.nearest(ego.x, ego.y), ego.speed_mps
-        lag, asked, weight = ACCELERATION_LAG_S, 0.0, 0.0
+        lag, fit, weight = ACCELERATION_LAG_S, 0.0, 0.0
         for ahead in AHEAD_S:
-            # distance lost to the lag, distance coasted, distance per m/s2 asked for
+            # Distance lost to the lag, distance coasted, distance per commanded m/s2
             late = lag * (ahead - lag)
             late += lag**2 * math.exp(-ahead / lag)
             free = speed * ahead + ego.acceleration_mps2 * late
             gain = ahead**2 / 2 - late
-            asked += gain * (self.travel_at(age_s + ahead) - here - free)
+            fit += gain * (self.travel_at(age_s + ahead) - here - free)
             weight += gain * gain
         low, high = ACCELERATION_RANGE_MPS2
-        acceleration = min(max(asked / weight, low), high)
-        # steering: from where the ego is once the wheels have turned
-        travel = speed * STEERING_LAG_S
-        pose = (ego.x, ego.y, ego.heading)
+        acceleration = min(max(fit / weight, low), high)
+        # Steering: from where the ego is once the wheels have turned
+        travel, pose = speed * STEERING_LAG_S, (ego.x, ego.y, ego.heading)
         x, y, heading = advance(*pose, ego.steering_rad, travel, ego.length)
-        # to the point of the curve one lookahead further
+        # To the point of the curve one lookahead further
         lookahead = max(SHORTEST_LOOKAHEAD_M, LOOKAHEAD_S * speed)
         target_x, target_y = self.point(self.nearest(x, y) + lookahead)
         cos, sin = math.cos(heading), math.sin(heading)
@@ -175,7 +172,7 @@ def _smooth(knots: Floats, course: float) -> Floats:
     The curve leaves the first knot along ``course`` (rad, the direction of travel) and
     has no curvature at the last.
     """
-    # a spline that starts along the course and ends straight
+    # A spline that starts along the course and ends straight
     tangent = np.array([math.cos(course), math.sin(course)])
     curve = knots[:1]
     if len(knots) > 1:
@@ -184,7 +181,7 @@ def _smooth(knots: Floats, course: float) -> Floats:
         fine = np.append(np.arange(0.0, arc[-1], STATION_M / 2), arc[-1])
         curve, tangent = spline(fine), spline(arc[-1], 1)
         tangent = tangent / np.hypot(*tangent)
-    # the straight extension, and even spacing
+    # The straight extension, and even spacing
     beyond = curve[-1] + BEYOND_M * tangent
     return resample(np.vstack([curve, beyond]), STATION_M)
 
@@ -194,7 +191,7 @@ FRONT_AXLE_M, REAR_AXLE_M = -0.090769015, 1.4178275
 """World on Rails: wheel angle of a full steer, axles from the centre."""
 
 
-def control_of(asked: PedalsAndWheel, length_m: float) -> Control:
+def control_of(pedals: PedalsAndWheel, length_m: float) -> Control:
     """Convert CARLA's throttle, brake and steer to the control of this ego.
 
     Full pedals are the limits of the ego's engine and brakes, as in CARLA: throttle 4
@@ -208,11 +205,10 @@ def control_of(asked: PedalsAndWheel, length_m: float) -> Control:
     changes nothing.
     """
     braking, thrust = ACCELERATION_RANGE_MPS2
-    curvature = curvature_by(-asked.steer)
+    curvature = curvature_by(-pedals.steer)
     sine = min(max(curvature * length_m / 2, -1.0), 1.0)
-    return Control(
-        asked.throttle * thrust + asked.brake * braking, steering_of(math.asin(sine))
-    )
+    acceleration = pedals.throttle * thrust + pedals.brake * braking
+    return Control(acceleration, steering_of(math.asin(sine)))
 
 
 def curvature_by(steer: float) -> float:

@@ -1,9 +1,9 @@
 """Calibration frames recorded from a model's view while a driver drives."""
 
+import itertools
 import zlib
 from collections.abc import Iterator
 from dataclasses import replace
-from itertools import islice
 
 import numpy as np
 
@@ -55,20 +55,19 @@ def driven_frames(
         FramesError: A count is below 1, or the seed below 0.
     """
     if count < 1 or scene_length < 1:
-        raise FramesError(
-            f"{count} frames in scenes of {scene_length}: both must be at least 1"
-        )
+        words = f"{count} frames in scenes of {scene_length}"
+        raise FramesError(f"{words}: both must be at least 1")
     if seed < 0:
         raise FramesError(f"seed {seed}: must be 0 or more")
-    # one scene per route, from a random moment on
-    routes = islice(fresh_routes(seed), first, None)
+    # Record one scene per route, from a random moment on
+    routes = itertools.islice(fresh_routes(seed), first, None)
     for place, route in enumerate(routes, first):
         random = np.random.default_rng([SEED_OFFSET + seed, place])
         spare_us = EXPERT_S[route.scenario] * 1_000_000 - scene_length * STEP_US
         begin_us = int(random.integers(0, max(1, spare_us // DT_US))) * DT_US
-        for at, arrays in enumerate(
-            _look(policy, driver, route, begin_us, min(scene_length, count - done))
-        ):
+        length = min(scene_length, count - done)
+        scene = _feeds_of_scene(policy, driver, route, begin_us, length)
+        for at, arrays in enumerate(scene):
             yield Frame(done, at == 0, arrays, place)
             done += 1
         if done == count:
@@ -80,15 +79,13 @@ def fresh_routes(seed: int) -> Iterator[Route]:
 
     The 220 that ship are skipped; the admission gate is not applied.
     """
-    judged = {(route.scenario, route.seed) for route in load_routes()}
+    shipped = {(route.scenario, route.seed) for route in load_routes()}
     types = np.random.default_rng(SEED_OFFSET + seed).permutation(sorted(EXPERT_S))
-    attempt = 0
-    while True:
+    for attempt in itertools.count():
         for scenario in map(str, types):
             drawn = seed_of(SEED_OFFSET + seed, scenario, attempt)
-            if (scenario, drawn) not in judged:
+            if (scenario, drawn) not in shipped:
                 yield propose(scenario, drawn, f"{scenario}_{attempt}")
-        attempt += 1
 
 
 def propose(scenario: str, seed: int, name: str) -> Route:
@@ -103,26 +100,23 @@ def seed_of(seed: int, scenario: str, attempt: int) -> int:
     return int(np.random.SeedSequence(words).generate_state(1)[0])
 
 
-def _look(
-    policy: OnnxPolicy, driver: OnnxPolicy, route: Route, begin_us: int, count: int
+def _feeds_of_scene(
+    policy: OnnxPolicy, driver: OnnxPolicy, route: Route, begin_us: int, length: int
 ) -> Iterator[dict[str, Array]]:
     """Yield the model's feeds from a moment on, until enough or the route ends."""
     world, rules = World(route), EndingRules()
-    driving, watching = (_observer_of(world, each) for each in (driver, policy))
+    driving, watching = (_observer_of(world, model) for model in (driver, policy))
     driver.reset(route)
-    # record every half second, from the first moment on
+    # Record every half second, from the first moment on
     policy.reset(route)
-    wanted = count
-    scene = world.scene()
-    while count and rules.ending(world, scene.ego.speed_mps) is None:
+    scene, left = world.scene(), length
+    while left and rules.ending(world, scene.ego.speed_mps) is None:
         since_us = scene.time_us - begin_us
         if since_us >= 0 and since_us % STEP_US == 0:
-            feeds = policy.inputs.feeds(
-                replace(watching.observe(scene), time_us=since_us)
-            )
-            first = policy.first.at(feeds) if count == wanted else {}
-            yield {**feeds, **first}
-            count -= 1
+            observation = replace(watching.observe(scene), time_us=since_us)
+            feeds = policy.inputs.feeds(observation)
+            yield {**feeds, **(policy.first.at(feeds) if left == length else {})}
+            left -= 1
         plan = driver.plan(driving.observe(scene))
         anchored = AnchoredPlan.of(plan, scene.ego, scene.time_us)
         world.step(anchored.control(scene.ego, scene.time_us))

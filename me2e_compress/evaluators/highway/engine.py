@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import queue
 import signal
 import socket
@@ -57,19 +58,19 @@ class RouteWorker:
         begun = time.perf_counter()
         process, heartbeat, line = self._started()
         line.send(route)
-        # watch the heartbeat: one call must not take too long
-        asked, since, limit_s = 0.0, begun, self.conditions.frame_limit_s
+        # Watch the heartbeat: one call must not take too long
+        call, since, limit_s = 0.0, begun, self.conditions.frame_limit_s
         try:
             while not line.poll(POLL_S):
                 if stop is not None and stop.is_set():
                     self.close()
                     return None
-                if heartbeat[0] != asked:
-                    asked, since = heartbeat[0], time.perf_counter()
-                elif asked and time.perf_counter() - since > limit_s:
+                if heartbeat[0] != call:
+                    call, since = heartbeat[0], time.perf_counter()
+                elif call and time.perf_counter() - since > limit_s:
                     return self._lost(route, begun, f"no plan within {limit_s:g} s")
             answer = line.recv()
-        # a closed pipe means that the process ended
+        # A closed pipe means that the process ended
         except (EOFError, BrokenPipeError, ConnectionResetError):
             process.join()
             return self._lost(route, begun, self._cause(route, process))
@@ -90,15 +91,12 @@ class RouteWorker:
         self,
     ) -> tuple[SpawnProcess, Heartbeat, Connection[Route, Driven | Me2eError]]:
         if self._process is None or self._heartbeat is None or self._line is None:
-            # the child keeps only its own end of the pipe
+            # The child keeps only its own end of the pipe
             context = spawn_context()
             heartbeat = context.Array("d", 2)
             ours, theirs = context.Pipe()
-            process = context.Process(
-                target=_serve,
-                args=(theirs, heartbeat, self.policy, self.conditions),
-                daemon=True,
-            )
+            options = (theirs, heartbeat, self.policy, self.conditions)
+            process = context.Process(target=_serve, args=options, daemon=True)
             process.start()
             theirs.close()
             self._process, self._heartbeat, self._line = process, heartbeat, ours
@@ -129,14 +127,12 @@ def _serve(
 ) -> None:
     """Drive the routes received until the other end of the pipe closes."""
     end_with_parent()
-    # the heartbeat tells the parent when a call of the policy began
-    asked = 0
+    # The heartbeat tells the parent when a call of the policy began
+    calls = itertools.count(1)
 
     def on_query(world: World) -> None:
-        nonlocal asked
-        asked += 1
         heartbeat[1] = completion_percent(world)
-        heartbeat[0] = float(asked)
+        heartbeat[0] = float(next(calls))
 
     def on_answer() -> None:
         heartbeat[0] = 0.0
@@ -187,7 +183,7 @@ class LocalEngine:
 
         threads = ThreadPoolExecutor(count)
         try:
-            # an error of any route ends the evaluation
+            # An error of any route ends the evaluation
             for future in as_completed(threads.submit(drive_route, e) for e in routes):
                 if (driven := future.result()) is not None:
                     yield driven
@@ -236,12 +232,11 @@ class RayEngine:
 
     def _connect(self, ray: Any) -> None:
         if self.address is None:
-            ray.init(
-                num_cpus=self.workers, include_dashboard=False, log_to_driver=False
-            )
+            alone = {"include_dashboard": False, "log_to_driver": False}
+            ray.init(num_cpus=self.workers, **alone)
             return
         try:
-            # fail within seconds if nothing listens: Ray itself tries for minutes
+            # Fail within seconds if nothing listens: Ray itself tries for minutes
             host, _, port = self.address.removeprefix("ray://").rpartition(":")
             if host and port.isdecimal():
                 place = host, int(port)

@@ -64,12 +64,10 @@ class EpisodeRecorder:
         if scene.time_us < len(self.frames) * FRAME_US:
             return
         ego = scene.ego
-        near = [
-            actor.speed_mps
-            for actor in scene.actors
-            if actor.kind in VEHICLES
-            and math.hypot(actor.x - ego.x, actor.y - ego.y) <= NEAR_M
-        ]
+        vehicles = [actor for actor in scene.actors if actor.kind in VEHICLES]
+        away_m = [math.hypot(one.x - ego.x, one.y - ego.y) for one in vehicles]
+        pairs = zip(vehicles, away_m, strict=True)
+        near = [vehicle.speed_mps for vehicle, metres in pairs if metres <= NEAR_M]
         frame = EgoFrame(
             time_us=scene.time_us,
             x=ego.x,
@@ -146,7 +144,7 @@ def _infractions(world: World, ending: Ending) -> tuple[Infraction, ...]:
                 kind = InfractionKind.COLLISION_LAYOUT
         if kind is not None:
             infractions.append(_infraction(kind, event, world))
-    # all leaving of lanes is one infraction, placed where it began
+    # All leaving of lanes is one infraction, placed where it began
     left = next((e for e in world.events if e.kind is EventKind.OUTSIDE_LANES), None)
     if left is not None:
         outside_m = world.outside_distance_m
@@ -159,7 +157,7 @@ def _infractions(world: World, ending: Ending) -> tuple[Infraction, ...]:
         ego = world.scene().ego
         at_end = world.time_us, ego.x, ego.y
         infractions.append(Infraction(ENDINGS[ending], *at_end, ending.value))
-    return tuple(sorted(infractions, key=lambda each: each.time_us or 0))
+    return tuple(sorted(infractions, key=lambda infraction: infraction.time_us or 0))
 
 
 def _infraction(kind: InfractionKind, event: Event, world: World) -> Infraction:

@@ -51,11 +51,9 @@ class Highway(Evaluator):
         self, words: str, beside: Path = Path()
     ) -> tuple[tuple[Route, ...], int]:
         """Return routes by ``all``, a number, ``ID,ID`` or a file's name."""
-        if words.endswith(".json"):
-            routes = load_routes(beside / words)
-            return routes, len(routes)
-        shipped = load_routes()
-        return pick_routes(shipped, words), len(shipped)
+        is_file = words.endswith(".json")
+        routes = load_routes(beside / words) if is_file else load_routes()
+        return routes if is_file else pick_routes(routes, words), len(routes)
 
     def check_policy(self, policy: Driver) -> None:
         """Open a policy once; highway-env is an extra."""
@@ -104,7 +102,7 @@ class Highway(Evaluator):
                 "it, so they are driven one at a time"
             )
             engine = LocalEngine()
-        # a long route that starts last would keep all other workers waiting
+        # A long route that starts last would keep all other workers waiting
         ordered = longest_first(_ours(drive.routes))
         for driven in engine.drive(policy, replace(drive, routes=()), ordered):
             log_cost(folder, driven)

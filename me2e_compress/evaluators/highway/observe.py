@@ -96,21 +96,13 @@ class ObservationBuilder:
         )
 
 
-ROAD_USERS = (
-    ActorKind.CAR,
-    ActorKind.VAN,
-    ActorKind.TRUCK,
-    ActorKind.EMERGENCY,
-    ActorKind.BICYCLE,
-    ActorKind.PEDESTRIAN,
-    ActorKind.PARKED,
-)
-"""Actors that a tracker would follow: all but doors, cones and barriers."""
+ROAD_USERS = {*ActorKind} - {ActorKind.DOOR, ActorKind.CONE, ActorKind.BARRIER}
+"""Actors that a tracker would follow."""
 
 
 def road_users(scene: Scene) -> npt.NDArray[np.float64]:
     """Return [N, 2] positions of road users, metres in the ego frame."""
-    places = [(each.x, each.y) for each in scene.actors if each.kind in ROAD_USERS]
+    places = [(actor.x, actor.y) for actor in scene.actors if actor.kind in ROAD_USERS]
     return scene.ego.seen(*np.array(places, np.float64).reshape(-1, 2).T)
 
 

@@ -64,14 +64,14 @@ class EndingRules:
         """Return why the route is over, or None; call it after every step."""
         if world.reason is not None:
             return world.reason
-        # far from the route, or for long
+        # Far from the route, or for long
         away_m, now_us = abs(world.lateral_m), world.time_us
         if away_m >= ASTRAY_M:
             self._astray_m += speed_mps * (now_us - self._last_us) / 1e6
         self._last_us = now_us
         if away_m >= DEVIATION_M or self._astray_m > ASTRAY_SHARE * world.path.goal_m:
             return Ending.DEVIATION
-        # standing since when
+        # Standing for long
         if speed_mps > BLOCKED_SPEED_MPS:
             self._stopped_at_us = None
         elif self._stopped_at_us is None:
@@ -150,10 +150,10 @@ class _Drive:
     def run(self) -> Episode:
         world, ending = self.world, None
         scene = world.scene()
-        # record, decide and step until a rule ends the route
+        # Record, decide and step until a rule ends the route
         try:
             self.listeners.on_query(world)
-            _ask(lambda: self.policy.reset(self.route))
+            _call_policy(lambda: self.policy.reset(self.route))
             self.listeners.on_answer()
             while ending is None:
                 self.recorder.record(scene)
@@ -165,21 +165,21 @@ class _Drive:
                 ending = self.rules.ending(world, scene.ego.speed_mps)
         except PolicyFailedError as failure:
             return self.recorder.episode(Ending.POLICY_FAILED, str(failure))
-        # the last frame has no decision
+        # The last frame has no decision
         self.recorder.record(scene)
         self.show(scene)
         return self.recorder.episode(ending)
 
     def decide(self, scene: Scene) -> None:
         """Query the policy at this frame; the clock says when its answer acts."""
-        # only the policy itself is timed
+        # Time the policy alone
         observation = self.observer.observe(scene)
         self.listeners.on_query(self.world)
         begun = time.perf_counter_ns()
-        answer = _ask(lambda: self.policy.plan(observation))
+        answer = _call_policy(lambda: self.policy.plan(observation))
         took_us = (time.perf_counter_ns() - begun) // 1_000
         self.listeners.on_answer()
-        # the latency source may use the measured time
+        # Convert its answer; the latency source may use the measured time
         try:
             valid = checked(answer)
         except EvaluationError as error:
@@ -210,7 +210,7 @@ class _Drive:
             self.listeners.on_moment(Moment(scene, images, plan, self.world.events))
 
 
-def _ask(call: Callable[[], T]) -> T:
+def _call_policy(call: Callable[[], T]) -> T:
     """Call the policy; whatever it raises is its failure, not ours."""
     try:
         return call()
