@@ -44,7 +44,8 @@ def success(episode: Episode) -> bool:
     if episode.given is None:
         return episode.succeeded
     return episode.given.status in SUCCESSES and all(
-        each.kind is InfractionKind.MIN_SPEED for each in episode.infractions
+        infraction.kind is InfractionKind.MIN_SPEED
+        for infraction in episode.infractions
     )
 
 
@@ -91,32 +92,24 @@ def smoothness(episode: Episode) -> Measure:
     frames = episode.frames
     if len(frames) < 3:
         return Measure(None, "ratio", f"{len(frames)} frames, 3 are needed")
-    # columns [4, N]: along, across, norm, yaw rate in degrees per second
-    columns = np.array(
-        [
-            (
-                frame.acceleration_mps2,
-                frame.lateral_acceleration_mps2,
-                (
-                    np.hypot(frame.acceleration_mps2, frame.lateral_acceleration_mps2)
-                    if frame.acceleration_norm_mps2 is None
-                    else frame.acceleration_norm_mps2
-                ),
-                np.degrees(frame.yaw_rate_radps),
-            )
-            for frame in frames
-        ]
-    ).T
-    # whole blocks only; the rest is dropped
+    # Columns [4, N]: along, across, norm, yaw rate in degrees per second
+    rows = list[tuple[float, ...]]()
+    for frame in frames:
+        along, across = frame.acceleration_mps2, frame.lateral_acceleration_mps2
+        norm = frame.acceleration_norm_mps2
+        norm = float(np.hypot(along, across)) if norm is None else norm
+        rows.append((along, across, norm, float(np.degrees(frame.yaw_rate_radps))))
+    columns = np.array(rows).T
+    # Whole blocks only; the rest is dropped
     length = min(len(frames), BLOCK_FRAMES)
     blocks = len(frames) // length
     cut = columns[:, : blocks * length].reshape(len(columns), blocks, length)
     a_along, a_across, a_length = map(_smoothed, cut[:3])
-    # as the original: degrees are unwrapped as if they were radians
+    # As the original: degrees are unwrapped as if they were radians
     turns = np.round(np.diff(cut[3]) / (2.0 * np.pi)).cumsum(axis=1)
     turned = np.pad(turns, ((0, 0), (1, 0)))
     yaw_rate = _smoothed(cut[3] - 2.0 * np.pi * turned)
-    # the last bound is in radians; the original's yaw acceleration is the yaw rate, of
+    # The last bound is in radians; the original's yaw acceleration is the yaw rate, of
     # which it asks less than 1.93 too
     within = (
         (a_along > -4.05) & (a_along < 2.40),
@@ -154,21 +147,17 @@ def mastered(episode: Episode, ability: str) -> bool:
     if ability != TRAFFIC_SIGNS or episode.junction_m is None:
         return False
     passed_m = episode.completion_percent / 100.0 * episode.route_length_m
-    return passed_m > episode.junction_m + JUNCTION_MARGIN_M and not _ran_a_sign(
-        episode
-    )
+    inside = passed_m > episode.junction_m + JUNCTION_MARGIN_M
+    return inside and not _ran_a_sign(episode)
 
 
 def successes(episodes: Sequence[Episode]) -> dict[str, tuple[bool, ...]]:
     """Return, for each ability, whether each route that tests it was mastered."""
-    return {
-        ability: tuple(
-            mastered(episode, ability)
-            for episode in episodes
-            if ability in episode.abilities
-        )
-        for ability in ABILITIES
-    }
+    outcomes = dict[str, tuple[bool, ...]]()
+    for name in ABILITIES:
+        tested = (episode for episode in episodes if name in episode.abilities)
+        outcomes[name] = tuple(mastered(episode, name) for episode in tested)
+    return outcomes
 
 
 def ability_rates(episodes: Sequence[Episode]) -> tuple[Estimate, dict[str, Estimate]]:
@@ -186,18 +175,15 @@ def ability_rates(episodes: Sequence[Episode]) -> tuple[Estimate, dict[str, Esti
         measure = Measure(100.0 * sum(won) / len(won), "%")
         interval = binomial_interval(sum(won), len(won))
         rates[ability] = Estimate(measure, *interval, len(won))
-    # failed routes that would count if the ego passed their junction
+    # Failed routes that would count if the ego passed their junction
     tested = [one for one in episodes if TRAFFIC_SIGNS in one.abilities]
-    unknown = [
-        one.route
-        for one in tested
-        if one.completion_percent > 0.0 and not (success(one) or _ran_a_sign(one))
-    ]
+    begun = [one for one in tested if one.completion_percent > 0.0]
+    unknown = [one.route for one in begun if not (success(one) or _ran_a_sign(one))]
     if unknown:
         others = f" and {len(unknown) - 1} others" if len(unknown) > 1 else ""
         reason = f"where the junction is on {unknown[0]}{others} is not known"
         rates[TRAFFIC_SIGNS] = Estimate.missing("%", reason, len(tested))
-    # the mean, if all five are known
+    # The mean, if all five are known
     lacks = [name for name, rate in rates.items() if rate.value is None]
     if lacks:
         reason = f"{lacks[0]}: {rates[lacks[0]].measure.reason}"
@@ -208,4 +194,4 @@ def ability_rates(episodes: Sequence[Episode]) -> tuple[Estimate, dict[str, Esti
 
 def _ran_a_sign(episode: Episode) -> bool:
     broken = (InfractionKind.STOP, InfractionKind.RED_LIGHT)
-    return any(each.kind in broken for each in episode.infractions)
+    return any(infraction.kind in broken for infraction in episode.infractions)

@@ -33,7 +33,7 @@ class Deadlines:
 
     def to_json(self) -> dict[str, Any]:
         """Return plain numbers, null for what was not measured."""
-        values = {name: each.value for name, each in self.measures.items()}
+        values = {name: measure.value for name, measure in self.measures.items()}
         return {"budget_ms": self.budget_ms, "decisions": self.count, **values}
 
 
@@ -48,22 +48,18 @@ def deadlines(
     from; None if each was measured on its own.
     """
     count, none = len(latencies_us), "no decision was taken"
-    if not count:
-        unknown, share = Measure(None, "ms", none), Measure(None, "%", none)
-        names = (*PERCENTILES, "mean_ms", "max_ms")
-        named = dict.fromkeys(names, unknown) | {"over_budget_percent": share}
-        return Deadlines(budget_ms, 0, named | {CRITICAL: UNSEEN, OTHER: UNSEEN})
     samples = count if measured is None else min(count, measured)
-    late = sum(each > 1e3 * budget_ms for each in latencies_us)
+    late = sum(latency_us > 1e3 * budget_ms for latency_us in latencies_us)
     measures = dict[str, Measure]()
     for name, percent in PERCENTILES.items():
-        why = too_few(percent, samples)
+        why = too_few(percent, samples) if count else none
         value = None if why else percentile(latencies_us, percent) / 1e3
         measures[name] = Measure(value, "ms", why)
     measures["mean_ms"] = _mean(latencies_us, none)
-    measures["max_ms"] = Measure(max(latencies_us) / 1e3, "ms")
-    measures["over_budget_percent"] = Measure(100.0 * late / count, "%")
-    return Deadlines(budget_ms, count, {**measures, CRITICAL: UNSEEN, OTHER: UNSEEN})
+    measures["max_ms"] = _mean([max(latencies_us)] if count else (), none)
+    over = Measure(100.0 * late / count, "%") if count else Measure(None, "%", none)
+    measures |= {"over_budget_percent": over, CRITICAL: UNSEEN, OTHER: UNSEEN}
+    return Deadlines(budget_ms, count, measures)
 
 
 def charged(
@@ -75,21 +71,20 @@ def charged(
 
     ``measured`` is the one of :func:`deadlines`.
     """
-    driven = tuple(episodes)
-    taken = [each.latency_us for episode in driven for each in episode.decisions]
-    if not any(taken):
-        return None
-    # latencies on frames with a low time to collision, and on others
-    critical, other = list[int](), list[int]()
-    for episode in driven:
+    # All latencies, and those on frames with a low time to collision or on others
+    latencies, critical, other = list[int](), list[int](), list[int]()
+    for episode in episodes:
         ttc_s = () if episode.conflicts is None else episode.conflicts.ttc_s
         for decision in episode.decisions:
+            latencies.append(decision.latency_us)
             frame = decision.time_us // FRAME_US
             if frame < len(ttc_s):
                 seconds = ttc_s[frame]
                 near = seconds is not None and seconds < TTC_CRITICAL_S
                 (critical if near else other).append(decision.latency_us)
-    compared = deadlines(taken, budget_ms, measured)
+    if not any(latencies):
+        return None
+    compared = deadlines(latencies, budget_ms, measured)
     by_frame = {
         CRITICAL: _mean(critical, "no decision on a frame with TTC below 1.5 s"),
         OTHER: _mean(other, "no decision on another frame"),
@@ -111,7 +106,7 @@ def deadlines_table(title: str, deadlines: Deadlines) -> Table:
     if deadlines.measures[CRITICAL].value is not None:
         names |= {CRITICAL: "mean, TTC below 1.5 s", OTHER: "mean, other frames"}
     shown = {words: deadlines.measures[name] for name, words in names.items()}
-    why = {words: each.reason for words, each in shown.items() if each.value is None}
+    why = {words: e.reason for words, e in shown.items() if e.value is None}
     return table(
         f"{title}: {plural(deadlines.count, 'decision')}",
         ("latency", "", "unit"),

@@ -73,10 +73,8 @@ def route_measures(
         if j_per_frame is not None and (route.decisions or failed):
             joules = j_per_frame * route.decisions
         rows.append((route.driving_score, efficiency, comfort, joules))
-    return RouteMeasures(
-        np.array(rows, np.float64).reshape(-1, 4),
-        np.array([bool(each.collisions) for each in routes], np.bool_),
-    )
+    crashed = np.array([bool(route.collisions) for route in routes], np.bool_)
+    return RouteMeasures(np.array(rows, np.float64).reshape(-1, 4), crashed)
 
 
 MEASURES: tuple[str, ...] = ("driving score", "efficiency", "comfort", "energy")
@@ -123,8 +121,9 @@ class EerResult:
     @property
     def ranking(self) -> tuple[str, ...]:
         """Names of the variants that have a score, best first."""
-        known = [name for name, each in self.scores.items() if each.value is not None]
-        return tuple(sorted(known, key=lambda name: -(self.scores[name].value or 0.0)))
+        values = {name: estimate.value for name, estimate in self.scores.items()}
+        known = [name for name, value in values.items() if value is not None]
+        return tuple(sorted(known, key=lambda name: -(values[name] or 0.0)))
 
 
 def eer(
@@ -144,44 +143,44 @@ def eer(
     Raises:
         EvaluationError: The variants differ in the number of routes.
     """
-    if len({len(each.table) for each in variants.values()}) > 1:
+    if len({len(measures.table) for measures in variants.values()}) > 1:
         raise EvaluationError("EER_AV compares variants on the same routes")
-    # variants and routes that can be scored
+    # Find the variants that can be scored
     missing = dict[str, str]()
-    for name, each in variants.items():
-        absent = np.asarray(np.isnan(each.table).all(axis=0))
+    for name, measures in variants.items():
+        absent = np.asarray(np.isnan(measures.table).all(axis=0))
         lacks = [m for m, gone in zip(MEASURES, absent, strict=True) if gone]
         missing[name] = f"{' and '.join(lacks)}: not measured" if lacks else ""
-    able = {name: each for name, each in variants.items() if not missing[name]}
-    # the routes that have all measures of all of them, and the gaps of the others
+    able = {name: measures for name, measures in variants.items() if not missing[name]}
+    # Find the routes that have all measures of all of them; count the others' gaps
     kept, left_out = np.zeros(0, np.bool_), dict[str, int]()
     if able:
-        gone = np.any([np.isnan(each.table) for each in able.values()], axis=0)
+        gone = np.any([np.isnan(measures.table) for measures in able.values()], axis=0)
         kept, gaps = ~gone.any(axis=1), gone.sum(axis=0).tolist()
         left_out = {m: n for m, n in zip(MEASURES, gaps, strict=True) if n}
-    tables = {name: each.table[kept] for name, each in able.items()}
-    # weights and scales, unless they are given
+    tables = {name: measures.table[kept] for name, measures in able.items()}
+    # Find weights and scales, unless they are given
     reason = "" if kept.any() else "no route has all four measures"
     if not reason and scale is None:
         try:
             scale = scale_of(tables)
         except EvaluationError as error:
             reason = str(error)
-    # one estimate per variant, or the reason why there is none
+    # Estimate every variant's score, or say why there is none
     scores, routes = dict[str, Estimate](), dict[str, Floats]()
+    kinds = types or [str(i) for i in range(len(kept))]
     for name, measures in variants.items():
         why = missing[name] or reason
         if why or scale is None:
             scores[name] = Estimate.missing(POINTS, why)
             continue
-        # equation 8
+        # Equation 8
         rows = (tables[name] - np.array(scale.offset)) / np.array(scale.span)
         terms = rows * np.array(scale.weights) * SIGNS
         safe = np.where(measures.crashed[kept], 0.0, terms[:, 1:].sum(axis=1))
         routes[name] = np.asarray(100.0 * (terms[:, 0] + safe))
-        kinds = types or [str(i) for i in range(len(kept))]
-        kinds = [kind for kind, keep in zip(kinds, kept, strict=True) if keep]
-        scores[name] = mean_estimate(routes[name].tolist(), kinds, POINTS, seed)
+        own_kinds = [kind for kind, keep in zip(kinds, kept, strict=True) if keep]
+        scores[name] = mean_estimate(routes[name].tolist(), own_kinds, POINTS, seed)
     return EerResult(scores, routes, None if reason else scale, left_out, kept)
 
 
@@ -191,7 +190,7 @@ def scale_of(tables: Mapping[str, Floats]) -> EerScale:
     offset, span = rows.min(axis=0), np.ptp(rows, axis=0)
     span = np.where(span > 0.0, span, 1.0)  # a constant measure has weight 0
     weights = critic_weights((rows - offset) / span)
-    return EerScale(*(tuple(each.tolist()) for each in (weights, offset, span)))
+    return EerScale(*(tuple(row.tolist()) for row in (weights, offset, span)))
 
 
 def critic_weights(rows: Floats) -> Floats:
@@ -216,7 +215,7 @@ def critic_weights(rows: Floats) -> Floats:
     Raises:
         EvaluationError: All criteria but one are constant, or all are redundant.
     """
-    # constant criteria are left out
+    # Leave out constant criteria
     spread = rows.std(axis=0)
     varies = spread > FLAT * np.abs(rows).max(axis=0, initial=0.0)
     content = np.zeros(rows.shape[1])
@@ -224,7 +223,7 @@ def critic_weights(rows: Floats) -> Floats:
         correlation = np.atleast_2d(np.corrcoef(rows[:, varies], rowvar=False))
         apart = np.clip(1.0 - np.abs(correlation), 0.0, 1.0)
         content[varies] = spread[varies] * apart.sum(axis=1)
-    # fully correlated criteria give no weights
+    # Fully correlated criteria give no weights
     total = float(content.sum())
     if total <= ALIKE * float(spread.sum()) or not varies.any():
         raise EvaluationError(

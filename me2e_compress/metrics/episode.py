@@ -2,9 +2,9 @@
 
 import dataclasses
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import StrEnum
-from types import MappingProxyType
 from typing import Annotated, Any
 
 from pydantic import ConfigDict, Field, TypeAdapter, with_config
@@ -55,22 +55,20 @@ COLLISIONS = (
     InfractionKind.COLLISION_LAYOUT,
 )
 
-PENALTY = MappingProxyType(
-    {
-        InfractionKind.COLLISION_PEDESTRIAN: 0.5,
-        InfractionKind.COLLISION_VEHICLE: 0.6,
-        InfractionKind.COLLISION_LAYOUT: 0.65,
-        InfractionKind.RED_LIGHT: 0.7,
-        InfractionKind.STOP: 0.8,
-        InfractionKind.GIVE_WAY: 0.8,
-        InfractionKind.SCENARIO_TIMEOUT: 0.7,
-        InfractionKind.YIELD_TO_EMERGENCY_VEHICLE: 0.7,
-        InfractionKind.MIN_SPEED: 1.0,
-        InfractionKind.ROUTE_DEVIATION: 1.0,
-        InfractionKind.VEHICLE_BLOCKED: 1.0,
-        InfractionKind.ROUTE_TIMEOUT: 1.0,
-    }
-)
+PENALTY: Mapping[InfractionKind, float] = {
+    InfractionKind.COLLISION_PEDESTRIAN: 0.5,
+    InfractionKind.COLLISION_VEHICLE: 0.6,
+    InfractionKind.COLLISION_LAYOUT: 0.65,
+    InfractionKind.RED_LIGHT: 0.7,
+    InfractionKind.STOP: 0.8,
+    InfractionKind.GIVE_WAY: 0.8,
+    InfractionKind.SCENARIO_TIMEOUT: 0.7,
+    InfractionKind.YIELD_TO_EMERGENCY_VEHICLE: 0.7,
+    InfractionKind.MIN_SPEED: 1.0,
+    InfractionKind.ROUTE_DEVIATION: 1.0,
+    InfractionKind.VEHICLE_BLOCKED: 1.0,
+    InfractionKind.ROUTE_TIMEOUT: 1.0,
+}
 """Factor per event: Bench2Drive 0.0.3, leaderboard/utils/statistics_manager.py.
 
 Leaving the lanes has no fixed factor: it costs the share of the way driven outside.
@@ -78,7 +76,16 @@ GIVE_WAY is ours.
 """
 
 
-@with_config(ConfigDict(allow_inf_nan=False, extra="forbid"))
+_STRICT = ConfigDict(allow_inf_nan=False, extra="forbid")
+
+LARGEST = 1e9
+"""The largest magnitude of a number on file: beyond, squares and sums overflow."""
+
+Quantity = Annotated[float, Field(ge=0.0, le=LARGEST)]
+"""A distance, duration or speed that is finite and not negative."""
+
+
+@with_config(_STRICT)
 @dataclass(frozen=True, slots=True)
 class Infraction:
     """One infraction; values that a simulator does not report are None.
@@ -102,7 +109,7 @@ class Infraction:
     percent: Annotated[float, Field(ge=0.0)] | None = None
     contact: Contact | None = None
     at_fault: bool | None = None
-    ego_speed_mps: Annotated[float, Field(ge=0.0, le=1e9)] | None = None
+    ego_speed_mps: Quantity | None = None
 
     @property
     def factor(self) -> float:
@@ -126,11 +133,6 @@ CROSSING_RAD = math.radians(30.0)
 """From this angle between headings paths cross or merge; below it one follows the
 other, and the time between them is a headway: SSAM's rear-end angle."""
 
-Distance = Annotated[float, Field(ge=0.0, le=1e9)]
-Seconds = Annotated[float, Field(ge=0.0, le=1e9)]
-
-_STRICT = ConfigDict(allow_inf_nan=False, extra="forbid")
-
 
 @with_config(_STRICT)
 @dataclass(frozen=True, slots=True)
@@ -148,7 +150,7 @@ class Encounter:
     actor: int
     kind: str
     time_us: int
-    pet_s: Seconds
+    pet_s: Quantity
     angle_rad: Annotated[float, Field(ge=0.0, le=3.15)]
     ego_first: bool
 
@@ -170,16 +172,13 @@ class ConflictRecord:
             direction.
     """
 
-    nearest_m: tuple[Distance | None, ...]
-    ttc_s: tuple[Seconds | None, ...]
+    nearest_m: tuple[Quantity | None, ...]
+    ttc_s: tuple[Quantity | None, ...]
     encounters: tuple[Encounter, ...]
 
 
 FRAME_US = 50_000
 """Microseconds between two frames: the simulators of the benchmarks run at 20 Hz."""
-
-LARGEST = 1e9
-"""The largest magnitude of a number on file: beyond, squares and sums overflow."""
 
 Number = Annotated[float, Field(ge=-LARGEST, le=LARGEST)]
 
@@ -275,7 +274,7 @@ class Episode:
     route: str
     scenario: str
     abilities: tuple[str, ...]
-    route_length_m: Annotated[float, Field(ge=0.0, le=LARGEST)]
+    route_length_m: Quantity
     completion_percent: Annotated[float, Field(ge=0.0, le=100.0)]
     ending: Ending
     failure: str | None
@@ -295,16 +294,13 @@ class Episode:
         status Completed or Perfect (merge_route_json.py).
         """
         whole = self.ending is Ending.COMPLETED and self.completion_percent >= 100.0
-        return whole and all(
-            infraction.kind is InfractionKind.MIN_SPEED
-            for infraction in self.infractions
-        )
+        kinds = {infraction.kind for infraction in self.infractions}
+        return whole and kinds <= {InfractionKind.MIN_SPEED}
 
     def to_json(self) -> dict[str, Any]:
         """Return plain objects; frames and decisions are stored column by column."""
-        record: dict[str, Any] = _EPISODE.dump_python(
-            dataclasses.replace(self, frames=(), decisions=()), mode="json"
-        )
+        bare = dataclasses.replace(self, frames=(), decisions=())
+        record: dict[str, Any] = _EPISODE.dump_python(bare, mode="json")
         record["frames"] = _columns(EgoFrame, self.frames)
         record["decisions"] = _columns(InferenceRecord, self.decisions)
         return record
@@ -316,9 +312,8 @@ class Episode:
         Raises:
             ValueError: If anything is missing, unknown, of another type or not finite.
         """
-        rows = {
-            name: _rows(name, record.get(name, {})) for name in ("frames", "decisions")
-        }
+        by_columns = ("frames", "decisions")
+        rows = {name: _rows(name, record.get(name, {})) for name in by_columns}
         return _EPISODE.validate_python({**record, **rows})
 
 
@@ -331,11 +326,10 @@ def _columns(kind: type, rows: tuple[Any, ...]) -> dict[str, list[Any]]:
 
 
 def _rows(name: str, columns: object) -> tuple[dict[str, Any], ...]:
-    if not isinstance(columns, dict) or not all(
-        isinstance(column, list) for column in columns.values()
-    ):
+    lists = columns.values() if isinstance(columns, dict) else ()
+    if not isinstance(columns, dict) or set(map(type, lists)) - {list}:
         raise ValueError(f"{name} are not stored as columns")
-    if len({len(column) for column in columns.values()}) > 1:
+    if len(set(map(len, lists))) > 1:
         raise ValueError(f"the columns of {name} differ in length")
-    rows = zip(*columns.values(), strict=True)
+    rows = zip(*lists, strict=True)
     return tuple(dict(zip(columns, row, strict=True)) for row in rows)

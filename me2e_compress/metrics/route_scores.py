@@ -85,7 +85,7 @@ def speed_ratios(episode: Episode) -> tuple[float, ...]:
         done = episode.completion_percent > DONE_PERCENT
         twice = done and len(given) > 1 and given[-1] == given[-2]
         return given[:-1] if twice else given
-    # the frames between two check points
+    # The frames between two check points
     spacing_m = episode.route_length_m / CHECKPOINTS
     passed, stretches = 0, list[list[EgoFrame]]([[]])
     for frame in episode.frames:
@@ -101,12 +101,12 @@ def speed_ratios(episode: Episode) -> tuple[float, ...]:
 
 def beside_traffic(stretch: Sequence[EgoFrame]) -> tuple[float, float, int]:
     """Return summed ego and traffic speeds (m/s) of frames with traffic; how many."""
-    seen = [
-        (frame.speed_mps, frame.traffic_speed_mps)
-        for frame in stretch
-        if frame.traffic_speed_mps is not None
-    ]
-    return sum(ego for ego, _ in seen), sum(other for _, other in seen), len(seen)
+    ego, traffic = list[float](), list[float]()
+    for frame in stretch:
+        if frame.traffic_speed_mps is not None:
+            ego.append(frame.speed_mps)
+            traffic.append(frame.traffic_speed_mps)
+    return sum(ego), sum(traffic), len(ego)
 
 
 # Driving comfort: the share of seconds with every variable in its range.
@@ -121,7 +121,7 @@ BLOCKED_US = 60_000_000
 Floats = npt.NDArray[np.float64]
 
 
-# the paper's table 1 in SI units: the 99th percentiles of human drivers that nuPlan's
+# The paper's table 1 in SI units: the 99th percentiles of human drivers that nuPlan's
 # comfort metric uses
 LOWEST_ACCELERATION_MPS2, HIGHEST_ACCELERATION_MPS2 = -4.05, 2.40
 LATERAL_ACCELERATION_MPS2 = 4.89
@@ -156,7 +156,7 @@ def comfort(episode: Episode) -> Measure:
 def smooth_frames(episode: Episode) -> npt.NDArray[np.bool_]:
     """Return for each of at least 7 frames whether all six variables are in range."""
     frames = episode.frames
-    # the jerk needs the acceleration vector in the world
+    # The jerk needs the acceleration vector in the world
     along = np.array([frame.acceleration_mps2 for frame in frames])
     left = np.array([frame.lateral_acceleration_mps2 for frame in frames])
     heading = np.array([frame.heading for frame in frames])
@@ -165,9 +165,9 @@ def smooth_frames(episode: Episode) -> npt.NDArray[np.bool_]:
     north = along * np.sin(heading) + left * np.cos(heading)
     times_us = np.array([frame.time_us for frame in frames])
     delta_s = (int(np.median(np.diff(times_us))) or FRAME_US) / 1e6
-    # every variable against its bounds
+    # Every variable against its bounds
     acceleration = filtered(along)
-    jerk_east, jerk_north = (filtered(each, delta_s, 1) for each in (east, north))
+    jerk_east, jerk_north = (filtered(axis, delta_s, 1) for axis in (east, north))
     return (
         (acceleration >= LOWEST_ACCELERATION_MPS2)
         & (acceleration <= HIGHEST_ACCELERATION_MPS2)
@@ -185,9 +185,7 @@ def filtered(
     """Smooth values, or every row of them, by Savitzky and Golay's filter."""
     from scipy.signal import savgol_filter  # takes half a second to import
 
-    smoothed: Any = savgol_filter(
-        values, window, ORDER, deriv=derivative, delta=delta_s
-    )
+    smoothed: Any = savgol_filter(values, window, ORDER, derivative, delta_s)
     return np.asarray(smoothed, np.float64)
 
 
@@ -273,13 +271,14 @@ def smallest_pet(episode: Episode) -> Measure:
     Only encounters at 30 degrees or more, at most 5 s apart, count.
     """
     encounters = () if episode.conflicts is None else episode.conflicts.encounters
-    crossing = [each.pet_s for each in encounters if each.angle_rad >= CROSSING_RAD]
+    crossing = [met.pet_s for met in encounters if met.angle_rad >= CROSSING_RAD]
     return _smallest(episode, crossing, "s", "no paths crossed within 5 s")
 
 
 def at_fault_collision(episode: Episode) -> bool | None:
     """Return whether a collision was the ego's fault, None if unknown."""
-    faults = [each.at_fault for each in episode.infractions if each.kind in COLLISIONS]
+    collisions = (one for one in episode.infractions if one.kind in COLLISIONS)
+    faults = [collision.at_fault for collision in collisions]
     if any(faults):
         return True
     return None if None in faults else False

@@ -3,7 +3,6 @@
 Whatever is compared between two drives is compared here, route by route.
 """
 
-import dataclasses
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -97,11 +96,8 @@ class RouteSummary:
     @property
     def moments(self) -> tuple[tuple[str, int | None], ...]:
         """Kind and time of each infraction but being too slow, which has no moment."""
-        return tuple(
-            (kind, time_us)
-            for kind, time_us, _ in self.infractions
-            if kind != InfractionKind.MIN_SPEED
-        )
+        timed = (one for one in self.infractions if one[0] != InfractionKind.MIN_SPEED)
+        return tuple((kind, time_us) for kind, time_us, _ in timed)
 
     @property
     def fate(self) -> str:
@@ -112,15 +108,14 @@ class RouteSummary:
     @property
     def collisions(self) -> tuple[tuple[str, str], ...]:
         """Kind and other party of each collision."""
-        return tuple(
-            (kind, detail) for kind, _, detail in self.infractions if kind in COLLISIONS
-        )
+        crashes = (one for one in self.infractions if one[0] in COLLISIONS)
+        return tuple((kind, detail) for kind, _, detail in crashes)
 
     @classmethod
     def of(cls, episode: Episode) -> Self:
         """Summarize an episode; a real run may log steps instead of decisions."""
-        # percentiles of the latency that the drive was charged
-        charged = [each.latency_us for each in episode.decisions]
+        # Percentiles of the latency that the drive was charged
+        charged = [decision.latency_us for decision in episode.decisions]
         latency_us = np.percentile(charged or [0], PERCENTS, method="higher")
         steps = 0 if episode.given is None else len(episode.frames)
         return cls(
@@ -135,7 +130,7 @@ class RouteSummary:
             scored.comfort(episode).value,
             episode.frames[-1].time_us if episode.frames else 0,
             len(charged) or steps,
-            tuple(int(each) for each in latency_us) if charged else (),
+            tuple(map(int, latency_us)) if charged else (),
             sum(charged),
             scored.ttc_exposure(episode).value,
             scored.smallest_ttc(episode).value,
@@ -148,12 +143,9 @@ class RouteSummary:
 
     def rounded(self) -> Self:
         """Return it with as many digits as files keep."""
-        floats: dict[str, Any] = {
-            name: round(value, DIGITS)
-            for name, value in vars(self).items()
-            if isinstance(value, float)
-        }
-        return replace(self, **floats)
+        floats = ((k, v) for k, v in vars(self).items() if isinstance(v, float))
+        rounded: dict[str, Any] = {name: round(value, DIGITS) for name, value in floats}
+        return replace(self, **rounded)
 
 
 POINTS = "points"
@@ -183,12 +175,9 @@ class RouteValues:
         if self.bounds is not None and other.bounds is not None:
             (low, high), (least, most) = self.bounds, other.bounds
             bounds = low - most, high - least
-        shared = {
-            route: value - other.by_route[route]
-            for route, value in self.by_route.items()
-            if route in other.by_route
-        }
-        # a drive without a single number says why
+        both = [route for route in self.by_route if route in other.by_route]
+        shared = {route: self.by_route[route] - other.by_route[route] for route in both}
+        # A drive without a single number says why
         missing = f"no route has a {self.name} in both drives"
         if not (self.by_route and other.by_route):
             missing = other.missing if self.by_route else self.missing
@@ -215,18 +204,13 @@ class RouteColumn:
 
     def values(self, routes: Sequence[RouteSummary], why: str = "") -> RouteValues:
         """Return the numbers of a drive; ``why`` there are no routes, if so."""
-        return RouteValues(
-            self.name,
-            self.unit,
-            {
-                each.route: value
-                for each in routes
-                if (value := self.of(each)) is not None
-            },
-            {each.route: each.scenario for each in routes},
-            self.bounds,
-            why or f"no route has a {self.name}",
-        )
+        values, types = dict[str, float](), dict[str, str]()
+        for route in routes:
+            types[route.route] = route.scenario
+            if (value := self.of(route)) is not None:
+                values[route.route] = value
+        why = why or f"no route has a {self.name}"
+        return RouteValues(self.name, self.unit, values, types, self.bounds, why)
 
 
 DS = RouteColumn("DS", "%", lambda route: route.driving_score, PERCENT)
@@ -336,8 +320,8 @@ def difference(
     routes: Sequence[RouteSummary], reference: Sequence[RouteSummary], seed: int = 0
 ) -> PairedDifference:
     """Compare two drives of the same routes, at least one, route by route."""
-    # routes must match, whatever their order
-    ours, others = ({each.route for each in drive} for drive in (routes, reference))
+    # Routes must match, whatever their order
+    ours, others = ({route.route for route in drive} for drive in (routes, reference))
     if unpaired := sorted(ours ^ others):
         raise EvaluationError(
             f"route {unpaired[0]} was driven by one of the two only: differences are "
@@ -366,17 +350,16 @@ def _estimate(values: RouteValues, seed: int) -> Estimate:
     mean = values.mean(seed)
     if mean.value is None or mean.low is None or mean.high is None:
         return mean
-    # widen the interval over these types
+    # Widen the interval over these types
     least, most = unseen_interval(mean.value, mean.n, values.bounds)
     low = mean.low if least is None else min(least, mean.low)
     high = mean.high if most is None else max(most, mean.high)
-    # the interval over new types must contain it
+    mean = replace(mean, low=low, high=high)
+    # The interval over new types must contain it
     if mean.anew_low is None or mean.anew_high is None:
-        return dataclasses.replace(mean, low=low, high=high)
-    return dataclasses.replace(
-        mean, low=low, high=high,
-        anew_low=min(low, mean.anew_low), anew_high=max(high, mean.anew_high),
-    )  # fmt: skip
+        return mean
+    anew = min(low, mean.anew_low), max(high, mean.anew_high)
+    return replace(mean, anew_low=anew[0], anew_high=anew[1])
 
 
 def holm(p_values: Sequence[float]) -> tuple[float, ...]:

@@ -111,32 +111,28 @@ def score(
     episodes: Sequence[Episode], expected: int = FULL_SET, seed: int = 0
 ) -> Scores:
     """Score a set of routes; their order affects nothing but the bootstrap."""
-    # means over routes with their intervals
 
     def driving_score(episode: Episode) -> Measure:
         return Measure(route_scores.route_score(episode).composed, "%")
 
     mean_ability, each_ability = _abilities(episodes, seed)
+    succeeded = [episode.succeeded for episode in episodes]
+    smoothness = bench2drive.smoothness
+    failed = [episode for episode in episodes if episode.ending in FAILURES]
     return Scores(
-        driving_score=_over(episodes, driving_score, "%", seed, PERCENT),
-        success_rate=_rate(
-            [episode.succeeded for episode in episodes], _types(episodes), seed
-        ),
-        efficiency=_over(episodes, route_scores.efficiency, "%", seed),
-        comfort=_over(episodes, route_scores.comfort, "ratio", seed, SHARE),
+        driving_score=_mean(episodes, driving_score, "%", seed, PERCENT),
+        success_rate=_rate(succeeded, _types(episodes), seed),
+        efficiency=_mean(episodes, route_scores.efficiency, "%", seed),
+        comfort=_mean(episodes, route_scores.comfort, "ratio", seed, SHARE),
         abilities=mean_ability,
         each_ability=each_ability,
-        bench2drive_efficiency=_over(episodes, bench2drive.efficiency, "%", seed),
-        bench2drive_smoothness=_over(
-            episodes, bench2drive.smoothness, "ratio", seed, SHARE
-        ),
+        bench2drive_efficiency=_mean(episodes, bench2drive.efficiency, "%", seed),
+        bench2drive_smoothness=_mean(episodes, smoothness, "ratio", seed, SHARE),
         safety=_safety(episodes, seed),
         routes=len(episodes),
         expected=expected,
         failures={
-            each.route: each.failure or each.ending.value
-            for each in episodes
-            if each.ending in FAILURES
+            episode.route: episode.failure or episode.ending.value for episode in failed
         },
     )
 
@@ -147,15 +143,15 @@ def _safety(episodes: Sequence[Episode], seed: int) -> SafetyScores:
     if len(known) == len(faults):
         at_fault = _rate(known, _types(episodes), seed)
     else:
-        # routes without a collision alone would make a rate of nothing but zeros
+        # Routes without a collision alone would make a rate of nothing but zeros
         reason = f"whose fault {len(faults) - len(known)} collisions were is not known"
         at_fault = Estimate.missing("%", reason)
     return SafetyScores(
-        _over(episodes, route_scores.room_kept, "%", seed, PERCENT),
-        _over(episodes, route_scores.ttc_exposure, "%", seed, PERCENT),
-        _over(episodes, route_scores.smallest_ttc, "s", seed),
-        _over(episodes, route_scores.smallest_pet, "s", seed),
-        _over(episodes, route_scores.smallest_distance, "m", seed),
+        _mean(episodes, route_scores.room_kept, "%", seed, PERCENT),
+        _mean(episodes, route_scores.ttc_exposure, "%", seed, PERCENT),
+        _mean(episodes, route_scores.smallest_ttc, "s", seed),
+        _mean(episodes, route_scores.smallest_pet, "s", seed),
+        _mean(episodes, route_scores.smallest_distance, "m", seed),
         at_fault,
     )
 
@@ -164,7 +160,7 @@ def _types(episodes: Iterable[Episode]) -> list[str]:
     return [episode.scenario for episode in episodes]
 
 
-def _over(
+def _mean(
     episodes: Sequence[Episode],
     metric: Callable[[Episode], Measure],
     unit: str,
@@ -172,7 +168,7 @@ def _over(
     bounds: Bounds | None = None,
 ) -> Estimate:
     measured = [(metric(episode), episode.scenario) for episode in episodes]
-    known = [(each.value, kind) for each, kind in measured if each.value is not None]
+    known = [(own.value, kind) for own, kind in measured if own.value is not None]
     if not known:
         reason = measured[0][0].reason if measured else "no route was driven"
         return Estimate.missing(unit, reason)
@@ -201,18 +197,18 @@ def _abilities(
     if any(episode.given is not None for episode in episodes):
         return ability_rates(episodes)
     outcomes = successes(episodes)
-    each = {
+    rates = {
         name: _rate(mastered, _types(e for e in episodes if name in e.abilities), seed)
         for name, mastered in outcomes.items()
     }
-    return _mean_ability(episodes, outcomes, seed), each
+    return _mean_ability(episodes, outcomes, seed), rates
 
 
 def _mean_ability(
     episodes: Sequence[Episode], outcomes: Mapping[str, tuple[bool, ...]], seed: int
 ) -> Estimate:
     """Return the mean of the abilities' success rates, if all five were driven."""
-    # the mean needs all five abilities
+    # The mean needs all five abilities
     missing = [name for name in ABILITIES if not outcomes[name]]
     if missing:
         reason = f"no route for {', '.join(missing)} was driven"
@@ -229,8 +225,8 @@ def _mean_ability(
         np.divide(weights @ good, n, out=rates, where=n > 0)
         return np.asarray(100.0 * np.nanmean(rates, axis=1))
 
-    # resampled routes may test none of an ability: hence nanmean
-    value = fmean(100.0 * sum(each) / len(each) for each in outcomes.values())
+    # Resampled routes may test none of an ability: hence nanmean
+    value = fmean(100.0 * sum(won) / len(won) for won in outcomes.values())
     here, anew = intervals(mean_rate, _types(episodes), seed, value, PERCENT)
     return Estimate(Measure(value, "%"), *here, len(episodes), *anew)
 
@@ -270,25 +266,22 @@ def leaderboard_scores(
     episodes: Sequence[Episode], set_size: int = FULL_SET
 ) -> LeaderboardScores:
     """Score a set of records as the leaderboard and as Bench2Drive's tools do."""
-    given = [each.given for each in episodes if each.given is not None]
-    scored = [route_scores.route_score(each) for each in episodes]
+    given = [episode.given for episode in episodes if episode.given is not None]
+    scored = [route_scores.route_score(episode) for episode in episodes]
 
     def quotients(values: Sequence[float]) -> Quotients:
         if not values:
             return Quotients()
         return Quotients(sum(values) / set_size, fmean(values))
 
-    return LeaderboardScores(
-        set_size,
-        len(episodes),
-        {
-            "driving_score": quotients([each.composed_percent for each in given]),
-            "completion": quotients([each.completion_percent for each in given]),
-            "penalty": quotients([each.penalty for each in given]),
-        },
-        {
-            "driving_score": quotients([each.composed for each in scored]),
-            "penalty": quotients([each.penalty for each in scored]),
-            "success_rate": quotients([100.0 * success(each) for each in episodes]),
-        },
-    )
+    reported = {
+        "driving_score": quotients([report.composed_percent for report in given]),
+        "completion": quotients([report.completion_percent for report in given]),
+        "penalty": quotients([report.penalty for report in given]),
+    }
+    computed = {
+        "driving_score": quotients([result.composed for result in scored]),
+        "penalty": quotients([result.penalty for result in scored]),
+        "success_rate": quotients([100.0 * success(episode) for episode in episodes]),
+    }
+    return LeaderboardScores(set_size, len(episodes), reported, computed)
