@@ -1,4 +1,4 @@
-"""An ego that turns left, for tests of what models are fed with."""
+"""An ego that turns left, for tests of the inputs of models."""
 
 import math
 
@@ -53,5 +53,4 @@ def observed(axes: Axes = Axes.FORWARD_LEFT) -> Observed:
 
 def value(text: str, axes: Axes = Axes.FORWARD_LEFT) -> npt.NDArray[np.float64]:
     """Return what a source gives there, by its text."""
-    found = INPUT_SOURCES.parse(text).value(observed(axes))
-    return np.asarray(found, np.float64)
+    return np.asarray(INPUT_SOURCES.parse(text).value(observed(axes)), np.float64)

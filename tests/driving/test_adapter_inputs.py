@@ -1,4 +1,4 @@
-"""An adapter's inputs, held against a graph's."""
+"""An adapter's inputs compared with a graph's."""
 
 from pathlib import Path
 from typing import Any
@@ -41,11 +41,11 @@ def test_parts_stand_one_after_the_other(tmp_path: Path) -> None:
     """TCP's state: speed over 12 m/s, target point, one-hot command."""
     inputs = inputs_of(tmp_path, "float[1, 9] state", STATE)
 
-    found = inputs.feeds(observation(NOW))
+    result = inputs.feeds(observation(NOW))
 
     state = [[0.5, 20.0, -5.0, 0, 0, 0, 1, 0, 0]]
-    assert found["state"].dtype == np.float32
-    np.testing.assert_allclose(found["state"].astype(float), np.array(state))
+    assert result["state"].dtype == np.float32
+    np.testing.assert_allclose(result["state"].astype(float), np.array(state))
 
 
 def test_one_source_keeps_its_shape_and_a_list_of_one_is_flat(tmp_path: Path) -> None:
@@ -58,10 +58,10 @@ def test_one_source_keeps_its_shape_and_a_list_of_one_is_flat(tmp_path: Path) ->
     """
     inputs = inputs_of(tmp_path, "double[1, 3, 2] way, float16[6] flat", text)
 
-    found = inputs.feeds(observation(NOW))
+    result = inputs.feeds(observation(NOW))
 
-    assert found["way"].shape == (1, 3, 2)
-    np.testing.assert_allclose(found["flat"].astype(float), np.tile([-0.5, 0], 3))
+    assert result["way"].shape == (1, 3, 2)
+    np.testing.assert_allclose(result["flat"].astype(float), np.tile([-0.5, 0], 3))
 
 
 def test_cameras_come_one_by_one_and_are_rendered_in_the_largest_size(
@@ -85,13 +85,13 @@ def test_cameras_come_one_by_one_and_are_rendered_in_the_largest_size(
     inputs = inputs_of(tmp_path, f"{ports}, float[1, 3, 3] k", text)
     pictures = np.full((6, 90, 160, 3), 7, np.uint8)
 
-    found = inputs.feeds(observation(NOW, images=pictures))
+    result = inputs.feeds(observation(NOW, images=pictures))
 
     assert inputs.image_size == (90, 160)
-    assert found["behind"].dtype == np.uint8
-    assert (found["behind"] == 7).all()
+    assert result["behind"].dtype == np.uint8
+    assert (result["behind"] == 7).all()
     expected = RIG.intrinsics[3] * [[0.5], [0.5], [1.0]]
-    np.testing.assert_allclose(found["k"][0], expected, rtol=1e-4)
+    np.testing.assert_allclose(result["k"][0], expected, rtol=1e-4)
 
 
 UNIAD = """
@@ -119,8 +119,12 @@ def test_uniads_own_inputs(tmp_path: Path) -> None:
 
     assert second["timestamp"] == pytest.approx([0.05])
     assert first["l2g_r_mat"].shape == (1, 3, 3)
-    assert [int(each["use_prev_bev"][0]) for each in (first, second)] == [0, 1]
+    assert [int(feeds["use_prev_bev"][0]) for feeds in (first, second)] == [0, 1]
     assert inputs.feeds(observation(NOW))["use_prev_bev"] == [0]
+
+
+SPEED, COMMAND = "[feeds.v]\nsource = 'speed'", "[feeds.v]\nsource = 'command'"
+PICTURE = "float[1, 3, 8, 8] v"
 
 
 @pytest.mark.parametrize(
@@ -132,32 +136,16 @@ def test_uniads_own_inputs(tmp_path: Path) -> None:
         ("float[1] v", "[images.w]", "the adapter names input w; there are v"),
         ("float[1, 2] v", "[feeds.v]\nsource = 'speed'", r"input v has shape \[1, 2\]"),
         ("float[1, 8] state", STATE, r"must be \[1, 9\]: it is speed 1, target-point"),
-        (
-            "float[1, 4] v",
-            "[feeds.v]\nsource = 'command'\none_hot = 6",
-            r"input v has shape \[1, 4\], it must be \[1, 6\]",
-        ),
-        ("int64[1] v", "[feeds.v]\nsource = 'speed'", r"input v is tensor\(int64\), a"),
-        (
-            "float[1] v",
-            "[feeds.v]\nsource = 'speed'\nmean = [1, 2]",
-            "input v: speed: mean and std make",
-        ),
+        ("float[1, 4] v", f"{COMMAND}\none_hot = 6", r"\[1, 4\], it must be \[1, 6\]"),
+        ("int64[1] v", SPEED, r"input v is tensor\(int64\), a"),
+        ("float[1] v", f"{SPEED}\nmean = [1, 2]", "input v: speed: mean and std make"),
         (
             "float[1, 6, 4, 4] v",
             "[feeds.v]\nsource = 'lidar2img'\nimages = 'wide'",
             "input v: images = 'wide' names no image input",
         ),
-        (
-            "float[1, 3, 8, 8] v",
-            "[images.v]\n[feeds.v]\nsource = 'speed'",
-            "feeds input v in two ways",
-        ),
-        (
-            "float[1, 3, 8, 8] v",
-            "[images.v]\ncameras = ['FRONT']",
-            "image normalisation unknown",
-        ),
+        (PICTURE, f"[images.v]\n{SPEED}", "feeds input v in two ways"),
+        (PICTURE, "[images.v]\ncameras = ['FRONT']", "image normalisation unknown"),
     ],
 )
 def test_what_does_not_fit_the_graph_is_one_line(
@@ -171,10 +159,7 @@ def test_what_does_not_fit_the_graph_is_one_line(
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        (
-            "[feeds.v]\nsource = 'velocities'",
-            "parts.0: no input source 'velocities'",
-        ),
+        ("[feeds.v]\nsource = 'speeds'", "parts.0: no input source 'speeds'"),
         ("[feeds.v]\nspeed = 1", "feeds.v.parts.0: no source is named; there are s"),
         ("[feeds.v]\nsource = 'speed'\nunit = 'm'", "speed has no option 'unit'"),
         ("[feeds.v]\nsource = 'speed'\nstd = 0", "speed: std is zero"),
@@ -257,12 +242,10 @@ def test_recorded_scenes_begin_so_too(tmp_path: Path) -> None:
 
     folder = record_frames(model, tmp_path / "frames", options)
 
-    found = [frame.arrays for frame in CalibrationSet(folder)]
-    assert [sorted(each) for each in found] == [
-        ["prev_time", "timestamp"],
-        ["timestamp"],
-    ] * 2
-    assert found[2]["prev_time"] == found[2]["timestamp"]
+    result = [frame.arrays for frame in CalibrationSet(folder)]
+    names = [sorted(arrays) for arrays in result]
+    assert names == [["prev_time", "timestamp"], ["timestamp"]] * 2
+    assert result[2]["prev_time"] == result[2]["timestamp"]
 
 
 @pytest.mark.parametrize(

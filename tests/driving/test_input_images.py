@@ -33,6 +33,7 @@ TCP = {
     "stitch": True,
     "size": [256, 900],
 }
+TWO, SMALL = {"cameras": ["FRONT", "BACK"]}, {"camera_size": [9, 16]}
 
 
 def images_of(
@@ -60,22 +61,15 @@ chosen = st.lists(st.sampled_from(CAMERA_NAMES), min_size=1, max_size=6)
 def test_a_crop_that_is_not_resized_keeps_every_pixel(
     cameras: list[str], left: int, width: int, top: int, height: int
 ) -> None:
-    made = images_of(
-        {
-            "cameras": cameras,
-            "camera_size": [ROWS, COLUMNS],
-            "crop": [[left, top, left + width, top + height]],
-            "layout": "bnhwc",
-        },
-        (1, len(cameras), height, width, 3),
-    )
+    crop = {"crop": [[left, top, left + width, top + height]], "layout": "bnhwc"}
+    table = {"cameras": cameras, "camera_size": [ROWS, COLUMNS], **crop}
 
-    found = made.apply(IMAGES)
+    result = images_of(table, (1, len(cameras), height, width, 3)).apply(IMAGES)
 
     for at, name in enumerate(cameras):
         whole = IMAGES[CAMERA_NAMES.index(name)]
         expected = whole[top : top + height, left : left + width]
-        np.testing.assert_array_equal(found[0, at], expected)
+        np.testing.assert_array_equal(result[0, at], expected)
 
 
 @given(cameras=chosen, lefts=st.lists(st.integers(0, 15), min_size=6, max_size=6))
@@ -87,10 +81,10 @@ def test_a_strip_that_is_not_resized_keeps_every_pixel(
     table = {"cameras": cameras, "crop": crops, "stitch": True, "layout": "hwc"}
     made = images_of({**table, "camera_size": [ROWS, COLUMNS]}, (10, width, 3))
 
-    found, begin = made.apply(IMAGES), 0
+    result, begin = made.apply(IMAGES), 0
 
     for name, (left, _, right, _) in zip(cameras, crops, strict=True):
-        part = found[:, begin : begin + right - left]
+        part = result[:, begin : begin + right - left]
         whole = IMAGES[CAMERA_NAMES.index(name)]
         np.testing.assert_array_equal(part, whole[2:12, left:right])
         begin += right - left
@@ -114,7 +108,7 @@ def test_a_point_projects_to_the_pixel_that_shows_it(
     lidar2img = CameraRig(ROWS, COLUMNS).lidar2img
     point = np.array([7.0, 3.0, 1.0, 1.0])
 
-    found = images_of(table, shape).projections(lidar2img) @ point
+    result = images_of(table, shape).projections(lidar2img) @ point
 
     left, top, right, bottom = (4, 2, 28, 16) if crop else (0, 0, COLUMNS, ROWS)
     joined = len(cameras) if stitch else 1
@@ -123,7 +117,7 @@ def test_a_point_projects_to_the_pixel_that_shows_it(
         before = at * (right - left) if stitch else 0
         across = (u / depth - left + before) * size[1] / ((right - left) * joined)
         down = (v / depth - top) * size[0] / (bottom - top)
-        assert found[at, :2] / found[at, 2] == pytest.approx((across, down), rel=1e-3)
+        assert result[at, :2] / result[at, 2] == pytest.approx((across, down), rel=1e-3)
 
 
 @pytest.mark.parametrize(
@@ -138,44 +132,44 @@ def test_a_point_projects_to_the_pixel_that_shows_it(
 def test_dimensions_stand_as_the_layout_says(
     layout: str, shape: tuple[int, ...]
 ) -> None:
-    found = images_of({"layout": layout}, shape, NORM).apply(IMAGES)
+    result = images_of({"layout": layout}, shape, NORM).apply(IMAGES)
 
-    assert found.shape == shape
+    assert result.shape == shape
     index = {"b": 0, "n": 4, "c": 2, "h": 5, "w": 7}
-    pixel = found[tuple(index[letter] for letter in layout)]
+    pixel = result[tuple(index[letter] for letter in layout)]
     assert pixel == pytest.approx((float(IMAGES[4, 5, 7, 2]) - 30) / 5)
 
 
 def test_bytes_stay_bytes_in_the_models_order() -> None:
     table = {"cameras": ["BACK"], "order": "bgr", "layout": "hwc"}
 
-    found = images_of(table, (ROWS, COLUMNS, 3)).apply(IMAGES)
+    result = images_of(table, (ROWS, COLUMNS, 3)).apply(IMAGES)
 
-    assert found.dtype == np.uint8
-    np.testing.assert_array_equal(found, IMAGES[3][..., ::-1])
+    assert result.dtype == np.uint8
+    np.testing.assert_array_equal(result, IMAGES[3][..., ::-1])
 
 
 def test_mean_and_std_of_zero_to_one_are_those_of_grey_levels() -> None:
     part = {"mean": [0.485, 0.456, 0.406], "std": [0.229, 0.224, 0.225]}
     table = ImageInput.model_validate({**part, "scale": 1 / 255})
-    grey = {key: tuple(255 * each for each in found) for key, found in part.items()}
+    grey = {key: tuple(255 * value for value in result) for key, result in part.items()}
 
-    found = table.normalization("img", None)
+    result = table.normalization("img", None)
 
-    assert found is not None
+    assert result is not None
     expected = ImageNormalization(**grey, order="rgb").apply(IMAGES)  # type: ignore[arg-type]
-    np.testing.assert_allclose(found.apply(IMAGES), expected, rtol=1e-5, atol=1e-5)
+    np.testing.assert_allclose(result.apply(IMAGES), expected, rtol=1e-5, atol=1e-5)
 
 
 def test_what_is_padded_is_zero_below_and_to_the_right() -> None:
     table = {"size": [ROWS, COLUMNS]}
 
-    found = images_of(table, (1, 6, 3, 20, 40), NORM).apply(IMAGES)
+    result = images_of(table, (1, 6, 3, 20, 40), NORM).apply(IMAGES)
 
-    assert found.shape == (1, 6, 3, 20, 40)
-    assert not found[..., ROWS:, :].any()
-    assert not found[..., COLUMNS:].any()
-    np.testing.assert_array_equal(found[..., :ROWS, :COLUMNS], NORM.apply(IMAGES))
+    assert result.shape == (1, 6, 3, 20, 40)
+    assert not result[..., ROWS:, :].any()
+    assert not result[..., COLUMNS:].any()
+    np.testing.assert_array_equal(result[..., :ROWS, :COLUMNS], NORM.apply(IMAGES))
 
 
 def test_tcps_strip_has_its_seams_where_the_published_one_has() -> None:
@@ -186,10 +180,10 @@ def test_tcps_strip_has_its_seams_where_the_published_one_has() -> None:
     images[:3] = grey[:, None, None, None]
 
     made = images_of({**TCP, "layout": "bhwc"}, (1, 256, 900, 3))
-    found = made.apply(images)
+    result = made.apply(images)
 
     assert made.rendered == (288, 512)
-    shades = found[0, 128, (0, 313, 316, 583, 586, 899), 0]
+    shades = result[0, 128, (0, 313, 316, 583, 586, 899), 0]
     assert shades.tolist() == [80, 80, 40, 40, 120, 120]
 
 
@@ -201,14 +195,8 @@ def test_tcps_strip_has_its_seams_where_the_published_one_has() -> None:
         ({"layout": "chv"}, "layout 'chv' must be the letters c, h and w"),
         ({"layout": "nhw"}, "layout 'nhw'"),
         ({"crop": [[0, 0, 5, 5]]}, "crop needs the camera_size"),
-        (
-            {"camera_size": [9, 16], "crop": [[0, 0, 17, 9]]},
-            "does not lie in 9 rows of 16 columns",
-        ),
-        (
-            {"camera_size": [9, 16], "crop": [[0, 0, 5, 5], [0, 0, 5, 5]]},
-            "2 crops for 6 cameras",
-        ),
+        ({**SMALL, "crop": [[0, 0, 17, 9]]}, "does not lie in 9 rows of 16 columns"),
+        ({**SMALL, "crop": [[0, 0, 5, 5], [0, 0, 5, 5]]}, "2 crops for 6 cameras"),
         ({"mean": [1, 2, 3]}, "mean and std belong together"),
         ({"mean": [1, 2, 3], "std": [1, 0, 1]}, "std is zero"),
     ],
@@ -228,24 +216,13 @@ def test_a_wrong_table_is_refused(table: dict[str, Any], words: str) -> None:
         ({"size": [9, 8]}, (1, 6, 3, 8, 8), "a size of 9 x 8 does not fit"),
         ({"stitch": True}, (1, 3, 8, 8), "camera_size must say"),
         (
-            {
-                "cameras": ["FRONT", "BACK"],
-                "stitch": True,
-                "camera_size": [900, 1600],
-                "rendered": [288, 512],
-                "crop": [[0, 0, 100, 299], [0, 2, 100, 301]],
-            },
-            (1, 3, 8, 8),
+            {**TCP, **TWO, "crop": [[0, 0, 100, 299], [0, 2, 100, 301]]},
+            (1, 3, 256, 900),
             "rendered in 288 x 512, the crops that are stitched have 95 and 96 rows",
         ),
         (
-            {
-                "cameras": ["FRONT"],
-                "camera_size": [900, 1600],
-                "rendered": [9, 16],
-                "crop": [[0, 0, 1, 900]],
-            },
-            (1, 3, 8, 8),
+            {**TCP, **TWO, "rendered": [9, 16], "crop": [[0, 0, 1, 900]]},
+            (1, 3, 256, 900),
             "rendered in 9 x 16, a crop has no pixel",
         ),
     ],
@@ -352,16 +329,10 @@ def test_intrinsics_are_those_of_the_rig_in_any_axes(axes: Axes) -> None:
     [
         ("command{one_hot=4}", r"numbers \[0, 1, 2, 3, 4, 5\] do not fit one_hot = 4"),
         ("command{one_hot=1000000000}", "one_hot = 1000000000 classes, of 1000 at"),
-        (
-            "past{steps=1000000000}",
-            "past: steps: Input should be less than",
-        ),
+        ("past{steps=1000000000}", "past: steps: Input should be less than"),
         ("past{steps=0}", "past: steps: Input should be greater than"),
         ("constant{values=[1], shape=[2]}", r"1 values have no shape \[2\]"),
-        (
-            "constant{values=[1, 2], shape=[-1, -2]}",
-            r"shape\.0: Input should be",
-        ),
+        ("constant{values=[1, 2], shape=[-1, -2]}", r"shape\.0: Input should be"),
         ("constant{values=[1e300]}", r"values\.0: Input should be less than or equal"),
         ("velocities", "no input source 'velocities'; there are speed, velocity"),
         ("target-point:middle", "target-point: which: Input should be 'near' or 'far'"),

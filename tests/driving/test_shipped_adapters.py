@@ -67,9 +67,9 @@ def test_tcps_waypoints_are_turned_to_ours(tcp: Path) -> None:
     pictures = np.zeros((6, 288, 512, 3), np.uint8)
     policy.reset(EXIT)
     still = motion(0.0, 0.0, 0.0, speed=0.0)
-    found = checked(policy.plan(observation(still, images=pictures)))
-    assert isinstance(found, Trajectory)
-    assert found.times_s.tolist() == [0.5, 1.0, 1.5, 2.0]
+    result = checked(policy.plan(observation(still, images=pictures)))
+    assert isinstance(result, Trajectory)
+    assert result.times_s.tolist() == [0.5, 1.0, 1.5, 2.0]
 
 
 def test_vad_tiny_is_fed_as_nuscenes_feeds_it(tmp_path: Path) -> None:
@@ -128,7 +128,6 @@ def test_a_file_of_that_name_wins(
 def test_no_such_adapter_names_those_that_ship() -> None:
     with pytest.raises(EvaluationError, match="adapter tpc: no such file; we ship"):
         adapter_file(Path("tpc"))
-    with pytest.raises(
-        EvaluationError, match=r"tcp-fusion is gone .*models\.tcp\.policy"
-    ):
+    words = r"tcp-fusion is gone .*models\.tcp\.policy"
+    with pytest.raises(EvaluationError, match=words):
         adapter_file(Path("tcp-fusion"))
