@@ -50,7 +50,7 @@ class Lanes(Evaluator):
         lanes = [Lane(f"lane_{number}", number) for number in range(self.count)]
         if words.isdecimal():
             return lanes[: int(words)], len(lanes)
-        picked = [each for each in lanes if words in (each.id, "all")]
+        picked = [lane for lane in lanes if words in (lane.id, "all")]
         if not picked:
             raise EvaluationError(f"no lane {words}")
         return picked, len(lanes)
@@ -79,7 +79,7 @@ class Tape(Evaluator):
     """Reads how somebody drove, on routes that it alone knows.
 
     Attributes:
-        named: What each is called.
+        named: What they are called.
     """
 
     name: ClassVar[str] = "tape"

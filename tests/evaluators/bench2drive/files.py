@@ -98,12 +98,15 @@ def checkpoint(*records: Json) -> Json:
 
 
 def merged(*records: Json) -> Json:
-    bare = [{key: each[key] for key in each if key != "index"} for each in records]
-    scores = [each["scores"]["score_composed"] for each in records]
+    bare = [
+        {key: record[key] for key in record if key != "index"} for record in records
+    ]
+    scores = [record["scores"]["score_composed"] for record in records]
+    completed = [record for record in records if record["status"] == "Completed"]
     return {
         "_checkpoint": {"records": bare},
         "driving score": sum(scores) / 220,
-        "success rate": sum(each["status"] == "Completed" for each in records) / 220,
+        "success rate": len(completed) / 220,
         "eval num": len(records),
     }
 
@@ -118,7 +121,7 @@ def recording(
 ) -> Json:
     """A steady turn to the right in CARLA's world, recorded at a rate."""
     rate = math.radians(yaw_degps)
-    found: Json = {}
+    result: Json = {}
     for index in range(steps):
         yaw = rate * interval_s * index
         ahead = [math.cos(yaw), math.sin(yaw), 0.0]
@@ -130,15 +133,15 @@ def recording(
             if rate
             else [along, 0.0, 0.3]
         )
-        found[str(first + every * index)] = {
-            "acceleration": [speed_mps * rate * each for each in aside],
+        result[str(first + every * index)] = {
+            "acceleration": [speed_mps * rate * share for share in aside],
             "angular_velocity": [0.0, 0.0, yaw_degps],
             "forward_vector": ahead,
             "right_vector": aside,
             "location": place,
             "rotation": [0.0, 0.0, math.degrees(yaw)],
         }
-    return found
+    return result
 
 
 def write(path: Path, document: object) -> Path:

@@ -31,8 +31,8 @@ OTHER = record(2082, "Accident", score=(60.0, 1.0, 60.0), status="Failed - TickR
 CRASHED = record(2084, status="Failed - Simulation crashed", score=(0, 1.0, 0))
 
 
-def routes(found: CollectedResults) -> list[str]:
-    return [each.route.split("_")[1] for each in found.episodes]
+def routes(result: CollectedResults) -> list[str]:
+    return [episode.route.split("_")[1] for episode in result.episodes]
 
 
 def test_results_files_have_any_name(tmp_path: Path) -> None:
@@ -41,13 +41,13 @@ def test_results_files_have_any_name(tmp_path: Path) -> None:
     write(tmp_path / "meta" / "0001.json", {"speed": 3.0})
     (tmp_path / "log.txt").write_text("Traceback (most recent call last):")
 
-    found = collect(tmp_path)
+    result = collect(tmp_path)
 
-    assert routes(found) == ["1711", "2082", "2084"]
-    assert found.route_set == "0.0.3"
-    assert found.crashed == ["RouteScenario_2084_rep0"]
-    assert len(found.missing) == 217
-    assert found.missing[0] == "1773"
+    assert routes(result) == ["1711", "2082", "2084"]
+    assert result.route_set == "0.0.3"
+    assert result.crashed == ["RouteScenario_2084_rep0"]
+    assert len(result.missing) == 217
+    assert result.missing[0] == "1773"
 
 
 def test_a_file_in_utf_16_is_named(tmp_path: Path) -> None:
@@ -100,24 +100,22 @@ def test_the_same_result_once_more_counts_once(tmp_path: Path) -> None:
     write(tmp_path / "2.json", checkpoint(again))
     write(tmp_path / "all.json", merged(GOOD, OTHER))
 
-    found = collect(tmp_path)
+    result = collect(tmp_path)
 
-    assert routes(found) == ["1711", "2082"]
-    assert len(found.repeated) == 2
-    assert found.contradictory == []
+    assert routes(result) == ["1711", "2082"]
+    assert len(result.repeated) == 2
+    assert result.contradictory == []
 
 
 def test_the_worst_of_contradictory_drives_counts(tmp_path: Path) -> None:
-    rammed = record(
-        score=(100, 0.6, 60.0), collisions_vehicle=[RAMMED], duration_s=19.0
-    )
+    rammed = record(score=(100, 0.6, 60.0), collisions_vehicle=[RAMMED], duration_s=19)
     write(tmp_path / "first.json", checkpoint(GOOD))
     write(tmp_path / "second.json", checkpoint(rammed))
 
-    found = collect(tmp_path)
+    result = collect(tmp_path)
 
-    assert found.contradictory == ["RouteScenario_1711_rep0"]
-    (episode,) = found.episodes
+    assert result.contradictory == ["RouteScenario_1711_rep0"]
+    (episode,) = result.episodes
     assert episode.given is not None
     assert episode.given.composed_percent == 60.0
 
@@ -127,30 +125,30 @@ def test_a_crash_gives_way_to_the_drive_that_followed(tmp_path: Path) -> None:
     write(tmp_path / "first.json", checkpoint(crashed))
     write(tmp_path / "second.json", checkpoint(GOOD))
 
-    found = collect(tmp_path)
+    result = collect(tmp_path)
 
-    assert found.rerun == ["RouteScenario_1711_rep0"]
-    assert (found.contradictory, found.crashed) == ([], [])
-    assert found.episodes[0].succeeded
+    assert result.rerun == ["RouteScenario_1711_rep0"]
+    assert (result.contradictory, result.crashed) == ([], [])
+    assert result.episodes[0].succeeded
 
 
 def test_crashes_with_different_results_are_a_contradiction(tmp_path: Path) -> None:
     further = {**CRASHED["scores"], "score_route": 30.0, "score_composed": 30.0}
     write(tmp_path / "r.json", checkpoint({**CRASHED, "scores": further}, CRASHED))
 
-    found = collect(tmp_path)
+    result = collect(tmp_path)
 
-    assert found.contradictory == ["RouteScenario_2084_rep0"]
-    assert found.episodes[0].completion_percent == 0.0
+    assert result.contradictory == ["RouteScenario_2084_rep0"]
+    assert result.episodes[0].completion_percent == 0.0
 
 
 def test_repetitions_are_other_drives(tmp_path: Path) -> None:
     write(tmp_path / "r.json", checkpoint(GOOD, record(rep=1)))
 
-    found = collect(tmp_path)
+    result = collect(tmp_path)
 
-    assert len(found.episodes) == found.repetitions == 2
-    assert found.repeated == found.contradictory == []
+    assert len(result.episodes) == result.repetitions == 2
+    assert result.repeated == result.contradictory == []
 
 
 def test_sets_are_told_apart(tmp_path: Path) -> None:
@@ -169,20 +167,19 @@ def test_what_is_broken_is_named_and_the_rest_read(tmp_path: Path) -> None:
     (tmp_path / "half.json").write_text(half[: len(half) // 2])
     begun = {"route_id": "RouteScenario_2091_rep0", "status": "Started"}
     score: Json = {"score_route": 0, "score_penalty": 0, "score_composed": float("nan")}
-    write(
-        tmp_path / "r.json", checkpoint(GOOD, begun, {**record(2115), "scores": score})
-    )
+    scored = {**record(2115), "scores": score}
+    write(tmp_path / "r.json", checkpoint(GOOD, begun, scored))
     write(tmp_path / "killed.json", checkpoint())
 
-    found = collect(tmp_path)
+    result = collect(tmp_path)
 
-    assert routes(found) == ["1711"]
-    reasons = list(found.broken.values())
+    assert routes(result) == ["1711"]
+    reasons = list(result.broken.values())
     assert reasons[0].startswith("not JSON: ")
     assert reasons[1] == "infractions: Field required"
     assert reasons[2].startswith("scores.score_composed: Input should be")
-    assert list(found.broken)[1] == f"{tmp_path / 'r.json'}, record 1"
-    assert found.unfinished == [tmp_path / "killed.json"]
+    assert list(result.broken)[1] == f"{tmp_path / 'r.json'}, record 1"
+    assert result.unfinished == [tmp_path / "killed.json"]
 
 
 @pytest.mark.parametrize(
@@ -223,19 +220,19 @@ FILES = {
 def test_whatever_became_of_a_file(
     tmp_path: Path, name: str, share: float, change: str
 ) -> None:
-    for each, text in FILES.items():
+    for file, text in FILES.items():
         at = int(share * len(text))
-        if each == name:
+        if file == name:
             text = text[:at] + ("" if change == "cut" else change + text[at + 1 :])
-        path = tmp_path / each
+        path = tmp_path / file
         path.parent.mkdir(exist_ok=True)
         path.write_text(text)
 
     try:
-        found = collect(tmp_path)
+        result = collect(tmp_path)
     except EvaluationError:
         return
-    assert len(found.episodes) <= 2
+    assert len(result.episodes) <= 2
 
 
 # Which recordings and logs of decisions lie beside results, and of which drive.
@@ -256,10 +253,10 @@ def test_recordings_are_found_by_the_name_of_the_drive(
     write(tmp_path / "r.json", checkpoint(GOOD))
     write(tmp_path / where, recording(40))
 
-    found = collect(tmp_path)
+    result = collect(tmp_path)
 
-    assert len(found.episodes[0].frames) == 40
-    assert found.unrecorded == []
+    assert len(result.episodes[0].frames) == 40
+    assert result.unrecorded == []
 
 
 NAME = str(GOOD["save_name"])
@@ -292,11 +289,11 @@ def test_which_of_the_recordings_is_taken_and_what_is_said_of_it(
     write(tmp_path / "r.json", checkpoint(GOOD))
     files = [write(tmp_path / name, steps) for name, steps in beside.items()]
 
-    found = collect(tmp_path)
+    result = collect(tmp_path)
 
-    assert len(found.episodes[0].frames) == frames
-    assert bool(found.unrecorded) == (frames == 0)
-    assert found.notes == [f"{files[named]}: {note}"]
+    assert len(result.episodes[0].frames) == frames
+    assert bool(result.unrecorded) == (frames == 0)
+    assert result.notes == [f"{files[named]}: {note}"]
 
 
 @pytest.mark.parametrize(
@@ -308,10 +305,10 @@ def test_a_metric_info_that_is_no_recording_is_named(
     write(tmp_path / "r.json", checkpoint(GOOD))
     file = write(tmp_path / GOOD["save_name"] / "metric_info.json", content)
 
-    found = collect(tmp_path)
+    result = collect(tmp_path)
 
-    assert list(found.broken) == [str(file)]
-    assert found.episodes[0].frames == ()
+    assert list(result.broken) == [str(file)]
+    assert result.episodes[0].frames == ()
 
 
 def test_decisions_may_be_noted_in_another_folder(tmp_path: Path) -> None:
@@ -351,6 +348,6 @@ def test_recordings_in_both_folders_are_one_and_may_lie_apart(tmp_path: Path) ->
     write(saved / NAME / "metric_info.json", recording(25, 0.5, every=10))
 
     for place in (saved, results):
-        found = Bench2DriveResults(place, saved).collect()
-        assert len(found.episodes[0].frames) == 25
-        assert found.off_rate == {"RouteScenario_1711_rep0": 0.5}
+        result = Bench2DriveResults(place, saved).collect()
+        assert len(result.episodes[0].frames) == 25
+        assert result.off_rate == {"RouteScenario_1711_rep0": 0.5}

@@ -11,18 +11,13 @@ RIG = CameraRig(16, 24)
 
 def observation(seed: int = 0, command: int = 2) -> Observation:
     rng = np.random.default_rng(seed)
-    return Observation(
-        0,
-        rng.integers(0, 256, (6, 16, 24, 3)).astype(np.uint8),
-        RIG.lidar2img,
-        rng.normal(size=18).astype(np.float32),
-        command,
-        3.0,
-    )
+    images = rng.integers(0, 256, (6, 16, 24, 3)).astype(np.uint8)
+    can_bus = rng.normal(size=18).astype(np.float32)
+    return Observation(0, images, RIG.lidar2img, can_bus, command, 3.0)
 
 
 def planned(policy: Policy, seen: Observation) -> npt.NDArray[np.floating]:
     """Ask a policy that answers waypoints."""
-    found = checked(policy.plan(seen))
-    assert isinstance(found, Trajectory)
-    return found.points
+    result = checked(policy.plan(seen))
+    assert isinstance(result, Trajectory)
+    return result.points

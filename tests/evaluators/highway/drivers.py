@@ -5,7 +5,7 @@ import signal
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import ClassVar
+from typing import Any, ClassVar, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -38,15 +38,15 @@ class Misbehaving:
     privileged: bool = True
 
     def reset(self, route: RouteInfo) -> None:
-        self.asked, self.blind = 0, Blind()
+        self.decisions, self.blind = 0, Blind()
         self.blind.reset(route)
         if self.way == "no-reset":
             raise RuntimeError("will not start")
 
     def plan(self, observation: Observation) -> Answer:
-        self.asked += 1
+        self.decisions += 1
         plan = self.blind.plan(observation)
-        return plan if self.asked < 20 else self.misbehave(plan)
+        return plan if self.decisions < 20 else self.misbehave(plan)
 
     def misbehave(self, plan: npt.NDArray[np.floating]) -> Answer:
         if self.way == "raise":
@@ -57,15 +57,15 @@ class Misbehaving:
             os._exit(7)
         if self.way == "killed":
             os.kill(os.getpid(), signal.SIGKILL)
-        if self.way == "not-finite":
-            return np.where(np.arange(12).reshape(6, 2) == 5, np.nan, plan)
-        if self.way == "steers-too-far":
-            return PedalsAndWheel(0.5, 1.3, 0.0)
-        if self.way == "no-pedal":
-            return PedalsAndWheel(float("nan"), 0.0, 0.0)
-        return {"shape": plan[:5], "integers": plan.astype(int), "list": [1, 2]}[
-            self.way
-        ]  # type: ignore[return-value]
+        answers: dict[str, Any] = {
+            "not-finite": np.where(np.arange(12).reshape(6, 2) == 5, np.nan, plan),
+            "steers-too-far": PedalsAndWheel(0.5, 1.3, 0.0),
+            "no-pedal": PedalsAndWheel(float("nan"), 0.0, 0.0),
+            "shape": plan[:5],
+            "integers": plan.astype(int),
+            "list": [1, 2],
+        }
+        return cast("Answer", answers[self.way])
 
 
 @dataclass(frozen=True)

@@ -35,4 +35,4 @@ def driven(
 
 def made_by(routes: Sequence[Route] = ROUTES, drive: Drive = TRACED) -> dict[str, Any]:
     asked = replace(drive, routes=routes, set_size=220)
-    return Highway().made_by(BLIND, asked) | {"routes": [each.id for each in routes]}
+    return Highway().made_by(BLIND, asked) | {"routes": [route.id for route in routes]}

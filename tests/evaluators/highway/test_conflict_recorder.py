@@ -18,7 +18,7 @@ from me2e_compress.evaluators.highway.episode_recorder import (
     EpisodeRecorder,
     junction_m,
 )
-from me2e_compress.metrics.episode import ConflictRecord, Contact, Ending, Infraction
+from me2e_compress.metrics.episode import ConflictRecord, Contact, Ending
 from me2e_compress.simulator.plane_geometry import (
     Command,
     Lane,
@@ -54,15 +54,11 @@ def recorded(*frames: tuple[Ego, tuple[Actor, ...]]) -> ConflictRecord:
 
 def crossing(late_s: float) -> ConflictRecord:
     """Drive on at 8 m/s along x = 0; an actor of 4.6 m crosses at 5 m/s, from below."""
-    return recorded(
-        *(
-            (
-                ego_at(8.0 * t - 24.0),
-                (actor(0.0, 5.0 * (t - late_s) - 15.0, 5.0, LEFT),),
-            )
-            for t in np.arange(8 * FRAMES_A_SECOND) / FRAMES_A_SECOND
-        )
-    )
+    frames = []
+    for t in np.arange(8 * FRAMES_A_SECOND) / FRAMES_A_SECOND:
+        other = actor(0.0, 5.0 * (t - late_s) - 15.0, 5.0, LEFT)
+        frames.append((ego_at(8.0 * t - 24.0), (other,)))
+    return recorded(*frames)
 
 
 @pytest.mark.parametrize(
@@ -78,24 +74,24 @@ def crossing(late_s: float) -> ConflictRecord:
 def test_how_near_others_are_and_when_they_are_met(
     ego: Ego, others: tuple[Actor, ...], nearest_m: float | None, ttc_s: float | None
 ) -> None:
-    found = recorded((ego, others))
+    result = recorded((ego, others))
 
-    (nearest,) = found.nearest_m
+    (nearest,) = result.nearest_m
     assert nearest == pytest.approx(nearest_m)
-    assert found.ttc_s == (ttc_s,)
+    assert result.ttc_s == (ttc_s,)
 
 
 @pytest.mark.parametrize(("late_s", "ego_first"), [(2.5, True), (-2.5, False)])
 def test_paths_that_cross_one_after_the_other(late_s: float, ego_first: bool) -> None:
-    (found,) = crossing(late_s).encounters
+    (result,) = crossing(late_s).encounters
 
     # The ego (5 m, 8 m/s) covers the actor's 1.95 m path for (5 + 1.95) / 8 s, the
     # actor (4.6 m, 5 m/s) the ego's 2 m path for (4.6 + 2) / 5 s; both are in its
     # middle after 3 s, the actor late. One corner of the area is left last.
     expected = 2.5 - (5.0 + 1.95) / 16.0 - (4.6 + 2.0) / 10.0
-    assert found.pet_s == pytest.approx(expected, abs=0.051)
-    assert found.ego_first is ego_first
-    assert found.angle_rad == pytest.approx(LEFT, abs=1e-3)
+    assert result.pet_s == pytest.approx(expected, abs=0.051)
+    assert result.ego_first is ego_first
+    assert result.angle_rad == pytest.approx(LEFT, abs=1e-3)
 
 
 def test_no_encounter_is_five_seconds_apart_or_with_who_stands() -> None:
@@ -134,31 +130,24 @@ def test_whose_fault_it_was(contact: Contact, y: float, fault: bool) -> None:
     assert at_fault(contact, ego_at(5.0, y), ROAD) is fault
 
 
-def collision(ego: Ego, other: Actor) -> Infraction:
-    event = Event(
-        *(50_000, EventKind.COLLISION, "the ego", ego.x, ego.y),
-        *(ego.speed_mps, other.id, other.kind),
-    )
+def test_a_collision_is_written_with_how_fast_and_whose_fault() -> None:
+    ego, other = ego_at(5.0), actor(9.0, speed=2.0)
+    what = (50_000, EventKind.COLLISION, "the ego", ego.x, ego.y)
+    scene = Scene(50_000, ego, (other,), ())
     world = SimpleNamespace(
         route=Route("r", "HighwayExit", 1),
         path=straight(),
         progress_m=10.0,
-        events=(event,),
+        events=(Event(*what, ego.speed_mps, other.id, other.kind),),
         roadmap=ROAD,
-        scene=lambda: Scene(50_000, ego, (other,), ()),
-        collided={50_000: Scene(50_000, ego, (other,), ())},
+        collided={50_000: scene},
     )
     recorder = EpisodeRecorder(cast(World, world))
-    recorder.record(world.scene())
-    (found,) = recorder.episode(Ending.COLLISION).infractions
-    return found
+    recorder.record(scene)
+    (result,) = recorder.episode(Ending.COLLISION).infractions
 
-
-def test_a_collision_is_written_with_how_fast_and_whose_fault() -> None:
-    found = collision(ego_at(5.0), actor(9.0, speed=2.0))
-
-    assert (found.contact, found.at_fault) == (Contact.FRONT, True)
-    assert found.ego_speed_mps == 8.0
+    assert (result.contact, result.at_fault) == (Contact.FRONT, True)
+    assert result.ego_speed_mps == 8.0
 
 
 # Boxes in the plane, by hand and against small steps of time.
@@ -195,9 +184,7 @@ def test_the_gap_between_two_outlines(other: np.ndarray, metres: float) -> None:
 def test_corners_of_a_turned_box() -> None:
     turned = corners(box(1.0, 2.0, math.pi / 2))
 
-    assert turned.tolist() == [
-        pytest.approx(point) for point in ([0, 4], [2, 4], [2, 0], [0, 0])
-    ]
+    assert turned == pytest.approx(np.array([[0, 4], [2, 4], [2, 0], [0, 0]]))
 
 
 @pytest.mark.parametrize(
@@ -292,15 +279,8 @@ def test_vehicles_within_50_m_moving_or_not_are_the_traffic(
 def test_a_junction_is_20_m_behind_the_first_turn_that_comes_before_the_goal(
     commands: str, goal_m: float, expected: float | None
 ) -> None:
-    names = {
-        "F": Command.FOLLOW,
-        "L": Command.LEFT,
-        "R": Command.RIGHT,
-        "S": Command.STRAIGHT,
-        "C": Command.CHANGE_LEFT,
-        "D": Command.CHANGE_RIGHT,
-    }
-    ahead = np.array([names[each] for each in commands], np.int64)
+    names = dict(zip("LRSFCD", Command, strict=True))
+    ahead = np.array([names[letter] for letter in commands], np.int64)
     path = SimpleNamespace(commands=ahead, goal_m=goal_m)
 
     assert junction_m(cast(RoutePath, path)) == expected

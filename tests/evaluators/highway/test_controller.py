@@ -1,6 +1,7 @@
 """The bicycle's circle, anchored plans, and tracking them with lag."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -42,8 +43,8 @@ def follow(
     *,
     every: int = 1,
     offset: float = 0.0,
-) -> tuple[TinyWorld, list[float]]:
-    """Drive the route's centre line at one speed; all lateral offsets."""
+) -> list[float]:
+    """Drive the route's centre line at one speed; return all lateral offsets."""
     world = TinyWorld(path, ego_at(5.0, offset, speed=speed))
     offsets, s = list[float](), 5.0
     plan = AnchoredPlan.of(np.zeros((6, 2)), world.ego, 0)
@@ -54,7 +55,7 @@ def follow(
             plan = AnchoredPlan.of(waypoints, world.ego, world.time_us)
         world.step(plan.control(world.ego, world.time_us))
         offsets.append(path.project(world.ego.x, world.ego.y, s)[1])
-    return world, offsets
+    return offsets
 
 
 @given(
@@ -70,9 +71,8 @@ def test_the_steering_through_a_point_reaches_it(
     dx, dy = x - place, y + place
     forward = math.cos(heading) * dx + math.sin(heading) * dy
     left = math.cos(heading) * dy - math.sin(heading) * dx
-    assert steering_through(forward, left, LENGTH_M) == pytest.approx(
-        steering, abs=2e-3
-    )
+    angle = steering_through(forward, left, LENGTH_M)
+    assert angle == pytest.approx(steering, abs=2e-3)
 
 
 @given(st.floats(0.1, 30.0), st.floats(-30.0, 30.0))
@@ -128,13 +128,13 @@ def test_a_heap_of_waypoints_is_a_stop() -> None:
 def test_it_stays_on_a_ring(radius: float, speed: float, every: int) -> None:
     turn = 1.4 if radius < 10 else 4.5
     seconds = (25.0 + turn * radius) / speed
-    _, offsets = follow(circle(radius, turn), speed, seconds, every=every)
+    offsets = follow(circle(radius, turn), speed, seconds, every=every)
     assert max(map(abs, offsets)) < 0.6
     assert abs(offsets[-1]) < 0.35
 
 
 def test_it_returns_to_the_line_without_swinging() -> None:
-    _, offsets = follow(straight(), 8.0, 6.0, offset=1.5)
+    offsets = follow(straight(), 8.0, 6.0, offset=1.5)
     assert abs(offsets[-1]) < 0.02
     assert min(offsets) > -0.15
 
@@ -146,10 +146,7 @@ def test_a_steady_acceleration_is_asked_for_exactly(rate: float) -> None:
     times, speed = 0.5 * np.arange(1, 7), 22.0
     travel = speed * times + rate * times**2 / 2
     waypoints = np.stack([travel, np.zeros(6)], axis=1)
-    ego = ego_at(speed=speed)
-    steady = type(ego)(
-        *(ego.x, ego.y, 0.0, speed, rate, 0.0, 0.0, 0.0), length=5.0, width=2.0
-    )
+    steady = replace(ego_at(speed=speed), acceleration_mps2=rate)
     control = AnchoredPlan.of(waypoints, steady, 0).control(steady, 0)
     assert control.acceleration_mps2 == pytest.approx(rate, abs=1e-6)
 
@@ -175,13 +172,8 @@ def test_the_same_way_in_other_waypoints_is_driven_the_same(
         bend = 40.0 * np.stack([np.sin(turned), 1 - np.cos(turned)], axis=1)
         return Trajectory(bend, times)
 
-    six, other = (
-        AnchoredPlan.of(plan, ego, 0).control(ego, 0)
-        for plan in (
-            planned(0.5 * np.arange(1, 7)),
-            planned(step_s * np.arange(1, count + 1)),
-        )
-    )
+    plans = planned(0.5 * np.arange(1, 7)), planned(step_s * np.arange(1, count + 1))
+    six, other = (AnchoredPlan.of(plan, ego, 0).control(ego, 0) for plan in plans)
     assert other.steering_rad == pytest.approx(six.steering_rad, abs=5e-3)
     assert other.acceleration_mps2 == pytest.approx(six.acceleration_mps2, abs=0.1)
 
@@ -192,19 +184,17 @@ def test_the_same_way_in_other_waypoints_is_driven_the_same(
 def test_pedals_span_what_the_ego_can_do(
     throttle: float, brake: float, mps2: float
 ) -> None:
-    found = control_of(PedalsAndWheel(throttle, 0.0, brake), LENGTH_M)
+    result = control_of(PedalsAndWheel(throttle, 0.0, brake), LENGTH_M)
 
-    assert found.acceleration_mps2 == pytest.approx(mps2)
-    assert found.steering_rad == 0.0
+    assert result.acceleration_mps2 == pytest.approx(mps2)
+    assert result.steering_rad == 0.0
 
 
 @pytest.mark.parametrize("steer", [-0.4, 0.05, 0.3])
 def test_a_steer_makes_the_same_circle(steer: float) -> None:
-    found = control_of(PedalsAndWheel(0.0, steer, 0.0), LENGTH_M)
+    angle = control_of(PedalsAndWheel(0.0, steer, 0.0), LENGTH_M).steering_rad
 
-    assert curvature_of(found.steering_rad, LENGTH_M) == pytest.approx(
-        -curvature_by(steer)
-    )
+    assert curvature_of(angle, LENGTH_M) == pytest.approx(-curvature_by(steer))
 
 
 def test_the_wheels_turn_no_further() -> None:

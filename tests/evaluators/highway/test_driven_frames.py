@@ -38,10 +38,7 @@ def seen(policy: OnnxPolicy, driver: OnnxPolicy) -> list[Frame]:
 
 def test_scenes_begin_with_their_clock_where_routes_do(seen: list[Frame]) -> None:
     assert [frame.index for frame in seen] == list(range(10))
-    assert [frame.starts_scene for frame in seen] == [
-        *([True, False, False, False] * 2),
-        *(True, False),
-    ]
+    assert [frame.index for frame in seen if frame.starts_scene] == [0, 4, 8]
     clock = [float(frame.arrays["timestamp"][0]) for frame in seen]
     assert clock == [0.0, 0.5, 1.0, 1.5, 0.0, 0.5, 1.0, 1.5, 0.0, 0.5]
 
@@ -92,10 +89,9 @@ def test_the_can_bus_counts_since_the_last_frame(seen: list[Frame]) -> None:
 def test_a_model_without_images_gets_none(driver: OnnxPolicy, tmp_path: Path) -> None:
     model = straight_on(tmp_path / "m.onnx", inputs="float[1, 18] can_bus")
 
-    (frame,) = driven_frames(OnnxPolicy.open(model), driver, 1, seed=0)
-    assert {name: array.shape for name, array in frame.arrays.items()} == {
-        "can_bus": (1, 18)
-    }
+    [frame] = driven_frames(OnnxPolicy.open(model), driver, 1, seed=0)
+    [(name, array)] = frame.arrays.items()
+    assert (name, array.shape) == ("can_bus", (1, 18))
 
 
 def test_a_scene_is_the_same_whatever_was_made_before(
@@ -137,20 +133,16 @@ def test_no_route_is_one_that_drivers_are_judged_on(
 
 
 @pytest.mark.parametrize(
-    ("count", "seed", "length", "words"),
+    ("numbers", "words"),
     [
-        (0, 0, 4, "0 frames in scenes of 4: both must be at least 1"),
-        (4, 0, 0, "4 frames in scenes of 0: both must be at least 1"),
-        (4, -1, 4, "seed -1: must be 0 or more"),
+        ((0, 0, 4), "0 frames in scenes of 4: both must be at least 1"),
+        ((4, 0, 0), "4 frames in scenes of 0: both must be at least 1"),
+        ((4, -1, 4), "seed -1: must be 0 or more"),
     ],
 )
 def test_bad_numbers(
-    policy: OnnxPolicy,
-    driver: OnnxPolicy,
-    count: int,
-    seed: int,
-    length: int,
-    words: str,
+    policy: OnnxPolicy, driver: OnnxPolicy, numbers: tuple[int, int, int], words: str
 ) -> None:
+    count, seed, length = numbers
     with pytest.raises(FramesError, match=words):
         next(driven_frames(policy, driver, count, seed=seed, scene_length=length))

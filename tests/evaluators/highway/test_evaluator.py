@@ -14,7 +14,6 @@ from me2e_compress.evaluators.highway.engine import LocalEngine
 from me2e_compress.evaluators.highway.evaluator import longest_first
 from me2e_compress.evaluators.results import ResultsFolder
 from me2e_compress.registry.drafts import is_marked
-from me2e_compress.simulator.routes import Route
 from me2e_compress.workflows.result import Listener
 from models.driver.expert.blind import BlindDriver
 from tests.evaluators.highway.drivers import CROSSING, EXIT, PARKED, ROUTES
@@ -42,10 +41,8 @@ def results(driven_once: tuple[Path, Path], tmp_path: Path) -> Path:
 
 def test_the_bytes_do_not_depend_on_the_number_of_workers(tmp_path: Path) -> None:
     routes = (PARKED, EXIT)  # the second takes longer, and begins first
-    one, two = (
-        driven(tmp_path / str(workers), routes, engine=LocalEngine(workers))
-        for workers in (1, 2)
-    )
+    one = driven(tmp_path / "1", routes, engine=LocalEngine(1))
+    two = driven(tmp_path / "2", routes, engine=LocalEngine(2))
 
     assert one == two
     assert [episode.route for episode in one] == ["parked", "exit"]
@@ -125,10 +122,7 @@ def test_a_file_that_is_corrupt_or_of_another_evaluation_is_driven_again(
         ({"drive": replace(TRACED, latency=FixedLatency(1))}, "latency"),
         ({"drive": replace(TRACED, frame_limit_s=5.0)}, "frame_limit_s"),
         ({"routes": (PARKED, EXIT)}, "routes"),
-        (
-            {"routes": (Route("crossing", "HighwayExit", 1), PARKED)},
-            "routes_sha256",
-        ),
+        ({"routes": (replace(CROSSING, scenario="HighwayExit"), PARKED)}, "routes_sha"),
     ],
 )
 def test_results_of_another_evaluation_are_not_mixed(

@@ -5,21 +5,16 @@ import pytest
 
 from me2e_compress.evaluators.highway.observe import APART_M, RouteNodes
 from me2e_compress.simulator.plane_geometry import RoutePath
-from me2e_compress.simulator.scene import (
-    Ego,
-)
+from me2e_compress.simulator.scene import Ego
 
 
 def path_of(commands: list[int]) -> RoutePath:
     """Straight to the north, a point every metre."""
     n = len(commands)
-    column, zero = np.ones(n), np.zeros(n)
-    points = np.stack([zero, np.arange(n, dtype=float)], axis=1)
-    numbers = np.array(commands)
-    heading = np.full(n, math.pi / 2)
-    return RoutePath(
-        points, heading, column, column, numbers, n - 1.0, column, column, column
-    )
+    column, heading = np.ones(n), np.full(n, math.pi / 2)
+    points = np.stack([np.zeros(n), np.arange(n, dtype=float)], axis=1)
+    way = (points, heading, column, column, np.array(commands))
+    return RoutePath(*way, n - 1.0, column, column, column)
 
 
 def ego_at(y: float) -> Ego:
@@ -42,6 +37,6 @@ def test_the_next_node_lies_at_least_four_metres_ahead_till_the_last(
     y: float, ahead: tuple[float, float]
 ) -> None:
     """One metre to the left, since the ego is to the right of the path."""
-    found = NODES.ahead(y, ego_at(y))
+    result = NODES.ahead(y, ego_at(y))
 
-    np.testing.assert_allclose(found, [[each, 1.0] for each in ahead], atol=1e-5)
+    np.testing.assert_allclose(result, [[metres, 1.0] for metres in ahead], atol=1e-5)

@@ -52,11 +52,11 @@ def test_waypoints_of_any_number_in_the_models_axes(tmp_path: Path) -> None:
     policy = adapted(model, f"axes = 'forward-right'\n[plan]\n{plan}").open()
     policy.reset(EXIT)
 
-    found = policy.plan(observation())
+    result = policy.plan(observation())
 
-    assert isinstance(found, Trajectory)
-    assert found.points[[0, 8]].tolist() == [[1.0, -0.5], [9.0, -4.5]]
-    assert found.times_s[[0, 8]].tolist() == [0.2, 1.8]
+    assert isinstance(result, Trajectory)
+    assert result.points[[0, 8]].tolist() == [[1.0, -0.5], [9.0, -4.5]]
+    assert result.times_s[[0, 8]].tolist() == [0.2, 1.8]
 
 
 @pytest.mark.parametrize(
@@ -102,11 +102,11 @@ def test_a_host_stage_takes_six_waypoints_of_any_plan(tmp_path: Path) -> None:
     policy = OnnxPolicy.open(model, Adapter(plan=plan), stage=Same())
     policy.reset(EXIT)
 
-    found = policy.plan(observation())
+    result = policy.plan(observation())
 
-    assert isinstance(found, Trajectory)
-    assert found.points[:, 0].tolist() == [2.0, 4.0, 6.0, 8.0, 10.0, 12.0]
-    assert found.points[2].tolist() == [6.0, 0.5]
+    assert isinstance(result, Trajectory)
+    assert result.points[:, 0].tolist() == [2.0, 4.0, 6.0, 8.0, 10.0, 12.0]
+    assert result.points[2].tolist() == [6.0, 0.5]
 
 
 MAP = """

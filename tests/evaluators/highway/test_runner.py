@@ -6,10 +6,14 @@ from types import SimpleNamespace
 from typing import Any, cast
 
 import numpy as np
-import numpy.typing as npt
 import pytest
 
-from me2e_compress.driving.contract import Observation, PedalsAndWheel, RouteInfo
+from me2e_compress.driving.contract import (
+    Answer,
+    Observation,
+    PedalsAndWheel,
+    RouteInfo,
+)
 from me2e_compress.driving.latency import FixedLatency
 from me2e_compress.evaluators import Drive
 from me2e_compress.evaluators.highway.drivers import OnnxDriver
@@ -42,7 +46,7 @@ class Standing:
     def reset(self, route: RouteInfo) -> None:
         self.resets += 1
 
-    def plan(self, observation: Observation) -> npt.NDArray[np.floating]:
+    def plan(self, observation: Observation) -> Answer:
         self.seen.append(observation)
         ahead = self.plans * 0.5 * np.arange(1, 7)
         return np.stack([ahead, np.zeros(6)], axis=1)
@@ -56,7 +60,9 @@ def test_a_blind_driver_ends_at_its_first_collision() -> None:
     assert 0.0 < episode.completion_percent < 100.0
     assert episode.infractions[0].time_us == episode.frames[-1].time_us
     hit = drive(CROSSING, Blind(), IDEAL).infractions
-    assert InfractionKind.COLLISION_PEDESTRIAN in [each.kind for each in hit]
+    assert InfractionKind.COLLISION_PEDESTRIAN in [
+        infraction.kind for infraction in hit
+    ]
 
 
 def test_standing_still_is_blocked_after_a_minute() -> None:
@@ -97,17 +103,13 @@ def test_decisions_come_as_often_as_equation_4_lets_them(
 
 def test_a_late_control_acts_late() -> None:
     """Equation 4 at 0.15 s: n = 2, so the first control acts in frame 3."""
-    prompt, late = (
-        drive(PARKED, Standing(), Drive(FixedLatency(latency)))
-        for latency in (0, 150_000)
-    )
+    brakes_in = []
+    for latency in (0, 150_000):
+        frames = drive(PARKED, Standing(), Drive(FixedLatency(latency))).frames
+        braking = (k for k, f in enumerate(frames) if f.acceleration_mps2 < -0.1)
+        brakes_in.append(next(braking))
 
-    braking = [
-        next(k for k, f in enumerate(e.frames) if f.acceleration_mps2 < -0.1)
-        for e in (prompt, late)
-    ]
-
-    assert braking[1] - braking[0] == 3
+    assert brakes_in[1] - brakes_in[0] == 3
 
 
 @pytest.mark.parametrize(
@@ -165,40 +167,27 @@ def test_the_layout_of_the_can_bus() -> None:
     ego = Ego(3.0, 4.0, -0.5, 6.0, 1.5, -0.5, 0.25, 0.1, 4.9, 2.0)
     bus = can_bus_of(ego, dataclasses.replace(ego, x=1.0, y=5.0, heading=6.1831853))
 
-    expected = np.zeros(18, np.float32)
-    expected[:2] = 2.0, -1.0
-    expected[3], expected[6] = np.cos(-0.25), np.sin(-0.25)
-    expected[7] = 6.0
-    expected[10:12] = 1.5, -0.5
-    expected[15] = 0.25
-    expected[16] = 2 * np.pi - 0.5
-    expected[17] = np.degrees(-0.5 + 0.1)
+    position, rotation = [2.0, -1.0, 0.0], [np.cos(-0.25), 0.0, 0.0, np.sin(-0.25)]
+    motion = [6.0, 0.0, 0.0, 1.5, -0.5, 0.0, 0.0, 0.0, 0.25]
+    turned = [2 * np.pi - 0.5, np.degrees(-0.5 + 0.1)]
+    expected = np.array([*position, *rotation, *motion, *turned], np.float32)
     assert bus.dtype == np.float32
     assert bus == pytest.approx(expected, abs=1e-4)
 
 
-@dataclass
-class Pressing:
-    """Answers one control, and no plan."""
+class Pressing(Standing):
+    """Answers full throttle, and no plan."""
 
-    control: PedalsAndWheel
-    needs_images: bool = False
-    privileged: bool = False
-
-    def reset(self, route: RouteInfo) -> None:
-        pass
-
-    def plan(self, observation: Observation) -> PedalsAndWheel:
-        return self.control
+    def plan(self, observation: Observation) -> Answer:
+        return PedalsAndWheel(1.0, 0.0, 0.0)
 
 
 def test_a_policy_of_controls_drives_and_shows_no_plan() -> None:
     """Full throttle is 4 m/s2; the latency holds for it as for a plan."""
     moments = list[Moment]()
     late = Drive(FixedLatency(150_000))
-    policy = Pressing(PedalsAndWheel(1.0, 0.0, 0.0))
 
-    episode = drive(PARKED, policy, late, Listeners(on_moment=moments.append))
+    episode = drive(PARKED, Pressing(), late, Listeners(on_moment=moments.append))
 
     assert episode.failure is None
     pushed = [frame.acceleration_mps2 for frame in episode.frames]
@@ -242,9 +231,9 @@ def test_road_users_stand_in_the_ego_frame() -> None:
     car = replace(scene.actors[0], kind=ActorKind.CAR, x=-3.0, y=20.0)
     cone = replace(car, kind=ActorKind.CONE)
 
-    found = road_users(replace(scene, ego=north, actors=(car, cone)))
+    result = road_users(replace(scene, ego=north, actors=(car, cone)))
 
-    assert found == pytest.approx(np.array([(20.0, 3.0)]))
+    assert result == pytest.approx(np.array([(20.0, 3.0)]))
     assert road_users(replace(scene, actors=())).shape == (0, 2)
 
 

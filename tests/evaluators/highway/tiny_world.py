@@ -56,9 +56,8 @@ def straight(**edges: float) -> RoutePath:
 
 def circle(radius_m: float, turn_rad: float, run_in_m: float = 30.0) -> RoutePath:
     phi = np.linspace(0.0, turn_rad, 400)[1:]
-    bend = np.stack(
-        [run_in_m + radius_m * np.sin(phi), radius_m * (1 - np.cos(phi))], axis=1
-    )
+    bend = radius_m * np.stack([np.sin(phi), 1 - np.cos(phi)], axis=1)
+    bend[:, 0] += run_in_m
     out = bend[-1] + np.outer([80.0], [np.cos(turn_rad), np.sin(turn_rad)])
     return path_through(np.vstack([[[0.0, 0.0]], bend, out]))
 
@@ -119,7 +118,3 @@ class TinyWorld:
             for a in self.actors
         )
         self.time_us += DT_US
-
-    @property
-    def offset_m(self) -> float:
-        return self.path.project(self.ego.x, self.ego.y)[1]
