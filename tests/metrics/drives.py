@@ -33,13 +33,9 @@ def cruise(
 ) -> tuple[EgoFrame, ...]:
     """Constant speed from the start to the end of a route."""
     count = math.ceil(length_m / speed / 0.05) + 1
+    speeds = {"speed_mps": speed, "traffic_speed_mps": traffic}
     return frames(
-        count,
-        lambda k: {
-            "speed_mps": speed,
-            "route_m": min(speed * 0.05 * k, length_m),
-            "traffic_speed_mps": traffic,
-        },
+        count, lambda k: {**speeds, "route_m": min(speed * 0.05 * k, length_m)}
     )
 
 

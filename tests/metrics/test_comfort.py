@@ -15,9 +15,10 @@ from me2e_compress.metrics.route_scores import (
 from tests.metrics.drives import cruise, drive, frames
 
 Floats = npt.NDArray[np.float64]
+A, B, W = "acceleration_mps2", "lateral_acceleration_mps2", "yaw_rate_radps"
 
 
-def held(count: int, **values: float) -> Episode:
+def steady(count: int, **values: float) -> Episode:
     return drive(driven=frames(count, lambda _: dict(values)))
 
 
@@ -26,15 +27,9 @@ def random_frames(seed: int, count: int) -> tuple[EgoFrame, ...]:
     along, left = rng.normal(0, 1.5, (2, count)).cumsum(axis=1) * 0.3
     yaw = rng.normal(0, 0.1, count).cumsum() * 0.3
     heading = (yaw * 0.05).cumsum()
+    columns = {A: along, B: left, W: yaw, "heading": heading}
     return frames(
-        count,
-        lambda k: {
-            "speed_mps": 8.0,
-            "acceleration_mps2": float(along[k]),
-            "lateral_acceleration_mps2": float(left[k]),
-            "yaw_rate_radps": float(yaw[k]),
-            "heading": float(heading[k]),
-        },
+        count, lambda k: {name: float(column[k]) for name, column in columns.items()}
     )
 
 
@@ -51,10 +46,9 @@ def local_fit(values: Floats, dt: float) -> tuple[Floats, Floats]:
 
 
 def columns(driven: tuple[EgoFrame, ...]) -> tuple[Floats, Floats, Floats, Floats]:
-    names = "acceleration_mps2", "lateral_acceleration_mps2", "yaw_rate_radps"
     a, b, w, heading = (
         np.array([getattr(frame, name) for frame in driven])
-        for name in (*names, "heading")
+        for name in (A, B, W, "heading")
     )
     return a, b, w, heading
 
@@ -77,9 +71,6 @@ def test_si_comfort_against_local_fits(seed: int) -> None:
     assert comfort(drive(driven=driven)).value == np.mean(whole)
 
 
-A, B, W = "acceleration_mps2", "lateral_acceleration_mps2", "yaw_rate_radps"
-
-
 @pytest.mark.parametrize(
     ("name", "inside", "outside"),
     [
@@ -88,8 +79,8 @@ A, B, W = "acceleration_mps2", "lateral_acceleration_mps2", "yaw_rate_radps"
     ],
 )
 def test_bounds_of_the_three_levels(name: str, inside: float, outside: float) -> None:
-    assert comfort(held(40, **{name: inside})).value == 1.0
-    assert comfort(held(40, **{name: outside})).value == 0.0
+    assert comfort(steady(40, **{name: inside})).value == 1.0
+    assert comfort(steady(40, **{name: outside})).value == 0.0
 
 
 @pytest.mark.parametrize(
@@ -116,14 +107,14 @@ def test_bounds_of_the_three_slopes(
 def test_fewer_than_20_frames_and_an_incomplete_segment_are_left_out() -> None:
     rough = drive(driven=frames(39, lambda k: {A: 3.0 if k > 30 else 0.0}))
 
-    assert comfort(held(19)).reason == "19 frames, 20 are needed"
-    assert comfort(held(20)).value == 1.0
+    assert comfort(steady(19)).reason == "19 frames, 20 are needed"
+    assert comfort(steady(20)).value == 1.0
     assert comfort(rough).value == 1.0
 
 
 @pytest.mark.parametrize(("intervals", "value"), [(1200, 1.0), (1199, 0.0)])
 def test_standing_blocked_is_not_uncomfortable(intervals: int, value: float) -> None:
-    shaken = held(intervals + 1, speed_mps=0.05, lateral_acceleration_mps2=6.0)
+    shaken = steady(intervals + 1, speed_mps=0.05, lateral_acceleration_mps2=6.0)
     ended = dataclasses.replace(shaken, ending=Ending.BLOCKED)
 
     assert comfort(shaken).value == value
@@ -157,15 +148,15 @@ def test_bench2drive_smoothness_against_local_fits(seed: int) -> None:
     driven = tuple(
         dataclasses.replace(f, yaw_rate_radps=f.yaw_rate_radps * scale) for f in calm
     )
-    expected = original(driven)
 
-    assert bench2drive.smoothness(drive(driven=driven)).value == np.mean(expected)
+    result = bench2drive.smoothness(drive(driven=driven))
+    assert result.value == np.mean(original(driven))
 
 
 def test_bench2drive_judges_short_routes_as_one_block() -> None:
-    assert bench2drive.smoothness(held(3)).value == 1.0
-    assert bench2drive.smoothness(held(12, acceleration_mps2=2.5)).value == 0.0
-    assert bench2drive.smoothness(held(2)).reason == "2 frames, 3 are needed"
+    assert bench2drive.smoothness(steady(3)).value == 1.0
+    assert bench2drive.smoothness(steady(12, acceleration_mps2=2.5)).value == 0.0
+    assert bench2drive.smoothness(steady(2)).reason == "2 frames, 3 are needed"
 
 
 def random_drive(seed: int, completed: bool = True) -> Episode:
@@ -202,11 +193,8 @@ def by_hand(episode: Episode) -> list[float]:
             del groups[last]
     ratios = []
     for group in groups.values():
-        pairs = [
-            (f.speed_mps, f.traffic_speed_mps)
-            for f in group
-            if f.traffic_speed_mps is not None
-        ]
+        near = [frame for frame in group if frame.traffic_speed_mps is not None]
+        pairs = [(frame.speed_mps, frame.traffic_speed_mps or 0.0) for frame in near]
         if pairs and np.sum(pairs, axis=0)[1] > 0:
             ego, traffic = np.mean(pairs, axis=0)
             ratios.append(100 * ego / traffic)
@@ -239,11 +227,9 @@ def test_no_traffic_is_not_measured_but_100_for_bench2drive() -> None:
 
 
 def test_a_route_that_ends_in_its_first_twentieth_has_none() -> None:
-    episode = drive(completion=4.9, driven=cruise(traffic=5.0)[:10])
+    reason = efficiency(drive(completion=4.9, driven=cruise(traffic=5.0)[:10])).reason
 
-    assert efficiency(episode).reason == (
-        "the ego did not pass the first 5 % of the route"
-    )
+    assert reason == "the ego did not pass the first 5 % of the route"
 
 
 def test_bench2drive_writes_the_last_check_point_twice() -> None:

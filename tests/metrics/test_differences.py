@@ -36,18 +36,18 @@ BAD = [driven(CRASH, route="a", completion=50.0), *GOOD[1:]]
 
 
 def test_the_mean_of_differences_route_by_route() -> None:
-    found = difference(BAD, GOOD)
+    result = difference(BAD, GOOD)
 
-    assert found.driving_score.value == pytest.approx((30.0 - 100.0) / 4)
-    assert found.success_rate.value == pytest.approx(-25.0)
-    assert found.driving_score.measure.unit == "points"
-    assert (found.better, found.worse) == (0, 1)
-    assert difference(BAD, GOOD[::-1]) == found
+    assert result.driving_score.value == pytest.approx((30.0 - 100.0) / 4)
+    assert result.success_rate.value == pytest.approx(-25.0)
+    assert result.driving_score.measure.unit == "points"
+    assert (result.better, result.worse) == (0, 1)
+    assert difference(BAD, GOOD[::-1]) == result
 
 
 def test_room_is_compared_where_both_drives_recorded_it() -> None:
     near, far = (
-        [replace(each, ttc_exposure=percent, at_fault=False) for each in GOOD]
+        [replace(route, ttc_exposure=percent, at_fault=False) for route in GOOD]
         for percent in (30.0, 10.0)
     )
 
@@ -56,27 +56,27 @@ def test_room_is_compared_where_both_drives_recorded_it() -> None:
 
 
 def test_where_nothing_differs_the_interval_is_what_may_be_unseen() -> None:
-    found = difference(BAD, BAD)
+    result = difference(BAD, BAD)
 
     # with 95 % at most 1 - 0.05 ** (1 / 4) of all routes differ, by 100 points each
     share = 100.0 * (1.0 - 0.05**0.25)
-    score = found.driving_score
+    score = result.driving_score
     assert score.value == 0.0
     assert (score.low, score.high) == pytest.approx((-share, share))
-    assert found.unseen_percent == pytest.approx(share)
-    assert found.differ == 0
+    assert result.unseen_percent == pytest.approx(share)
+    assert result.differ == 0
 
 
 def test_four_routes_that_differ_alike_say_little_of_a_fifth() -> None:
     worse = [driven(CRASH, route=name, completion=50.0) for name in "abcd"]
 
-    found = difference(worse, GOOD)
+    result = difference(worse, GOOD)
 
     share = 1.0 - 0.05**0.25
     low, high = -70.0 - share * 30.0, -70.0 + share * 170.0
-    score = found.driving_score
+    score = result.driving_score
     assert (score.low, score.high) == pytest.approx((low, high))
-    assert found.verdict == "no difference shown"
+    assert result.verdict == "no difference shown"
 
 
 def test_success_is_compared_by_mcnemars_exact_test() -> None:
@@ -84,11 +84,11 @@ def test_success_is_compared_by_mcnemars_exact_test() -> None:
     one = [driven(*[CRASH] * (k < 1), route=name) for k, name in enumerate(names)]
     other = [driven(*[CRASH] * (k > 11), route=name) for k, name in enumerate(names)]
 
-    found = difference(one, other)
+    result = difference(one, other)
 
     # 8 routes gained, 1 lost: 2 * (1 + 9) / 2 ** 9
-    assert (found.gained, found.lost) == (8, 1)
-    assert found.p_value == pytest.approx(20 / 512)
+    assert (result.gained, result.lost) == (8, 1)
+    assert result.p_value == pytest.approx(20 / 512)
     assert difference(one, one).p_value == 1.0
 
 
@@ -100,17 +100,17 @@ def test_holm_by_hand() -> None:
 
 @given(st.lists(st.floats(0, 1), max_size=6))
 def test_holm_only_raises_and_keeps_the_order(p_values: list[float]) -> None:
-    found = holm(p_values)
+    result = holm(p_values)
 
-    assert all(p <= new <= 1.0 for p, new in zip(p_values, found, strict=True))
-    ranked = [new for _, new in sorted(zip(p_values, found, strict=True))]
+    assert all(p <= new <= 1.0 for p, new in zip(p_values, result, strict=True))
+    ranked = [new for _, new in sorted(zip(p_values, result, strict=True))]
     assert ranked == sorted(ranked)
 
 
 def test_one_route_has_no_interval() -> None:
-    found = difference(BAD[:1], GOOD[:1]).driving_score
+    result = difference(BAD[:1], GOOD[:1]).driving_score
 
-    assert (found.value, found.low, found.high, found.n) == (-70.0, None, None, 1)
+    assert (result.value, result.low, result.high, result.n) == (-70.0, None, None, 1)
 
 
 def test_other_routes_are_named() -> None:
@@ -141,7 +141,7 @@ def test_few_routes_show_only_large_differences(
 
 
 @pytest.mark.parametrize(
-    ("routes", "low", "high", "value", "said"),
+    ("routes", "low", "high", "value", "verdict"),
     [
         (220, 0.7, 6.7, 3.7, "better"),
         (220, -6.7, -0.7, -3.7, "worse"),
@@ -153,15 +153,16 @@ def test_few_routes_show_only_large_differences(
     ],
 )
 def test_a_verdict_asks_for_the_interval_and_for_enough_routes(
-    routes: int, low: float | None, high: float | None, value: float, said: str
+    routes: int, low: float | None, high: float | None, value: float, verdict: str
 ) -> None:
-    assert paired(routes, low, high, value).verdict == said
+    assert paired(routes, low, high, value).verdict == verdict
 
 
 # Intervals over these types, over types drawn anew, and where nothing differed.
 
 
 TYPES = [f"type {i // 5}" for i in range(220)]
+SHARE = 1 - 0.05**0.025
 
 
 def alike(correlation: float) -> list[float]:
@@ -172,9 +173,9 @@ def alike(correlation: float) -> list[float]:
     return [50.0 + 10.0 * float(value) for value in shared + own]
 
 
-def halves(found: Estimate) -> tuple[float, float]:
+def halves(result: Estimate) -> tuple[float, float]:
     """Half the width of both intervals."""
-    ends = (found.low, found.high, found.anew_low, found.anew_high)
+    ends = (result.low, result.high, result.anew_low, result.anew_high)
     assert None not in ends
     low, high, anew_low, anew_high = (end or 0.0 for end in ends)
     return (high - low) / 2, (anew_high - anew_low) / 2
@@ -194,11 +195,11 @@ def test_each_interval_is_as_wide_as_its_standard_error_says() -> None:
 
 def test_where_no_type_has_two_routes_both_are_the_plain_bootstrap() -> None:
     values, n = alike(0.0), 220
-    found = mean_estimate(values, [str(i) for i in range(n)], "%")
+    result = mean_estimate(values, [str(i) for i in range(n)], "%")
 
     error = pstdev(values) / math.sqrt(n - 1)
-    assert halves(found) == pytest.approx((1.96 * error,) * 2, rel=0.05)
-    assert found.value == pytest.approx(fmean(values))
+    assert halves(result) == pytest.approx((1.96 * error,) * 2, rel=0.05)
+    assert result.value == pytest.approx(fmean(values))
 
 
 def test_the_same_seed_gives_the_same_intervals() -> None:
@@ -213,29 +214,28 @@ def test_the_same_seed_gives_the_same_intervals() -> None:
 @pytest.mark.parametrize(
     ("bounds", "interval"),
     [
-        ((0.0, 100.0), (100 - 100 * (1 - 0.05**0.025), 100.0)),
-        (
-            (-100.0, 200.0),
-            (100 - 200 * (1 - 0.05**0.025), 100 + 100 * (1 - 0.05**0.025)),
-        ),
+        ((0.0, 100.0), (100 - 100 * SHARE, 100.0)),
+        ((-100.0, 200.0), (100 - 200 * SHARE, 100 + 100 * SHARE)),
     ],
 )
 def test_routes_that_all_are_equal_have_no_interval_of_no_width(
     bounds: tuple[float, float], interval: tuple[float, float]
 ) -> None:
-    found = mean_estimate([100.0] * 40, TYPES[:40], "%", bounds=bounds)
+    result = mean_estimate([100.0] * 40, TYPES[:40], "%", bounds=bounds)
 
-    assert (found.low, found.high) == pytest.approx(interval)
+    assert (result.low, result.high) == pytest.approx(interval)
     # eight types: 1 - 0.05 ** (1 / 8)
     low = 100 - (100 - bounds[0]) * (1 - 0.05**0.125)
-    assert found.anew_low == pytest.approx(low)
+    assert result.anew_low == pytest.approx(low)
 
 
 def test_types_that_are_all_or_nothing_leave_routes_unseen() -> None:
-    found = mean_estimate([0.0] * 5 + [100.0] * 5, TYPES[:10], "%", bounds=(0, 100))
+    result = mean_estimate([0.0] * 5 + [100.0] * 5, TYPES[:10], "%", bounds=(0, 100))
 
     share = unseen_share(10)
-    assert (found.low, found.high) == pytest.approx((50 - 50 * share, 50 + 50 * share))
+    assert (result.low, result.high) == pytest.approx(
+        (50 - 50 * share, 50 + 50 * share)
+    )
     assert unseen_share(220) == pytest.approx(3 / 220, rel=0.01)
 
 
@@ -260,11 +260,11 @@ def test_the_intervals_turn_with_the_sign(
 ) -> None:
     values, types = zip(*rows, strict=True)
 
-    found = mean_estimate(values, types, "points", seed, (-100, 100))
+    result = mean_estimate(values, types, "points", seed, (-100, 100))
     back = mean_estimate([-v for v in values], types, "points", seed, (-100, 100))
 
-    assert found.low == pytest.approx(-(back.high or 0.0), abs=1e-6)
-    assert found.high == pytest.approx(-(back.low or 0.0), abs=1e-6)
+    assert result.low == pytest.approx(-(back.high or 0.0), abs=1e-6)
+    assert result.high == pytest.approx(-(back.low or 0.0), abs=1e-6)
 
 
 def test_the_exact_binomial_interval() -> None:

@@ -34,11 +34,11 @@ FACTORS = {
 
 @pytest.mark.parametrize("kind", PENALTY)
 def test_each_infraction_costs_its_factor(kind: InfractionKind) -> None:
+    factor = FACTORS[kind]
+
     scored = route_score(drive(infraction(kind), completion=80.0))
 
-    assert scored == RouteScore(
-        80.0, FACTORS[kind.value], round(80 * FACTORS[kind.value], 6)
-    )
+    assert scored == RouteScore(80.0, factor, round(80 * factor, 6))
 
 
 def test_penalties_multiply_and_leaving_the_lanes_costs_its_share_of_the_way() -> None:
@@ -94,28 +94,25 @@ SLOW = infraction(InfractionKind.MIN_SPEED, percent=50.0)
 
 
 def given(episode: Episode, status: str, composed: float) -> Episode:
-    said = Given(status, episode.completion_percent, 1.0, composed)
-    return dataclasses.replace(episode, given=said)
+    scores = Given(status, episode.completion_percent, 1.0, composed)
+    return dataclasses.replace(episode, given=scores)
 
 
+STUCK = drive(route="c", completion=30.0, ending=Ending.BLOCKED)
 ROUTES = (
     given(drive(SLOW, route="a"), "Completed", 100.0),
     given(drive(CRASH, route="b"), "Completed", 59.9),
-    given(
-        drive(route="c", completion=30.0, ending=Ending.BLOCKED),
-        "Failed - Agent got blocked",
-        30.0,
-    ),
+    given(STUCK, "Failed - Agent got blocked", 30.0),
 )
 
 
 def test_both_quotients_of_what_was_given_and_computed() -> None:
-    found = leaderboard_scores(ROUTES)
+    result = leaderboard_scores(ROUTES)
 
     for quotients, total in (
-        (found.given["driving_score"], 189.9),
-        (found.computed["driving_score"], 190.0),
-        (found.computed["success_rate"], 100.0),
+        (result.given["driving_score"], 189.9),
+        (result.computed["driving_score"], 190.0),
+        (result.computed["success_rate"], 100.0),
     ):
         assert quotients.set == pytest.approx(total / 220)
         assert quotients.driven == pytest.approx(total / 3)
@@ -149,7 +146,7 @@ def test_traffic_signs_are_rated_unless_a_junction_decides() -> None:
 
 def test_the_mean_is_that_of_five() -> None:
     others = ("Overtaking", "Emergency_Brake", "Give_Way")
-    routes = (*TESTED, *(drive(route=each, abilities=(each,)) for each in others))
+    routes = (*TESTED, *(drive(route=other, abilities=(other,)) for other in others))
 
     mean, _ = ability_rates(routes)
 

@@ -1,4 +1,4 @@
-"""EER_AV against a hand-worked example, and what it must not hang on."""
+"""EER_AV against a hand-worked example, and what it must not depend on."""
 
 import dataclasses
 import math
@@ -25,7 +25,9 @@ from tests.metrics.drives import cruise, drive, infraction
 
 
 def measured(episodes: Sequence[Episode], j_per_frame: float | None) -> RouteMeasures:
-    return route_measures([RouteSummary.of(each) for each in episodes], j_per_frame)
+    return route_measures(
+        [RouteSummary.of(episode) for episode in episodes], j_per_frame
+    )
 
 
 def measures(*rows: tuple[float, float, float, float], crashed: str) -> RouteMeasures:
@@ -53,43 +55,43 @@ def of_table(table: np.ndarray) -> RouteMeasures:
 
 
 def test_the_example_by_hand() -> None:
-    found = eer(BY_HAND, EQUAL)
+    result = eer(BY_HAND, EQUAL)
 
-    assert found.routes["a"] == pytest.approx([100 * 3 / 8, -100 / 24])
-    assert found.routes["b"] == pytest.approx([100 * 5 / 8, 0.0])
-    assert found.scores["a"].value == pytest.approx(100 / 6)
-    assert found.scores["b"].value == pytest.approx(31.25)
-    assert found.scores["b"].measure.unit == "points"
-    assert found.ranking == ("b", "a")
+    assert result.routes["a"] == pytest.approx([100 * 3 / 8, -100 / 24])
+    assert result.routes["b"] == pytest.approx([100 * 5 / 8, 0.0])
+    assert result.scores["a"].value == pytest.approx(100 / 6)
+    assert result.scores["b"].value == pytest.approx(31.25)
+    assert result.scores["b"].measure.unit == "points"
+    assert result.ranking == ("b", "a")
 
 
 def test_a_collision_leaves_the_driving_score_alone() -> None:
     """Half of everything: (1/2) / 4, and not (1/2 + 1/2 + 1/2 - 1/2) / 4."""
     half = (70, 100, 0.5, 7.5)
 
-    found = eer({"a": measures(half, half, crashed="x.")}, EQUAL)
+    result = eer({"a": measures(half, half, crashed="x.")}, EQUAL)
 
-    assert found.routes["a"] == pytest.approx([100 / 8, 100 / 4])
+    assert result.routes["a"] == pytest.approx([100 / 8, 100 / 4])
 
 
 def test_the_scale_is_of_all_routes_and_used_again_on_another_variant() -> None:
-    found = eer(BY_HAND)
+    result = eer(BY_HAND)
 
-    assert found.scale is not None
-    assert (found.scale.offset, found.scale.span) == (EQUAL.offset, EQUAL.span)
-    assert sum(found.scale.weights) == pytest.approx(1.0)
-    alone = eer({"b": BY_HAND["b"]}, found.scale)
-    assert alone.routes["b"] == pytest.approx(found.routes["b"])
+    assert result.scale is not None
+    assert (result.scale.offset, result.scale.span) == (EQUAL.offset, EQUAL.span)
+    assert sum(result.scale.weights) == pytest.approx(1.0)
+    alone = eer({"b": BY_HAND["b"]}, result.scale)
+    assert alone.routes["b"] == pytest.approx(result.routes["b"])
 
 
 def test_weights_come_from_critic_over_routes_and_variants() -> None:
-    tables = {name: each.table for name, each in BY_HAND.items()}
-    found = scale_of(tables).weights
+    tables = {name: scores.table for name, scores in BY_HAND.items()}
+    result = scale_of(tables).weights
 
     # normalized: DS 1 1/3 1 0, DE 1/2 0 1 0, DC 1 1/2 1/2 0, E 1 1 0 0
     x = np.array([[1, 1 / 3, 1, 0], [0.5, 0, 1, 0], [1, 0.5, 0.5, 0], [1, 1, 0, 0]])
     content = x.std(axis=1) * (1 - np.abs(np.corrcoef(x))).sum(axis=1)
-    assert found == pytest.approx(content / content.sum())
+    assert result == pytest.approx(content / content.sum())
 
 
 @pytest.mark.parametrize("measure", range(4))
@@ -98,11 +100,11 @@ def test_a_missing_measure_is_named_and_the_others_are_scored(measure: int) -> N
     table[:, measure] = NAN
     lacking = RouteMeasures(table, BY_HAND["a"].crashed)
 
-    found = eer({**BY_HAND, "c": lacking})
+    result = eer({**BY_HAND, "c": lacking})
 
     names = ("driving score", "efficiency", "comfort", "energy")
-    assert found.scores["c"].measure.reason == f"{names[measure]}: not measured"
-    assert found.scores["a"] == eer(BY_HAND).scores["a"]
+    assert result.scores["c"].measure.reason == f"{names[measure]}: not measured"
+    assert result.scores["a"] == eer(BY_HAND).scores["a"]
 
 
 def test_a_route_that_one_variant_did_not_measure_is_left_out_of_all() -> None:
@@ -111,19 +113,19 @@ def test_a_route_that_one_variant_did_not_measure_is_left_out_of_all() -> None:
         "b": measures(*BY_HAND["b"].table.tolist(), (90, 90, 0.9, 1), crashed=".x."),
     }
 
-    found = eer(more)
+    result = eer(more)
 
-    assert found.left_out == {"efficiency": 1}
-    assert found.scores["b"] == eer(BY_HAND).scores["b"]
+    assert result.left_out == {"efficiency": 1}
+    assert result.scores["b"] == eer(BY_HAND).scores["b"]
 
 
 def test_variants_that_measure_the_same_have_no_weights() -> None:
     same = measures((50, 50, 0.5, 5), (50, 50, 0.5, 5), crashed="..")
 
-    found = eer({"a": same, "b": same}).scores["a"]
+    result = eer({"a": same, "b": same}).scores["a"]
 
-    assert found.value is None
-    assert "CRITIC finds no weights" in found.measure.reason
+    assert result.value is None
+    assert "CRITIC finds no weights" in result.measure.reason
 
 
 def test_unequal_routes_are_refused() -> None:
@@ -135,13 +137,11 @@ def test_unequal_routes_are_refused() -> None:
 def test_neither_units_nor_the_order_of_routes_change_a_score(
     one: np.ndarray, other: np.ndarray, unit: float, order: list[int]
 ) -> None:
-    found = eer({"a": of_table(one), "b": of_table(other)})
-    units = (1.0, 1.0, 1.0, unit)
-    moved = eer(
-        {"a": of_table(one[order] * units), "b": of_table(other[order] * units)}
-    )
+    result = eer({"a": of_table(one), "b": of_table(other)})
+    first, second = (table[order] * (1.0, 1.0, 1.0, unit) for table in (one, other))
+    moved = eer({"a": of_table(first), "b": of_table(second)})
 
-    for name, score in found.scores.items():
+    for name, score in result.scores.items():
         again = moved.scores[name]
         assert score.n == again.n
         assert score.value == pytest.approx(again.value, abs=1e-6)
@@ -149,38 +149,37 @@ def test_neither_units_nor_the_order_of_routes_change_a_score(
 
 def test_joules_of_a_route_are_those_of_its_decisions() -> None:
     """Without a log of them, as of a real run, each recorded step is one."""
-    found = measured([drive(driven=cruise(traffic=5.0))], 2.5)
-    told = Given("Completed", 100.0, 1.0, 100.0)
-    eight = drive(driven=cruise()[:8])
-    real = dataclasses.replace(eight, decisions=(), given=told)
+    result = measured([drive(driven=cruise(traffic=5.0))], 2.5)
+    reported, eight = Given("Completed", 100.0, 1.0, 100.0), drive(driven=cruise()[:8])
+    real = dataclasses.replace(eight, decisions=(), given=reported)
 
     assert np.isnan(measured([drive()], None).table[0, 3])
     # a drive by hand has one decision
-    assert found.table.tolist() == [pytest.approx([100.0, 200.0, 1.0, 2.5])]
+    assert result.table.tolist() == [pytest.approx([100.0, 200.0, 1.0, 2.5])]
     assert measured([real], 2.5).table[0, 3] == 20.0
 
 
 def test_a_driver_that_failed_at_once_is_not_left_out() -> None:
     stuck = drive(completion=1.0, driven=cruise(1.0), ending=Ending.TIMEOUT)
-    found = measured([stuck], 1.0)
+    result = measured([stuck], 1.0)
 
-    assert found.table[0, 1:3].tolist() == [0.0, 0.0]
+    assert result.table[0, 1:3].tolist() == [0.0, 0.0]
 
 
 def test_without_a_record_nothing_is_made_up() -> None:
     hit = infraction(InfractionKind.COLLISION_VEHICLE)
     silent = dataclasses.replace(drive(hit, completion=2.0), decisions=())
-    found = measured([silent], 1.0)
+    result = measured([silent], 1.0)
 
-    assert np.isnan(found.table[0, 1:]).all()
-    assert found.crashed.tolist() == [True]
+    assert np.isnan(result.table[0, 1:]).all()
+    assert result.crashed.tolist() == [True]
 
 
 @pytest.mark.parametrize("kind", InfractionKind)
 def test_of_all_infractions_a_collision_alone_is_a_crash(kind: InfractionKind) -> None:
-    found = measured([drive(infraction(kind, 50.0)), drive()], 1.0)
+    result = measured([drive(infraction(kind, 50.0)), drive()], 1.0)
 
-    assert found.crashed.tolist() == [kind.name.startswith("COLLISION"), False]
+    assert result.crashed.tolist() == [kind.name.startswith("COLLISION"), False]
 
 
 # CRITIC against a hand-worked example, and what must not change its weights.
@@ -206,11 +205,11 @@ def test_the_example_by_hand_beside_a_constant_that_weighs_nothing() -> None:
     outer, middle = (2 - 1 / math.sqrt(3)) / 2, (math.sqrt(3) - 1) / 2
     contents = np.array([outer, middle, outer])
 
-    found = critic_weights(np.hstack([np.full((4, 1), 0.7), ROWS]))
+    result = critic_weights(np.hstack([np.full((4, 1), 0.7), ROWS]))
 
     assert critic_weights(ROWS) == pytest.approx(contents / contents.sum())
-    assert found[0] == 0.0
-    assert found[1:] == pytest.approx(critic_weights(ROWS))
+    assert result[0] == 0.0
+    assert result[1:] == pytest.approx(critic_weights(ROWS))
 
 
 @pytest.mark.parametrize(
@@ -233,10 +232,10 @@ def test_measures_that_say_the_same_have_no_weights(
 def test_neither_the_order_of_rows_nor_a_sign_nor_an_offset_matters(
     rows: np.ndarray, order: list[int]
 ) -> None:
-    found, other = weights_of(rows), weights_of(1.0 - rows[order])
+    result, other = weights_of(rows), weights_of(1.0 - rows[order])
 
-    assert (found is None) == (other is None)
-    if found is not None and other is not None:
-        assert found == pytest.approx(other, abs=1e-6)
-        assert found.sum() == pytest.approx(1.0)
-        assert (found >= 0.0).all()
+    assert (result is None) == (other is None)
+    if result is not None and other is not None:
+        assert result == pytest.approx(other, abs=1e-6)
+        assert result.sum() == pytest.approx(1.0)
+        assert (result >= 0.0).all()

@@ -35,15 +35,9 @@ frame_rows = st.builds(
 )
 infractions = st.builds(
     Infraction,
-    st.sampled_from(InfractionKind),
-    times,
-    numbers,
-    numbers,
-    st.text(max_size=8),
-    st.none() | percents,
-    st.none() | st.sampled_from(Contact),
-    st.none() | st.booleans(),
-    st.none() | st.floats(0.0, LARGEST),
+    *(st.sampled_from(InfractionKind), times, numbers, numbers, st.text(max_size=8)),
+    *(st.none() | percents, st.none() | st.sampled_from(Contact)),
+    *(st.none() | st.booleans(), st.none() | lengths),
 )
 encounters = st.builds(
     Encounter,
@@ -52,13 +46,9 @@ encounters = st.builds(
 )
 episodes = st.builds(
     Episode,
-    st.text(max_size=8),
-    st.text(max_size=8),
+    *(st.text(max_size=8), st.text(max_size=8)),
     st.lists(st.text(max_size=4), max_size=2).map(tuple),
-    st.floats(0.0, LARGEST),
-    percents,
-    st.sampled_from(Ending),
-    st.none() | st.text(max_size=8),
+    *(lengths, percents, st.sampled_from(Ending), st.none() | st.text(max_size=8)),
     st.lists(infractions, max_size=2).map(tuple),
     st.lists(frame_rows, max_size=4).map(tuple),
     st.lists(st.builds(InferenceRecord, times, times), max_size=3).map(tuple),

@@ -111,11 +111,11 @@ def test_a_failure_that_ends_a_route_is_said() -> None:
         drive(ending=Ending.POLICY_FAILED, route="r2"), failure="ValueError: no"
     )
 
-    found = score((drive(), broken))
+    result = score((drive(), broken))
 
-    assert found.failures == {"r2": "ValueError: no"}
-    assert found.failed.startswith("1 of 2 routes ended because the policy or the")
-    assert found.failed.endswith("failed: ValueError: no (r2)")
+    assert result.failures == {"r2": "ValueError: no"}
+    assert result.failed.startswith("1 of 2 routes ended because the policy or the")
+    assert result.failed.endswith("failed: ValueError: no (r2)")
     assert score((drive(),)).failed == ""
 
 
@@ -123,12 +123,12 @@ def test_a_failure_that_ends_a_route_is_said() -> None:
 def test_both_commands_warn_of_failures(kind: type[Result]) -> None:
     scores = score((drive(ending=Ending.SIMULATOR_FAILED),))
     if kind is EvaluateResult:
-        found: Result = EvaluateResult("mine", Path("out"), scores)
+        result: Result = EvaluateResult("mine", Path("out"), scores)
     else:
-        found = ScoreResult({"out": scores})
+        result = ScoreResult({"out": scores})
 
-    assert found.status == "warning"
-    assert "simulator failed (r1)" in found.alerts()[0]
+    assert result.status == "warning"
+    assert "simulator failed (r1)" in result.alerts()[0]
 
 
 def encounter(pet_s: float, angle_deg: float) -> Encounter:
@@ -136,8 +136,8 @@ def encounter(pet_s: float, angle_deg: float) -> Encounter:
 
 
 def crash(at_fault: bool | None) -> Infraction:
-    found = infraction(InfractionKind.COLLISION_VEHICLE)
-    return dataclasses.replace(found, at_fault=at_fault)
+    result = infraction(InfractionKind.COLLISION_VEHICLE)
+    return dataclasses.replace(result, at_fault=at_fault)
 
 
 NEAR_MISS = drive(
@@ -166,7 +166,7 @@ def test_room_is_kept_by_who_comes_near_nobody() -> None:
     close = dataclasses.replace(
         NEAR_MISS.conflicts, encounters=(encounter(0.3, 60.0), encounter(2.0, 90.0))
     )
-    found = [
+    result = [
         room_kept(drive(*faults, conflicts=conflicts)).value
         for faults, conflicts in (
             ((), NEAR_MISS.conflicts),
@@ -177,7 +177,7 @@ def test_room_is_kept_by_who_comes_near_nobody() -> None:
         )
     ]
 
-    assert found == pytest.approx([50.0, 10.0, 10.0, 0.0, 100.0])
+    assert result == pytest.approx([50.0, 10.0, 10.0, 0.0, 100.0])
     for faults in ((), (crash(True),), (crash(None),)):
         episode = drive(*faults, conflicts=close)
         assert RouteSummary.of(episode).room_kept == room_kept(episode).value
@@ -205,19 +205,19 @@ def test_whether_a_collision_was_the_egos_fault(
 
 
 def test_the_rate_of_collisions_at_fault_and_none_of_one_unknown_fault() -> None:
-    found = score([drive(), drive(crash(False)), drive(crash(True)), drive()]).safety
+    result = score([drive(), drive(crash(False)), drive(crash(True)), drive()]).safety
     unknown = score([drive(), drive(crash(None))]).safety
 
-    assert found.at_fault_collisions.value == 25.0
-    assert found.at_fault_collisions.n == 4
+    assert result.at_fault_collisions.value == 25.0
+    assert result.at_fault_collisions.n == 4
     reason = "whose fault 1 collisions were is not known"
     assert unknown.at_fault_collisions.measure == Measure(None, "%", reason)
 
 
 def test_percentiles_and_the_share_over_budget() -> None:
-    found = deadlines([1_000 * ms for ms in range(1, 1001)], 50.0)
+    result = deadlines([1_000 * ms for ms in range(1, 1001)], 50.0)
 
-    assert found.to_json() == {
+    assert result.to_json() == {
         "budget_ms": 50.0,
         "decisions": 1000,
         "p50_ms": 500.0,
@@ -236,17 +236,17 @@ def test_percentiles_and_the_share_over_budget() -> None:
 
 
 def test_a_percentile_of_too_few_or_of_a_trace_of_fewer_is_not_measured() -> None:
-    found = deadlines([40_000] * 150)
+    result = deadlines([40_000] * 150)
 
-    assert found.measures["p99_ms"].value == 40.0
-    assert found.measures["p99.9_ms"].reason == "needs 1,000 samples, has 150"
-    shown = deadlines_table("trace", found)
+    assert result.measures["p99_ms"].value == 40.0
+    assert result.measures["p99.9_ms"].reason == "needs 1,000 samples, has 150"
+    shown = deadlines_table("trace", result)
     assert [cell.text for cell in shown.rows[2]][:2] == ["p99.9", "-"]
     assert "needs 1,000 samples, has 150" in shown.note
-    found = deadlines([40_000] * 2478, measured=16)  # drawn from a trace
-    assert (found.count, found.measures["p50_ms"].value) == (2478, 40.0)
+    result = deadlines([40_000] * 2478, measured=16)  # drawn from a trace
+    assert (result.count, result.measures["p50_ms"].value) == (2478, 40.0)
     for name, needs in (("p99_ms", "100"), ("p99.9_ms", "1,000")):
-        reason = found.measures[name].reason
+        reason = result.measures[name].reason
         assert reason == f"needs {needs} samples, has 16"
 
 
@@ -262,16 +262,16 @@ def test_a_tail_in_critical_frames_shows() -> None:
     taken = [(0, 100_000), (50_000, 250_000), (100_000, 100_000), (150_000, 350_000)]
     episode = replace(
         drive(conflicts=looked),
-        decisions=tuple(InferenceRecord(*each) for each in taken),
+        decisions=tuple(InferenceRecord(*decision) for decision in taken),
     )
 
-    found = charged([episode, replace(episode, conflicts=None)])
+    result = charged([episode, replace(episode, conflicts=None)])
 
-    assert found is not None
-    assert found.count == 8
-    assert found.measures["critical_mean_ms"].value == 300.0
-    assert found.measures["other_mean_ms"].value == 100.0
-    assert [row[0].text for row in deadlines_table("r", found).rows][-2:] == [
+    assert result is not None
+    assert result.count == 8
+    assert result.measures["critical_mean_ms"].value == 300.0
+    assert result.measures["other_mean_ms"].value == 100.0
+    assert [row[0].text for row in deadlines_table("r", result).rows][-2:] == [
         "mean, TTC below 1.5 s",
         "mean, other frames",
     ]
