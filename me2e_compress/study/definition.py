@@ -345,11 +345,10 @@ class Study:
         """Yield the files and folders that it reads."""
         yield from filter(None, (self.frames, self.held_out))
         yield from self.provider.plugins
-        for own in self.variants:
-            yield from filter(
-                None, (own.policy, own.module_map, own.adapter, own.trace)
-            )
-            yield from (file for step in own.passes for file in step.files())
+        for variant in self.variants:
+            files = variant.policy, variant.module_map, variant.adapter, variant.trace
+            yield from filter(None, files)
+            yield from (file for step in variant.passes for file in step.files())
 
     def check(self) -> None:
         """Check that there are routes and recordings, and that files exist.
@@ -387,14 +386,14 @@ class Study:
         chosen = tuple(blocks[name] for name in names)
         driven = {self.baseline, *(name for block in chosen for name in block.variants)}
         under = {name for block in chosen for name in block.conditions}
-        variants = tuple(own for own in self.variants if own.name in driven)
-        conditions = tuple(own for own in self.conditions if own.name in under)
+        variants = tuple(variant for variant in self.variants if variant.name in driven)
+        conditions = tuple(one for one in self.conditions if one.name in under)
         return replace(self, blocks=chosen, variants=variants, conditions=conditions)
 
     @property
     def reference(self) -> Variant:
         """The baseline variant."""
-        return next(own for own in self.variants if own.name == self.baseline)
+        return next(one for one in self.variants if one.name == self.baseline)
 
     def drive_of(self, name: str) -> tuple[Variant, Condition]:
         """Return variant and condition of ``VARIANT.CONDITION``."""

@@ -90,13 +90,13 @@ def time_all(
             which sets the device scale, is zero.
     """
     traces, measured = dict[str, LatencyTrace](), dict[str, LatencyTrace]()
-    for variant in (own.variant for own in prepared):
+    for variant in (entry.variant for entry in prepared):
         if variant.trace is not None:
             traces[variant.name] = LatencyTrace.load(variant.trace)
     reason = "no held-out frames were given"
     if study.held_out is not None:
         reason = "not a model"
-        timed = [own for own in prepared if own.model and not own.variant.trace]
+        timed = [entry for entry in prepared if entry.model and not entry.variant.trace]
         measured = _measure_traces(study, study.held_out, timed, workspace, listener)
     # Find the highest load under which a trace was measured here
     loads = [trace.others for trace in measured.values() if trace.others is not None]
@@ -121,15 +121,15 @@ def _measure_traces(
     timing, frames = study.timing, CalibrationSet(held_out)
     machine = in_turn_text(timing.threads, study.provider)
     parts = machine, str(timing.samples), frames.fingerprint
-    digests = (f"{own.name} {own.sha256}" for own in timed)
+    digests = (f"{entry.name} {entry.sha256}" for entry in timed)
     key = hashlib.sha256("\n".join((*parts, *digests)).encode()).hexdigest()
-    paths = {own.name: workspace.trace(own.variant, key) for own in timed}
+    paths = {entry.name: workspace.trace(entry.variant, key) for entry in timed}
     if all(path.is_file() for path in paths.values()):
         return {name: LatencyTrace.load(path) for name, path in paths.items()}
     traces = record_traces(
-        {own.name: own.model for own in timed if own.model is not None},
+        {entry.name: entry.model for entry in timed if entry.model is not None},
         frames,
-        metadata={own.name: own.metadata for own in timed},
+        metadata={entry.name: entry.metadata for entry in timed},
         samples=timing.samples,
         threads=timing.threads,
         provider=study.provider,
@@ -200,7 +200,7 @@ def compare_plans(
     if not math.isfinite(plan.max_m):
         return PlanFidelity.unknown("its plan is not finite")
     # An identical plan has an infinite ratio
-    noise_db = next(own.sqnr_db for own in fidelity.outputs if own.name == output)
+    noise_db = next(drift.sqnr_db for drift in fidelity.outputs if drift.name == output)
     sqnr = Measure(None, "dB", EXACT if noise_db == math.inf else "no plan")
     if math.isfinite(noise_db):
         sqnr = Measure(noise_db, "dB")

@@ -64,18 +64,16 @@ def run_study(
         cells, prepared = prepare_study(study, folder, engine, listener)
         # Compare plans and drives of every variant with the baseline's
         study, clock = cells.study, cells.clock
-        baseline = next(own for own in prepared if own.variant == study.reference)
+        baseline = next(entry for entry in prepared if entry.variant == study.reference)
         variants, drives = list[PreparedVariant](), list[DriveRecord]()
-        for own in prepared:
-            fidelity = compare_plans(study, baseline, own, listener)
-            latencies = clock.latencies(own)
-            variants.append(replace(own, latency_ms=latencies, fidelity=fidelity))
+        for entry in prepared:
+            fidelity = compare_plans(study, baseline, entry, listener)
+            latencies = clock.latencies(entry)
+            variants.append(replace(entry, latency_ms=latencies, fidelity=fidelity))
         for condition in study.conditions:
             drives += cells.drive_variants(condition, prepared)
-        compared, made_by = (
-            (tuple(variants), tuple(drives)),
-            (this_machine(), versions()),
-        )
+        compared = tuple(variants), tuple(drives)
+        made_by = this_machine(), versions()
         return StudyResult(study, *compared, clock.scale, *made_by, clock.load)
 
 
@@ -122,16 +120,16 @@ class StudyCells:
     ) -> list[DriveRecord]:
         """Drive the variants of one condition, the baseline first."""
         driven, baseline = self.study.driven_under(condition), self.study.baseline
-        prepared = [own for own in prepared if own.variant in driven]
+        prepared = [entry for entry in prepared if entry.variant in driven]
         # The baseline drives first: others are compared with it
-        ordered = sorted(prepared, key=lambda own: own.name != baseline)
-        records = {own.name: self._drive_cell(own, condition) for own in ordered}
+        ordered = sorted(prepared, key=lambda entry: entry.name != baseline)
+        records = {entry.name: self._drive_cell(entry, condition) for entry in ordered}
         for name, record in records.items():
             if name != baseline and record.routes and records[baseline].routes:
                 reference, seed = records[baseline].routes, self.study.seed
                 gap = difference(record.routes, reference, seed)
                 records[name] = replace(record, difference=gap)
-        return [records[own.name] for own in prepared]
+        return [records[entry.name] for entry in prepared]
 
     def drive(self, prepared: PreparedVariant, condition: Condition) -> Drive | None:
         """Return what a cell drives; None without a driver or its latency."""

@@ -53,7 +53,7 @@ class StudyResult(Result):
     @property
     def timed(self) -> bool:
         """Whether the latency of any variant is known."""
-        return any(own.latency_ms[50].value is not None for own in self.variants)
+        return any(one.latency_ms[50].value is not None for one in self.variants)
 
     @property
     def coverage(self) -> tuple[int, int]:
@@ -202,7 +202,7 @@ def _score_cells(drive: DriveRecord) -> tuple[Cell, ...]:
 
 def difference_table(result: StudyResult) -> Table:
     """Show every variant minus the baseline, paired by route."""
-    compared = [(own, gap) for own in result.drives if (gap := own.difference)]
+    compared = [(drive, gap) for drive in result.drives if (gap := drive.difference)]
     gaps = [gap for _, gap in compared]
     # p-values are corrected for all comparisons shown
     corrected, rows = holm([gap.p_value for gap in gaps]), list[tuple[Cell, ...]]()
@@ -242,7 +242,7 @@ def _differences_note(gaps: Sequence[PairedDifference]) -> str:
 def _gap_cells(gap: Comparison | PairedDifference) -> tuple[Cell, ...]:
     """Return one cell for each of `GAPS`."""
     estimates = gap.driving_score, gap.room_kept, gap.success_rate
-    score, room, rate = (estimate_cell(own, signed=True) for own in estimates)
+    score, room, rate = (estimate_cell(estimate, signed=True) for estimate in estimates)
     return score, anew_cell(gap.driving_score), room, rate
 
 
@@ -283,9 +283,9 @@ def route_tables(result: StudyResult) -> tuple[Table, ...]:
     rows = list[tuple[Cell, ...]]()
     for routes in zip(*(drive.routes for drive in driven), strict=True):
         cells = [Cell(routes[0].route)]
-        for end in routes:
-            room = "" if end.room_kept is None else f"; room {end.room_kept:.0f} %"
-            cells.append(Cell(f"{end.driving_score:.1f}", f"{end.fate}{room}"))
+        for route in routes:
+            room = "" if route.room_kept is None else f"; room {route.room_kept:.0f} %"
+            cells.append(Cell(f"{route.driving_score:.1f}", f"{route.fate}{room}"))
         rows.append(tuple(cells))
     columns = ("route", *map(result.label, driven))
     note = "Driving score, why it is not 100, and the room kept to others."

@@ -98,7 +98,7 @@ def test_each_route_has_its_end_unless_there_are_many(result: StudyResult) -> No
 
     assert table is not None
     assert table.columns[:2] == ("route", "blind, ideal")
-    assert [row[0].text for row in table.rows] == [each.id for each in ROUTES]
+    assert [row[0].text for row in table.rows] == [route.id for route in ROUTES]
     ends = {cell.detail for row in table.rows for cell in row[1:]}
     assert "collision with a vehicle; room 0 %" in ends
     many = (
@@ -123,7 +123,7 @@ def test_the_answer_has_a_row_a_variant_and_a_mark_a_drive(result: StudyResult) 
         assert drawn.count(f">{words}</text>") == count, words
     # a drive that was not made, and one condition alone
     ideal = [drive for drive in result.drives if drive.condition == IDEAL.name]
-    row = tuple(replace(each, scores=None) for each in ideal)
+    row = tuple(replace(drive, scores=None) for drive in ideal)
     study = replace(result.study, conditions=(IDEAL,))
     ideal_alone = answer(replace(result, study=study, drives=row))
     assert ideal_alone.count(">not driven<") == 4
@@ -163,7 +163,7 @@ def test_a_page_of_a_comparison_is_folded_but_for_its_pictures(page: str) -> Non
 
     assert head.count("<svg") == 2
     assert "<table" not in head
-    assert sum(each.count("<table") for each in rest) == page.count("<table") >= 6
+    assert sum(text.count("<table") for text in rest) == page.count("<table") >= 6
     assert head.index("<svg") < head.index('<ul class="findings">')
 
 

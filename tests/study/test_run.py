@@ -77,7 +77,7 @@ def test_the_same_model_does_not_differ_and_the_baseline_is_not_compared(
     result: StudyResult,
 ) -> None:
     ideal = [drive for drive in result.drives if drive.condition == IDEAL.name]
-    blind, slow, again, fast = (each.difference for each in ideal)
+    blind, slow, again, fast = (drive.difference for drive in ideal)
 
     assert slow is None
     assert again is not None
@@ -317,7 +317,7 @@ def test_a_record_keeps_what_the_tables_need(record: Path, tmp_path: Path) -> No
     read = DriveRecord.load(record)
     read.save(tmp_path / "again.jsonl")
 
-    assert [route.route for route in read.routes] == [each.id for each in ROUTES]
+    assert [route.route for route in read.routes] == [route.id for route in ROUTES]
     assert read.routes[0].latency_us == (500_000,) * 4
     assert read.made_by["set_size"] == 220
     assert record.stat().st_size < 2_000

@@ -221,7 +221,7 @@ def limits(outcome: StudyResult) -> str:
         f" 95 % interval of the mean. {plural(routes, 'route')} cannot show a"
         f" difference below {least:.1f} points of driving score{rest}."
     )
-    free = [own.name for own in outcome.study.conditions if own.latency == "none"]
+    free = [one.name for one in outcome.study.conditions if one.latency == "none"]
     if free:
         under = ", ".join(free)
         note += f" Decisions cost no time under {under}: no latency shows there."
