@@ -265,7 +265,7 @@ class TrafficRoad(Road):  # type: ignore[misc]  # highway-env is untyped
         pairs = list[tuple[RoadObject, RoadObject]]()
         for i, j in zip(first[hit].tolist(), second[hit].tolist(), strict=True):
             # people step aside for each other, and round things
-            people = [isinstance(each, Walker) for each in (bodies[i], bodies[j])]
+            people = [isinstance(body, Walker) for body in (bodies[i], bodies[j])]
             if not (all(people) or (any(people) and bodies[j] in self.objects)):
                 pairs.append((bodies[i], bodies[j]))
         return pairs

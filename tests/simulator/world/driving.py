@@ -38,7 +38,7 @@ def coast(world: World, frames: int, control: Control | None = None) -> None:
 def drive_blind(route: Route, speed_mps: float) -> list[Infraction]:
     """What was done wrong; that the end was not reached does not count."""
     episode = drive(route, Blind(speed_mps), Drive(FixedLatency(100_000)))
-    return [each for each in episode.infractions if each.kind not in ENDS_ONLY]
+    return [one for one in episode.infractions if one.kind not in ENDS_ONLY]
 
 
 def trace(route: Route, frames: int = 200, dt_us: int = 50_000) -> list[object]:
