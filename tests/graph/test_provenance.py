@@ -61,7 +61,7 @@ def test_a_file_holds_few_bytes_of_the_past_and_loses_but_passes(
     stored = [{each.key for each in node.metadata_props} for node in written.graph.node]
     assert [ORIGINS in keys for keys in stored] == [False, False, True, True]
     read = graph.load(tmp_path / "m.onnx")
-    kept = [PASSES in keys for keys in held]
+    kept = [PASSES in keys for keys in stored]
     assert kept == [False, False, True, True]
     assert [
         {key: text for key, text in props.items() if keep or key != PASSES}

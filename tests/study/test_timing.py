@@ -175,5 +175,5 @@ def test_a_baseline_without_latency_sets_no_scale(make: Make, tmp_path: Path) ->
 def test_a_real_clock(make: Make, tmp_path: Path) -> None:
     clock = clock_of(make(timing=Timing(12)), tmp_path)
 
-    assert [len(value.samples_us) for value in clock.traces.values()] == [12, 12, 12]
+    assert [len(trace.samples_us) for trace in clock.traces.values()] == [12, 12, 12]
     assert "in turn" in clock.traces["slow"].machine
