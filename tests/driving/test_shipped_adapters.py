@@ -128,6 +128,3 @@ def test_a_file_of_that_name_wins(
 def test_no_such_adapter_names_those_that_ship() -> None:
     with pytest.raises(EvaluationError, match="adapter tpc: no such file; we ship"):
         adapter_file(Path("tpc"))
-    words = r"tcp-fusion is gone .*models\.tcp\.policy"
-    with pytest.raises(EvaluationError, match=words):
-        adapter_file(Path("tcp-fusion"))
