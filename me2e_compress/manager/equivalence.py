@@ -144,28 +144,20 @@ def _verify_pieces(
     """Compare the pieces between steps: return a proof, or None and whether one breaks.
 
     A piece breaks the promise that differs by more than rounding moves it, however far
-    rounding moves the outputs after it.
+    rounding moves the outputs after it. What rounding moves as far within its piece is
+    unsteady; where every operand of a step is, nothing is proven.
     """
     steps = pieces.steps_after_changes(before, after)
     if not steps:
         return None, False
+    operands = list(pieces.operand_names(steps).values())
     try:
         gaps, limits = pieces.piece_errors(before, after, steps, inputs)
-        operands = list(pieces.operand_names(steps).values())
         limits = result.tolerances | limits
-        wrong = [n for n in (*result.judged, *operands) if gaps[n] > limits[n]]
-        if not wrong:
-            worst = max(operands, key=lambda name: gaps[name])
-            remark = (
-                "compared piece by piece, since behind a quantizer or a choice rounding"
-                f" alone is a whole step: {plural(len(operands), 'operand')} of such"
-                f" nodes are the same (off by {gaps[worst]:.1e} of its range at"
-                f" most, {worst}; allowed {limits[worst]:.0e})"
-            )
-            outputs = {name: gaps[name] for name in gaps if name not in operands}
-            return dataclasses.replace(result, errors=outputs, remarks=(remark,)), False
+        apart = [n for n in (*result.judged, *operands) if gaps[n] > limits[n]]
         # Inputs and weights of the first graph, changed in their last places
-        for seed in range(NUDGES):
+        wrong = apart
+        for seed in range(NUDGES if apart else 0):
             nudged = pieces.nudged_weights(before, seed), inputs.nudged(seed)
             trial, _ = pieces.piece_errors(before, nudged[0], steps, inputs, nudged[1])
             wrong = [name for name in wrong if gaps[name] > trial[name]]
@@ -173,7 +165,25 @@ def _verify_pieces(
                 break
     except (FramesError, GraphError):
         return None, False
-    return None, bool(wrong)
+    steady = [name for name in operands if name not in apart]
+    if wrong or not steady:
+        return None, bool(wrong)
+    worst, unsteady = max(steady, key=gaps.__getitem__), len(operands) - len(steady)
+    remark = (
+        "compared piece by piece, since behind a quantizer or a choice rounding"
+        f" alone is a whole step: {plural(len(steady), 'operand')} of such"
+        f" nodes are the same (off by {gaps[worst]:.1e} of its range at"
+        f" most, {worst}; allowed {limits[worst]:.0e})"
+        + f"; {unsteady} more move as far by rounding alone"
+        * bool(unsteady)
+    )
+    proof = dataclasses.replace(
+        result,
+        errors={name: gaps[name] for name in gaps if name not in operands},
+        unsteady=tuple(name for name in result.judged if name in apart),
+        remarks=(remark,),
+    )
+    return proof, False
 
 
 def difference(before: ir.Model, after: ir.Model, inputs: VerificationInputs) -> str:

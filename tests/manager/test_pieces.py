@@ -128,6 +128,40 @@ def test_a_breach_is_one_however_far_rounding_moves_what_is_behind_it(
     assert not check.passed
 
 
+CANCELLED = """<ir_version: 9, opset_import: ["" : 19]>
+m (float[1,64] x) => (float[1,64] y, float[1,64] other) {
+    ["/head/First"] a = Add(x, k)
+    ["/head/Second"] b = Sub(a, l)
+    c = Round(b)
+    d = Neg(x)
+    ["/head/Sum"] e = Add(d, w)
+    r = Round(e)
+    y = Mul(c, b)
+    other = Mul(r, d)
+}"""
+
+
+@pytest.mark.parametrize(("shift", "passed"), [(0.0, True), (0.02, False)])
+def test_a_piece_that_rounding_alone_moves_as_far_is_unsteady_not_wrong(
+    shift: float, passed: bool
+) -> None:
+    w, shifts = np.ones((1, 64), np.float32), (0.0, shift)
+    before, after = (
+        read(CANCELLED, k=w * large, l=w * large + moved, w=w + SHIFT * (large > 1e4))
+        for large, moved in zip((1e4, 3e4), shifts, strict=True)
+    )
+    for model in (before, after):
+        infer_shapes(model)
+    x = np.random.default_rng(3).uniform(0, 1, (1, 64)).astype(np.float32)
+
+    check = verified(before, after, Frame(0, True, {"x": x}))
+
+    assert check.passed == passed
+    if passed:
+        assert check.unsteady == ("y",)
+        assert "; 1 more move as far by rounding alone" in check.remarks[0]
+
+
 @pytest.mark.parametrize("guilty", [0, 1])
 def test_the_largest_error_of_all_frames_counts(guilty: int) -> None:
     before, after, frame = graphs("Round", SHIFT)
