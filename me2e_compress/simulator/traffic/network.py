@@ -304,7 +304,7 @@ def build_path(network: Network, legs: Sequence[Leg], goal_m: float) -> RoutePat
         stations = np.linspace(leg.enter_m, end, count)
         poses = [network.pose(leg.lane, float(s)) for s in stations]
         piece = np.array([(p.x, p.y) for p in poses])
-        begin = done
+        begin = change_end = done
         bridged = pieces and np.hypot(*(piece[0] - pieces[-1][-1])) > 0.5
         for line in (_bridge(pieces[-1], piece), piece) if bridged else (piece,):
             change_end = done
