@@ -359,9 +359,9 @@ class Item:
 
     Attributes:
         nodes: number of nodes, with those in subgraphs.
-        parameters: elements of all initializers but those of int32, int64, bool and
-            string, which are shapes, indices and masks.
-        weight_bytes: bytes of all initializers.
+        parameters: elements of weights: initializers, but those of int32, int64, bool
+            and string, which are shapes, indices and masks.
+        weight_bytes: of all initializers.
         macs: known multiply-accumulates: a lower bound if others are unknown, and then
             None instead of 0.
         unknown_macs_nodes: number of its nodes that are not in ``macs``.
