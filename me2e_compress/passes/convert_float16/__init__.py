@@ -1,11 +1,11 @@
 """Convert a graph to float16 where that is as good as float32."""
 
 import dataclasses
-import fnmatch
 import itertools
 import math
 from collections import Counter
 from collections.abc import Collection, Mapping
+from fnmatch import fnmatchcase
 
 import numpy as np
 import onnx_ir as ir
@@ -170,7 +170,7 @@ def _matches(model: ir.Model, pattern: str) -> list[ir.Node]:
     def words(node: ir.Node) -> list[str]:
         return [node.name or "", node.op_type, provenance.module_of(node)]
 
-    nodes = [node for node in model.graph if fnmatch.filter(words(node), pattern)]
+    nodes = [n for n in model.graph if any(fnmatchcase(w, pattern) for w in words(n))]
     if not nodes:
         raise PreconditionError(f"keep: no node, operator or module is {pattern!r}")
     return nodes
