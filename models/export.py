@@ -20,15 +20,15 @@ from typing import TYPE_CHECKING
 import onnx
 
 from me2e_compress import graph
-from me2e_compress.display import format_mb
-from me2e_compress.errors import GraphError, Me2eError, RecipeError
+from me2e_compress.base.atomic import PRODUCER
+from me2e_compress.base.display import format_mb
+from me2e_compress.base.errors import GraphError, Me2eError, RecipeError
+from me2e_compress.commands.checks import writing
+from me2e_compress.commands.inspect import WEIGHTS
+from me2e_compress.commands.options import check_count
 from me2e_compress.graph import file_bytes
 from me2e_compress.operators.deformable_attention import DeformableAttention
-from me2e_compress.registry.drafts import PRODUCER
 from me2e_compress.shipped.drivers import write_model_file
-from me2e_compress.workflows.checks import writing
-from me2e_compress.workflows.inspect import WEIGHTS
-from me2e_compress.workflows.options import check_count
 from models.construct import construct, draw
 from models.dialect import in_dialect
 from models.published_weights import PublishedWeights, published_weights

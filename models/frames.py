@@ -8,12 +8,12 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 
+from me2e_compress.base.errors import Me2eError
 from me2e_compress.calibration.recording import Begin, partial_folder, write_recording
-from me2e_compress.errors import Me2eError
+from me2e_compress.commands.checks import check_folder, writing
+from me2e_compress.commands.options import check_count
 from me2e_compress.runtime.frames import Frame
 from me2e_compress.version import __version__
-from me2e_compress.workflows.checks import check_folder, writing
-from me2e_compress.workflows.options import check_count
 from models.stacks import STACKS, find
 from models.synthetic_frames import frames
 

@@ -7,8 +7,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from me2e_compress.errors import GraphError
-from me2e_compress.workflows.inspect import WEIGHTS
+from me2e_compress.base.errors import GraphError
+from me2e_compress.commands.inspect import WEIGHTS
 from models.construct import construct
 from models.published_names import PUBLISHED, Mismatch, NameMatch
 from models.stacks import Stack, find

@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Literal
 
-from me2e_compress.errors import GraphError
+from me2e_compress.base.errors import GraphError
 from models.bev.sizes import CAMERAS, EMBED
 from models.uniad.config import CONFIGS, MEMORY, UniadConfig
 from models.vad.config import VadConfig

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from me2e_compress.errors import GraphError
-from me2e_compress.registry.documents import MalformedError, check_regular, reading
+from me2e_compress.base.documents import MalformedError, check_regular, reading
+from me2e_compress.base.errors import GraphError
 
 if TYPE_CHECKING:
     from torch import Tensor

@@ -7,7 +7,7 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
-from me2e_compress.errors import FramesError
+from me2e_compress.base.errors import FramesError
 from models.stacks import Stack
 from models.synthetic_cameras import LIDAR_HEIGHT_M, SCALE, render, rig
 from models.synthetic_world import (

@@ -6,10 +6,10 @@ from typing import cast
 import onnx_ir as ir
 import pytest
 
+from me2e_compress.commands import checks
 from me2e_compress.driving.policies import POLICIES
 from me2e_compress.graph.modules.module_map import ModuleMap
 from me2e_compress.passes.base import Context
-from me2e_compress.workflows import checks
 from tests.support import profiles
 from tests.support.command import cli, command, dense, files
 from tests.support.in_process import here, short

@@ -12,9 +12,9 @@ import onnx_ir as ir
 import pytest
 
 from me2e_compress import graph
+from me2e_compress.base.errors import FramesError, RecipeError
 from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.driving.onnx_policy import OnnxPolicy
-from me2e_compress.errors import FramesError, RecipeError
 from me2e_compress.graph import provenance
 from me2e_compress.graph.modules.assign import detect
 from me2e_compress.graph.modules.module_map import ModuleMap

@@ -5,8 +5,8 @@ from pathlib import Path
 import pytest
 
 from me2e_compress import graph
+from me2e_compress.base.errors import GraphError
 from me2e_compress.calibration.dataset import CalibrationSet
-from me2e_compress.errors import GraphError
 from me2e_compress.shipped.drivers import SHIPPED, card, copy, frames_of, shipped_model
 
 

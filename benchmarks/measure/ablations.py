@@ -25,13 +25,13 @@ from benchmarks.paper.published import (
 )
 from benchmarks.subjects.subjects import write_source
 from me2e_compress import graph
+from me2e_compress.base.errors import Me2eError
 from me2e_compress.calibration.dataset import CalibrationSet
-from me2e_compress.errors import Me2eError
+from me2e_compress.commands.inspect import weigh
 from me2e_compress.graph.modules.module_map import ModuleMap
 from me2e_compress.manager import PassManager, recipe
 from me2e_compress.passes import Context, Pass
 from me2e_compress.shipped.drivers import frames_of
-from me2e_compress.workflows.inspect import weigh
 
 LEDGER_M = {
     "uniad-scheme-1": 14.455,

@@ -24,6 +24,7 @@ import numpy as np
 import numpy.typing as npt
 import onnx
 
+from me2e_compress.commands.result import SILENT
 from me2e_compress.driving.contract import Observation, RouteInfo
 from me2e_compress.driving.latency import FixedLatency
 from me2e_compress.driving.onnx_policy import OnnxPolicy
@@ -36,7 +37,6 @@ from me2e_compress.metrics.bench2drive import ABILITIES
 from me2e_compress.metrics.measure import Estimate
 from me2e_compress.metrics.scores import Scores, score
 from me2e_compress.simulator.routes import Route, load_routes, pick_routes
-from me2e_compress.workflows.result import SILENT
 from models.driver.expert import Expert
 from models.driver.expert.blind import BlindDriver
 

@@ -37,6 +37,7 @@ from benchmarks.tools.layer_timing import (
     time_graphs,
 )
 from me2e_compress import graph
+from me2e_compress.commands.plan import PreparedGraph
 from me2e_compress.graph import static_shape
 from me2e_compress.graph.nodes import constant_values
 from me2e_compress.passes import Context
@@ -49,7 +50,6 @@ from me2e_compress.targets.onnxruntime import OnnxRuntime
 from me2e_compress.targets.onnxruntime.costs import costs_of
 from me2e_compress.targets.onnxruntime.region import end_of, objection
 from me2e_compress.targets.weights import biased_end
-from me2e_compress.workflows.plan import PreparedGraph
 from models.export import export
 
 WRONG = 1.1

@@ -48,8 +48,8 @@ from benchmarks.subjects.subject import Subject
 from benchmarks.tools import processes
 from benchmarks.tools.gpu_table import Found, write
 from me2e_compress import graph
-from me2e_compress.errors import ProviderError
-from me2e_compress.runtime.atomic import write_json
+from me2e_compress.base.atomic import write_json
+from me2e_compress.base.errors import ProviderError
 from me2e_compress.runtime.providers import CPU, PROVIDERS, Provider, provider_named
 
 FRAMES = {"highway": 64, "vad-tiny": 2}

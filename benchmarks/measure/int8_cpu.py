@@ -35,8 +35,8 @@ from benchmarks.tools.layer_timing import time_interleaved
 from benchmarks.tools.peer import peak_mb
 from benchmarks.tools.processes import answer, has_modelopt
 from me2e_compress import graph
+from me2e_compress.base.errors import GraphError
 from me2e_compress.calibration.dataset import CalibrationSet
-from me2e_compress.errors import GraphError
 from me2e_compress.fidelity.compare import compare
 from me2e_compress.graph.modules.module_map import ModuleMap
 from me2e_compress.graph.nodes import constant_values

@@ -192,7 +192,7 @@ def _subject(
     name: str, out: Path
 ) -> tuple[ir.Model, CalibrationSet, CalibrationSet, ModuleMap]:
     from benchmarks.subjects.subjects import make, write_frames
-    from me2e_compress.workflows.checks import load_map
+    from me2e_compress.commands.checks import load_map
 
     calibrated, held_out = FRAMES[name]
     subject = make(name, out, calibrated)
@@ -215,8 +215,8 @@ def _crests(seen: Statistics) -> str:
 
 def scenes(folder: Path) -> None:
     """Compare the ranges of recordings, and of a few scenes with those of all."""
-    from me2e_compress.workflows.checks import model_path
-    from me2e_compress.workflows.plan import PreparedGraph
+    from me2e_compress.commands.checks import model_path
+    from me2e_compress.commands.plan import PreparedGraph
 
     path = model_path("highway")
     ready = PreparedGraph.of(path, graph.load(path), None)

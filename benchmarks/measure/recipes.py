@@ -18,12 +18,12 @@ from time import process_time
 from benchmarks.subjects.tensorrt_recipe import for_tensorrt
 from me2e_compress import graph
 from me2e_compress.calibration.dataset import CalibrationSet
+from me2e_compress.commands.compress import compress
+from me2e_compress.commands.options import CompressOptions
 from me2e_compress.fidelity.compare import Reference
 from me2e_compress.fidelity.liveness import LivenessTally
 from me2e_compress.manager import recipe
 from me2e_compress.runtime.session import Session
-from me2e_compress.workflows.compress import compress
-from me2e_compress.workflows.options import CompressOptions
 from models.export import export
 from models.frames import record
 

@@ -16,10 +16,10 @@ import time
 from pathlib import Path
 
 from benchmarks.tools.driver_records import routes_csv
-from me2e_compress.errors import Me2eError
+from me2e_compress.base.atomic import write_bytes
+from me2e_compress.base.errors import Me2eError
 from me2e_compress.evaluators.highway.engine import LocalEngine
 from me2e_compress.evaluators.results import ResultsFolder
-from me2e_compress.runtime.atomic import write_bytes
 from me2e_compress.study import Listener, Study, load_study, run_study
 from me2e_compress.study.drive_record import DriveRecord
 from me2e_compress.study.report.page import write_study

@@ -24,8 +24,11 @@ from benchmarks.paper.published import INT8_COUNTS
 from benchmarks.paper.weigh import int8_counts
 from benchmarks.subjects.subjects import write_source
 from me2e_compress import graph
+from me2e_compress.base.errors import Me2eError
 from me2e_compress.calibration.ranges import Ranges
-from me2e_compress.errors import Me2eError
+from me2e_compress.commands.compress import compress
+from me2e_compress.commands.lint import lint
+from me2e_compress.commands.options import CompressOptions, LintOptions
 from me2e_compress.graph import provenance
 from me2e_compress.graph.modules.module_map import ModuleMap
 from me2e_compress.quantization.decision import stamp_plan
@@ -33,9 +36,6 @@ from me2e_compress.quantization.plan import make_plan
 from me2e_compress.quantization.rules import RULE_SETS
 from me2e_compress.quantization.scheme import QuantScheme
 from me2e_compress.targets import TARGETS
-from me2e_compress.workflows.compress import compress
-from me2e_compress.workflows.lint import lint
-from me2e_compress.workflows.options import CompressOptions, LintOptions
 
 PRESETS = {"uniad-tiny": "uniad", "vad-tiny": "vad"}
 PAPER = {"uniad-tiny": "UniAD", "vad-tiny": "VAD"}

@@ -23,8 +23,8 @@ from benchmarks.paper.drives import FILE
 from benchmarks.paper.questions import SHIPPED
 from benchmarks.paper.records import RECORDS, add_facts, files, read_paper
 from benchmarks.paper.result import paper_page
-from me2e_compress.errors import Me2eError
-from me2e_compress.runtime.atomic import write_bytes
+from me2e_compress.base.atomic import write_bytes
+from me2e_compress.base.errors import Me2eError
 from me2e_compress.study import load_study
 
 ROOT = Path(__file__).parents[2]

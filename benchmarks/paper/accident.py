@@ -13,11 +13,11 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Polygon
 from pydantic import ConfigDict, TypeAdapter, with_config
 
-from me2e_compress.errors import StudyError
+from me2e_compress.base import atomic, documents
+from me2e_compress.base.atomic import write_json
+from me2e_compress.base.errors import StudyError
 from me2e_compress.metrics.episode import COLLISIONS, InfractionKind
 from me2e_compress.metrics.route_summary import RouteSummary
-from me2e_compress.registry import documents, drafts
-from me2e_compress.runtime.atomic import write_json
 from me2e_compress.simulator.pictures import Moment
 from me2e_compress.simulator.routes import Route
 from me2e_compress.simulator.scene import Actor, Ego
@@ -78,7 +78,7 @@ class Accident:
 
     def save(self, path: Path) -> None:
         """Write it as JSON."""
-        with drafts.writing_errors(path, StudyError):
+        with atomic.writing_errors(path, StudyError):
             write_json(path, _ACCIDENT.dump_python(self, mode="json"))
 
     @classmethod

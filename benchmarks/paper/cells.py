@@ -6,7 +6,7 @@ from typing import Literal
 from benchmarks.paper.drives import ModelFacts, PaperDrives
 from benchmarks.paper.normalizations import scored
 from benchmarks.paper.published import PublishedDrive
-from me2e_compress.display import Cell
+from me2e_compress.base.display import Cell
 from me2e_compress.driving.realtime import DT_US, skipped_decisions
 from me2e_compress.metrics.eer import POINTS, RouteMeasures, eer, route_measures
 from me2e_compress.metrics.measure import Estimate, Measure

@@ -4,7 +4,7 @@ from collections import Counter
 
 from benchmarks.paper.drives import SCHEMES, ModelFacts, PaperDrives
 from benchmarks.paper.published import INT8_COUNTS
-from me2e_compress.display import Cell, Table
+from me2e_compress.base.display import Cell, Table
 from me2e_compress.metrics.episode import InfractionKind
 from me2e_compress.study.cells import MISSING
 

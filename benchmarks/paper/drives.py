@@ -10,10 +10,10 @@ from pydantic import ConfigDict, TypeAdapter, with_config
 
 from benchmarks.paper.accident import Accident
 from benchmarks.paper.questions import SHIPPED, PaperQuestions
-from me2e_compress.errors import StudyError
+from me2e_compress.base import atomic, documents
+from me2e_compress.base.atomic import write_json
+from me2e_compress.base.errors import StudyError
 from me2e_compress.metrics.route_summary import COLUMNS, RouteColumn
-from me2e_compress.registry import documents, drafts
-from me2e_compress.runtime.atomic import write_json
 from me2e_compress.runtime.energy import EnergyResult
 from me2e_compress.study import Study
 from me2e_compress.study.drive_record import DriveRecord
@@ -112,7 +112,7 @@ class KeptFacts:
 
     def save(self, path: Path) -> None:
         """Write them as JSON."""
-        with drafts.writing_errors(path, StudyError):
+        with atomic.writing_errors(path, StudyError):
             path.parent.mkdir(parents=True, exist_ok=True)
             write_json(path, _KEPT.dump_python(self, mode="json"))
 

@@ -6,7 +6,7 @@ from enum import StrEnum
 from benchmarks.paper.drives import PaperDrives
 from benchmarks.paper.evidence import Found, evidence
 from benchmarks.paper.questions import BEFORE, PaperQuestion, PaperQuestions
-from me2e_compress.display import Cell, Table
+from me2e_compress.base.display import Cell, Table
 from me2e_compress.metrics.route_summary import holm
 from me2e_compress.study.cells import MISSING, estimate_cell
 

@@ -6,7 +6,7 @@ from enum import StrEnum
 
 import numpy as np
 
-from me2e_compress.errors import EvaluationError
+from me2e_compress.base.errors import EvaluationError
 from me2e_compress.metrics.eer import (
     POINTS,
     EerResult,

@@ -9,8 +9,8 @@ from typing import Literal, Self
 
 from pydantic import ConfigDict, TypeAdapter, with_config
 
-from me2e_compress.errors import StudyError
-from me2e_compress.registry import documents
+from me2e_compress.base import documents
+from me2e_compress.base.errors import StudyError
 from me2e_compress.study.cells import MINUS, number
 from me2e_compress.study.definition import check_unique
 

@@ -13,7 +13,7 @@ from benchmarks.paper.questions import FILE as QUESTIONS
 from benchmarks.paper.questions import SHIPPED, PaperQuestions
 from benchmarks.paper.result import PaperResult
 from benchmarks.paper.weigh import weigh, weighed
-from me2e_compress.errors import StudyError
+from me2e_compress.base.errors import StudyError
 from me2e_compress.evaluators.highway import runner
 from me2e_compress.evaluators.highway.engine import LocalEngine
 from me2e_compress.simulator.pictures import Moment

@@ -18,7 +18,7 @@ from benchmarks.paper.findings import (
     told_of_questions,
 )
 from benchmarks.paper.tables import all_paper_tables
-from me2e_compress.display import Table
+from me2e_compress.base.display import Table
 from me2e_compress.study.report.figures import styled, svg
 from me2e_compress.study.report.page import Drawing, Page, Section
 

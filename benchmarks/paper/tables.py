@@ -25,7 +25,7 @@ from benchmarks.paper.cells import (
 from benchmarks.paper.counts import partners, table_4
 from benchmarks.paper.drives import PaperDrives
 from benchmarks.paper.published import PublishedDrive
-from me2e_compress.display import Cell, Table
+from me2e_compress.base.display import Cell, Table
 from me2e_compress.metrics.route_summary import PERCENTS
 from me2e_compress.study.cells import MISSING
 from me2e_compress.study.definition import StudyBlock

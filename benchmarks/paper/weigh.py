@@ -14,8 +14,12 @@ from benchmarks.paper.drives import (
 )
 from benchmarks.paper.evidence import FEWEST_RUNS
 from me2e_compress import graph
+from me2e_compress.base.errors import StudyError
 from me2e_compress.calibration.dataset import CalibrationSet
-from me2e_compress.errors import StudyError
+from me2e_compress.commands.inspect import inspect
+from me2e_compress.commands.options import InspectOptions, ProfileOptions
+from me2e_compress.commands.profile import profile
+from me2e_compress.commands.result import Listener
 from me2e_compress.graph import WEIGHTED
 from me2e_compress.quantization.decision import plan_of
 from me2e_compress.runtime.energy.meter import measure_energy
@@ -25,10 +29,6 @@ from me2e_compress.study.definition import Study
 from me2e_compress.study.outcome import Clock, this_machine
 from me2e_compress.study.prepared import PreparedVariant
 from me2e_compress.study.run import StudyCells
-from me2e_compress.workflows.inspect import inspect
-from me2e_compress.workflows.options import InspectOptions, ProfileOptions
-from me2e_compress.workflows.profile import profile
-from me2e_compress.workflows.result import Listener
 
 PROFILED = 100
 """Inferences under a profiler, for the figure of modules."""

@@ -21,11 +21,11 @@ import numpy as np
 from benchmarks.subjects import bev_head, original_patterns, original_tcp, resnet50
 from benchmarks.subjects.subject import Subject, at
 from me2e_compress import graph
+from me2e_compress.commands.compress import compress
+from me2e_compress.commands.files import export_stack
+from me2e_compress.commands.frames import record_frames
+from me2e_compress.commands.options import CompressOptions, FramesOptions
 from me2e_compress.shipped.drivers import SHIPPED
-from me2e_compress.workflows.compress import compress
-from me2e_compress.workflows.files import export_stack
-from me2e_compress.workflows.frames import record_frames
-from me2e_compress.workflows.options import CompressOptions, FramesOptions
 from models.export import export
 from models.frames import record
 

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 import pynvml
 
+from me2e_compress.base.atomic import write_bytes, write_json
 from me2e_compress.manager.report import versions
-from me2e_compress.runtime.atomic import write_bytes, write_json
 from me2e_compress.runtime.profile import processor
 
 PLANS = {"vad-tiny": "ego_fut_preds", "highway": "plan"}

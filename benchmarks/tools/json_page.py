@@ -14,11 +14,11 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
 
 import me2e_compress
-from me2e_compress.runtime.atomic import write_bytes
+from me2e_compress.base.atomic import write_bytes
+from me2e_compress.commands.lint import RuleSummary
+from me2e_compress.commands.listing import DoctorResult, ListResult
+from me2e_compress.commands.result import Result
 from me2e_compress.runtime.latency_trace import TimeShare
-from me2e_compress.workflows.lint import RuleSummary
-from me2e_compress.workflows.listing import DoctorResult, ListResult
-from me2e_compress.workflows.result import Result
 
 PAGE = Path(__file__).parents[2] / "docs" / "json.md"
 FORMS = Path(__file__).with_name("json_forms.txt")

@@ -27,8 +27,8 @@ import onnxruntime as ort
 import pynvml
 
 from benchmarks.tools.run_one import peak_mb
-from me2e_compress.errors import EnergyError, Me2eError
-from me2e_compress.registry import name_in
+from me2e_compress.base.errors import EnergyError, Me2eError
+from me2e_compress.base.text import name_in
 from me2e_compress.runtime.energy import EnergyResult
 from me2e_compress.runtime.energy.energy_counter import (
     ENERGY_COUNTERS,

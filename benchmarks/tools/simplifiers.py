@@ -63,8 +63,8 @@ class Taken:
 
 
 def ours(job: Job, verify_frames: int = 0) -> Work:
-    from me2e_compress.workflows.compress import compress
-    from me2e_compress.workflows.options import CompressOptions
+    from me2e_compress.commands.compress import compress
+    from me2e_compress.commands.options import CompressOptions
 
     module_map: str | Path = job.preset
     if not job.preset:

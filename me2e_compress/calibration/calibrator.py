@@ -14,6 +14,9 @@ import onnx_ir as ir
 import onnx_ir.passes.common as common
 
 from me2e_compress import graph
+from me2e_compress.base import documents
+from me2e_compress.base.atomic import write_bytes
+from me2e_compress.base.errors import FramesError, GraphError
 from me2e_compress.calibration.dataset import CalibrationSet, load_arrays, npz_bytes
 from me2e_compress.calibration.observers import DEFAULT_METHOD, OBSERVERS
 from me2e_compress.calibration.ranges import Ranges
@@ -28,10 +31,7 @@ from me2e_compress.calibration.statistics import (
     index_inputs,
     is_not_finite,
 )
-from me2e_compress.errors import FramesError, GraphError
 from me2e_compress.graph.nodes import makers_of, reads_of
-from me2e_compress.registry import documents
-from me2e_compress.runtime.atomic import write_bytes
 from me2e_compress.runtime.frames import Array
 from me2e_compress.runtime.probing import (
     READINGS,

@@ -30,12 +30,12 @@ import numpy.typing as npt
 import onnx_ir as ir
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, PositiveInt
 
-from me2e_compress.display import error_line
-from me2e_compress.errors import FramesError, PreconditionError
+from me2e_compress.base import atomic, documents
+from me2e_compress.base.display import error_line
+from me2e_compress.base.documents import NPZ_ERRORS, check_regular
+from me2e_compress.base.errors import FramesError, PreconditionError
 from me2e_compress.graph import array_of, static_shape
 from me2e_compress.graph.recurrence import not_fed_back, recurrent_inputs, sides
-from me2e_compress.registry import documents, drafts
-from me2e_compress.registry.documents import NPZ_ERRORS, check_regular
 from me2e_compress.runtime.frames import Array, Frame
 
 LARGEST_BYTES = 2 << 30
@@ -100,7 +100,7 @@ def npz_bytes(
     """Return an ``.npz`` of arrays; equal arrays give equal bytes."""
     content = io.BytesIO()
     with zipfile.ZipFile(content, "w", compression) as archive:
-        archive.comment = drafts.BYTES
+        archive.comment = atomic.BYTES
         for name, array in arrays.items():
             with archive.open(f"{name}.npy", "w", force_zip64=True) as entry:
                 np.lib.format.write_array(

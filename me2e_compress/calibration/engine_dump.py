@@ -7,9 +7,9 @@ import functools
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 
+from me2e_compress.base.display import plural
+from me2e_compress.base.errors import FramesError
 from me2e_compress.calibration.dataset import CalibrationSet, load_arrays, read_headers
-from me2e_compress.display import plural
-from me2e_compress.errors import FramesError
 from me2e_compress.runtime.frames import Array
 
 _CACHED = 8

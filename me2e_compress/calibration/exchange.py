@@ -10,10 +10,10 @@ from pathlib import Path
 
 import onnx_ir as ir
 
+from me2e_compress.base.display import join_names, plural
+from me2e_compress.base.errors import FramesError
 from me2e_compress.calibration.observers import QUANT_MAX
 from me2e_compress.calibration.ranges import IMPORTED, LARGEST, Ranges
-from me2e_compress.display import join_names, plural
-from me2e_compress.errors import FramesError
 from me2e_compress.graph import digest, provenance
 
 _LEAST_SHARE = 0.5

@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 import onnx_ir as ir
 
-from me2e_compress.errors import FramesError, GraphError
+from me2e_compress.base.errors import FramesError, GraphError
 from me2e_compress.runtime.frames import Array, Frames
 from me2e_compress.runtime.providers import CPU, Provider
 from me2e_compress.runtime.session import Session, replay

@@ -11,9 +11,9 @@ from typing import ClassVar, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
+from me2e_compress.base.errors import FramesError, RecipeError
+from me2e_compress.base.registry import Registry
 from me2e_compress.calibration.statistics import BINS, Statistics
-from me2e_compress.errors import FramesError, RecipeError
-from me2e_compress.registry import Registry
 
 __all__ = ["OBSERVERS", "QUANT_MAX", "Bounds", "Observer", "scale_of"]
 

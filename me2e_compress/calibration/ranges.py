@@ -9,12 +9,12 @@ from typing import Literal, Self, TypeAlias
 import numpy as np
 import pydantic
 
+from me2e_compress.base import documents
+from me2e_compress.base.atomic import write_document
+from me2e_compress.base.display import join_names, plural
+from me2e_compress.base.errors import FramesError
 from me2e_compress.calibration.observers import OBSERVERS, Observer
 from me2e_compress.calibration.statistics import ALL_ZERO, NOT_FINITE, Statistics
-from me2e_compress.display import join_names, plural
-from me2e_compress.errors import FramesError
-from me2e_compress.registry import documents
-from me2e_compress.runtime.atomic import write_document
 
 OUTLIER_CREST = 64
 """Crest factor (largest magnitude of the range over root mean square) from which a

@@ -10,10 +10,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar, TypeAlias
 
+from me2e_compress.base import atomic, documents
+from me2e_compress.base.atomic import write_document
+from me2e_compress.base.errors import FramesError
+from me2e_compress.base.registry import Registry
 from me2e_compress.calibration.dataset import PixelInput, PixelInputs, npz_bytes
-from me2e_compress.errors import FramesError
-from me2e_compress.registry import Registry, documents, drafts
-from me2e_compress.runtime.atomic import write_document
 from me2e_compress.runtime.frames import Frame
 from me2e_compress.runtime.providers import CPU, Provider
 
@@ -73,14 +74,14 @@ def write_recording(
             draft.write(frame)
         if not draft.scenes:
             raise FramesError(f"{folder}: there are no frames to write")
-        # The index makes the folder a recording; a kill may have left drafts.
+        # The index makes the folder a recording; a kill may have left atomic.
         for leftover in partial.glob(f".{PROGRESS}.*"):
             leftover.unlink()
         count = {"count": draft.count}
-        index = {**drafts.IN_JSON, "scenes": draft.scenes, **described, **count}
-        with drafts.naming_file(partial / INDEX):
+        index = {**atomic.IN_JSON, "scenes": draft.scenes, **described, **count}
+        with atomic.naming_file(partial / INDEX):
             (partial / INDEX).write_text(json.dumps(index, indent=1) + "\n")
-        drafts.put_in_place(partial, folder)
+        atomic.put_in_place(partial, folder)
         (folder / PROGRESS).unlink()
     finally:
         if len(draft.scenes) < 2:  # nothing to go on from
@@ -129,7 +130,7 @@ class _Draft:
             record = {"scenes": self.scenes, "places": self.places}
             write_document(self.folder / PROGRESS, {"key": self.key, **record})
         path = self._frame(self.count)
-        with drafts.naming_file(path):
+        with atomic.naming_file(path):
             path.write_bytes(npz_bytes(frame.arrays, zipfile.ZIP_DEFLATED))
         self.count += 1
 

@@ -5,8 +5,8 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Literal
 
+from me2e_compress.base.display import plural
 from me2e_compress.calibration.ranges import OUTLIER_CREST, Activity, Ranges
-from me2e_compress.display import plural
 
 ROUND_CREST = 254
 """Crest factor from which half an int8 step (range / 254) exceeds the root mean square,

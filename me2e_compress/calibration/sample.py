@@ -5,8 +5,8 @@ import itertools
 
 import numpy as np
 
+from me2e_compress.base.errors import FramesError
 from me2e_compress.calibration.dataset import CalibrationSet
-from me2e_compress.errors import FramesError
 
 
 def draw(whole: CalibrationSet, count: int, seed: int) -> CalibrationSet:

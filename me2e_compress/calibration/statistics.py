@@ -10,8 +10,8 @@ import numpy as np
 import numpy.typing as npt
 import onnx_ir as ir
 
-from me2e_compress.display import join_names, plural
-from me2e_compress.errors import FramesError
+from me2e_compress.base.display import join_names, plural
+from me2e_compress.base.errors import FramesError
 from me2e_compress.graph.nodes import FLOATS, grid_of, reads_of
 from me2e_compress.runtime.frames import Array
 from me2e_compress.runtime.probing import READINGS, Probe, insert_probes

@@ -5,9 +5,9 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
+from me2e_compress.base.display import escape_controls
+from me2e_compress.base.errors import Me2eError, OptionError
 from me2e_compress.cli.signals import INTERRUPTED, TERMINATED, handle_signals
-from me2e_compress.display import escape_controls
-from me2e_compress.errors import Me2eError, OptionError
 
 RUN_AGAIN = "run again to go on"
 RESUMES = {
@@ -54,8 +54,8 @@ def _run(run: Callable[[], None]) -> int:
     """Run a command; print an error of the user's on one line; return the exit code."""
     from cyclopts import CycloptsError
 
+    from me2e_compress.base.extras import with_install_hint
     from me2e_compress.cli.console import errors
-    from me2e_compress.extras import with_install_hint
 
     try:
         # file names that are not UTF-8, and a current folder that was removed

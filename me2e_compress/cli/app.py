@@ -5,9 +5,9 @@ from typing import Annotated
 
 from cyclopts import App, Group, Parameter
 
+from me2e_compress.base.extras import missing_module
 from me2e_compress.cli import commands, driving
 from me2e_compress.cli.console import printing
-from me2e_compress.extras import missing_module
 from me2e_compress.version import __version__
 
 

@@ -9,10 +9,10 @@ from typing import Annotated, TypeAlias
 
 from cyclopts import Parameter
 
+from me2e_compress.base.errors import EvaluationError, OptionError, RecipeError
+from me2e_compress.base.extras import require_extra
 from me2e_compress.cli.console import listening, printing, say, show, show_call, tell
-from me2e_compress.errors import EvaluationError, OptionError, RecipeError
-from me2e_compress.extras import require_extra
-from me2e_compress.workflows.options import (
+from me2e_compress.commands.options import (
     CalibrateOptions,
     CompareOptions,
     CompressOptions,
@@ -25,7 +25,7 @@ from me2e_compress.workflows.options import (
     SensitivityOptions,
     WriteOptions,
 )
-from me2e_compress.workflows.result import Result
+from me2e_compress.commands.result import Result
 
 Output: TypeAlias = Annotated[Path, Parameter(name=["--output", "-o"])]
 WRITING = WriteOptions()
@@ -66,7 +66,7 @@ def demo(
 
 def doctor() -> None:
     """Show what this machine can do, and what to install for the rest."""
-    from me2e_compress.workflows.listing import doctor as workflow
+    from me2e_compress.commands.listing import doctor as workflow
 
     show(workflow())
 
@@ -77,7 +77,7 @@ def list_entries(kind: str | None = None, /) -> None:
     Args:
         kind: passes, rules, ...: one kind, and what its options mean
     """
-    from me2e_compress.workflows.listing import list_entries as workflow
+    from me2e_compress.commands.listing import list_entries as workflow
 
     show(workflow(kind))
 
@@ -89,7 +89,7 @@ def export(stack: str, /, *, output: Output, writing: WriteOptions = WRITING) ->
         stack: highway
         output: the ONNX file
     """
-    from me2e_compress.workflows.files import export_stack
+    from me2e_compress.commands.files import export_stack
 
     show(export_stack(stack, output, force=writing.force))
 
@@ -100,7 +100,7 @@ def inspect(model: str, /, *, options: InspectOptions | None = None) -> None:
     Args:
         model: the ONNX file, or highway; not changed
     """
-    from me2e_compress.workflows.inspect import inspect as workflow
+    from me2e_compress.commands.inspect import inspect as workflow
 
     show(workflow(model, options))
 
@@ -112,7 +112,7 @@ def join(stack: Path, /, *, output: Output, writing: WriteOptions = WRITING) -> 
         stack: the TOML file that names the files
         output: the joined graph
     """
-    from me2e_compress.workflows.files import join as workflow
+    from me2e_compress.commands.files import join as workflow
 
     show(workflow(stack, output, force=writing.force))
 
@@ -127,7 +127,7 @@ def split(
         stack: the TOML file that names the files
         output: the folder of the files
     """
-    from me2e_compress.workflows.files import split as workflow
+    from me2e_compress.commands.files import split as workflow
 
     show(workflow(model, stack, output, force=writing.force))
 
@@ -145,7 +145,7 @@ def frames(
         stack: highway, or M.onnx
         output: the folder
     """
-    from me2e_compress.workflows.frames import FramesResult, record_frames
+    from me2e_compress.commands.frames import FramesResult, record_frames
 
     with listening() as listener:
         record_frames(stack, output, options, listener)
@@ -167,7 +167,7 @@ def plan(
         model: the ONNX file, or highway; float or with a plan
         output: the plan as JSON
     """
-    from me2e_compress.workflows.plan import plan as workflow
+    from me2e_compress.commands.plan import plan as workflow
 
     result = workflow(model, output, options)
     show(result, result.view(every=printing.verbose).tables)
@@ -192,7 +192,7 @@ def calibrate(
         frames: the recorded FRAMES; --import needs none
         output: the ranges as JSON
     """
-    from me2e_compress.workflows.calibrate import calibrate as workflow
+    from me2e_compress.commands.calibrate import calibrate as workflow
 
     show_call(workflow, model, frames, output, options)
 
@@ -218,8 +218,8 @@ def compress(
         passes: a pipeline, as text; see above
         frames: the recorded FRAMES
     """
+    from me2e_compress.commands.compress import compress as workflow
     from me2e_compress.manager.recipe import parse
-    from me2e_compress.workflows.compress import compress as workflow
 
     if recipe is not None and passes is not None:
         raise RecipeError("give a recipe (-r) or a pipeline (--passes), not both")
@@ -233,7 +233,7 @@ def lint(model: str, /, *, options: LintOptions | None = None) -> None:
     Args:
         model: the ONNX file, or highway; not changed
     """
-    from me2e_compress.workflows.lint import lint as workflow
+    from me2e_compress.commands.lint import lint as workflow
 
     with listening() as listener:
         result = workflow(model, options, listener)
@@ -260,7 +260,7 @@ def sensitivity(
         frames: the recorded FRAMES
         output: the RECIPE.toml
     """
-    from me2e_compress.workflows.search import measure_sensitivity
+    from me2e_compress.commands.search import measure_sensitivity
 
     show_call(measure_sensitivity, model, frames, output, options)
 
@@ -275,7 +275,7 @@ def search(
         frames: the recorded FRAMES
         output: the RECIPE.toml
     """
-    from me2e_compress.workflows.search import search as workflow
+    from me2e_compress.commands.search import search as workflow
 
     show_call(workflow, model, frames, output, options or SearchOptions())
 
@@ -303,8 +303,8 @@ def compare(
         float_graph: the graph's float source, with --outputs
         first_difference: name the first module after which the second differs
     """
-    from me2e_compress.workflows import compare as between
-    from me2e_compress.workflows import compare_dump as against_engine
+    from me2e_compress.commands import compare as between
+    from me2e_compress.commands import compare_dump as against_engine
 
     options = options or CompareOptions()
     if first_difference and (options.as_it_stands or outputs is not None):
@@ -345,8 +345,8 @@ def profile(
         output: the trace
         imported: what another tool measured
     """
-    from me2e_compress.workflows import profile as workflow
-    from me2e_compress.workflows.profile import check_import, import_profile
+    from me2e_compress.commands import profile as workflow
+    from me2e_compress.commands.profile import check_import, import_profile
 
     options = options or ProfileOptions()
     with listening() as listener:

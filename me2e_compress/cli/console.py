@@ -19,8 +19,14 @@ from rich.progress import (
 from rich.table import Table as RichTable
 from rich.text import Text
 
-from me2e_compress.display import Cell, Table, escape_controls, format_duration, plural
-from me2e_compress.workflows.result import SILENT, Listener, Result
+from me2e_compress.base.display import (
+    Cell,
+    Table,
+    escape_controls,
+    format_duration,
+    plural,
+)
+from me2e_compress.commands.result import SILENT, Listener, Result
 
 console = Console(record=True, emoji=False)
 errors = Console(stderr=True, highlight=False, emoji=False)

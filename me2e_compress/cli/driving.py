@@ -2,17 +2,17 @@
 
 from pathlib import Path
 
+from me2e_compress.base.errors import OptionError
+from me2e_compress.base.extras import require_extra
 from me2e_compress.cli.commands import WRITING, Output
 from me2e_compress.cli.console import listening, printing, say, show, show_call, tell
-from me2e_compress.errors import OptionError
-from me2e_compress.extras import require_extra
-from me2e_compress.metrics import BUDGET_MS
-from me2e_compress.workflows.options import (
+from me2e_compress.commands.options import (
     EvaluateOptions,
     Joules,
     WorkerOptions,
     WriteOptions,
 )
+from me2e_compress.metrics import BUDGET_MS
 
 RUNNING = WorkerOptions()
 
@@ -36,7 +36,7 @@ def evaluate(
         output: the results folder
         check: say what fits and what is missing, drive nothing
     """
-    from me2e_compress.workflows import evaluate as workflow
+    from me2e_compress.commands import evaluate as workflow
 
     # --check drives nothing, and needs no folder
     if check:
@@ -70,7 +70,7 @@ def score(
         joules: NAME=JOULES or NAME=FILE: of an inference; gives EER_AV
         budget_ms: what a decision may take; 20 Hz: 50
     """
-    from me2e_compress.workflows.score import score as workflow
+    from me2e_compress.commands.score import score as workflow
 
     if not results:
         raise OptionError("score needs a folder of results: RESULTS")
@@ -110,13 +110,13 @@ def study(
         trust_code: run Python and libraries that it names
     """
     require_extra("highway", "a study")
+    from me2e_compress.commands.checks import check_folder
     from me2e_compress.evaluators.highway.engine import engine_named
     from me2e_compress.study import load_study
     from me2e_compress.study.report.page import write_study
     from me2e_compress.study.run import run_study
     from me2e_compress.study.workload import workload
     from me2e_compress.study.workspace import HTML, JSON, MARKDOWN
-    from me2e_compress.workflows.checks import check_folder
 
     # read and check everything that the study needs before it starts
     asked = load_study(definition, routes, provider, trust_code=trust_code)

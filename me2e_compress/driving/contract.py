@@ -29,7 +29,7 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import Field
 
-from me2e_compress.errors import EvaluationError
+from me2e_compress.base.errors import EvaluationError
 from me2e_compress.runtime.frames import Array
 from me2e_compress.runtime.plan_adapter import Trajectory
 from me2e_compress.runtime.session import DTYPES, SessionPort

@@ -14,9 +14,9 @@ import numpy.typing as npt
 from pydantic import Field, GetCoreSchemaHandler
 from pydantic_core import CoreSchema
 
+from me2e_compress.base.errors import EvaluationError
+from me2e_compress.base.registry import Registry
 from me2e_compress.driving.contract import Positive
-from me2e_compress.errors import EvaluationError
-from me2e_compress.registry import Registry
 
 
 @dataclass(frozen=True, eq=False, slots=True)

@@ -18,9 +18,9 @@ import numpy.typing as npt
 from pydantic import GetCoreSchemaHandler
 from pydantic_core import CoreSchema
 
+from me2e_compress.base.errors import EvaluationError
+from me2e_compress.base.registry import Registry
 from me2e_compress.driving.contract import Count, Positive
-from me2e_compress.errors import EvaluationError
-from me2e_compress.registry import Registry
 from me2e_compress.runtime.latency_trace import LatencyTrace
 
 __all__ = [

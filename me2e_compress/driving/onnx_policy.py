@@ -7,6 +7,7 @@ from typing import Self
 
 import numpy as np
 
+from me2e_compress.base.errors import EvaluationError, FramesError, GraphError
 from me2e_compress.driving.adapter import Adapter
 from me2e_compress.driving.adapter.adapter import ZEROS, RecurrentEntry
 from me2e_compress.driving.adapter.inputs import ModelInputs, contract_names
@@ -20,7 +21,6 @@ from me2e_compress.driving.contract import (
     six_waypoints,
 )
 from me2e_compress.driving.host_stage import HostStage, HostWork
-from me2e_compress.errors import EvaluationError, FramesError, GraphError
 from me2e_compress.runtime.frames import Array
 from me2e_compress.runtime.plan_adapter import PlanAdapter
 from me2e_compress.runtime.providers import CPU, Provider

@@ -13,9 +13,10 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import ClassVar, Protocol, cast, runtime_checkable
 
+from me2e_compress.base.errors import EvaluationError
+from me2e_compress.base.registry import Registry
+from me2e_compress.base.text import name_in
 from me2e_compress.driving.contract import Policy
-from me2e_compress.errors import EvaluationError
-from me2e_compress.registry import Registry, name_in
 
 __all__ = [
     "MODEL",
@@ -73,7 +74,7 @@ class Driver(abc.ABC):
 
 
 _HIGHWAY = "me2e_compress.evaluators.highway.drivers"
-_SHIPPED = "me2e_compress.workflows.shipped_driver"
+_SHIPPED = "me2e_compress.commands.shipped_driver"
 
 POLICIES: Registry[Driver] = Registry(
     "policy",

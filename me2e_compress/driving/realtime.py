@@ -14,7 +14,7 @@ from enum import StrEnum
 from numbers import Integral
 from typing import Generic, TypeVar
 
-from me2e_compress.errors import EvaluationError
+from me2e_compress.base.errors import EvaluationError
 
 DT_US = 50_000
 """Step of the benchmark's simulators: 20 Hz."""

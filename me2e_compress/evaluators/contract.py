@@ -11,13 +11,13 @@ from typing import Any, ClassVar, Protocol, Self
 
 from pydantic import TypeAdapter, ValidationError
 
+from me2e_compress.base.errors import EvaluationError
+from me2e_compress.base.registry import Registry
 from me2e_compress.driving.contract import RouteInfo
 from me2e_compress.driving.latency import FixedLatency, LatencySource
 from me2e_compress.driving.policies import Driver, opened
 from me2e_compress.driving.realtime import DT_US, LatencyModel
-from me2e_compress.errors import EvaluationError
 from me2e_compress.metrics.episode import FRAME_US, Episode
-from me2e_compress.registry import Registry
 from me2e_compress.simulator.camera_rig import CLEAR, Weather
 from me2e_compress.simulator.routes import Route
 from me2e_compress.version import __version__
@@ -26,7 +26,7 @@ FRAME_LIMIT_S = 60.0
 
 
 class Listener(Protocol):
-    """Hears how far a long step is; see `me2e_compress.workflows.listener`."""
+    """Hears how far a long step is; see `me2e_compress.commands.listener`."""
 
     @property
     def on_progress(self) -> Callable[[str, int, int, str], None]:

@@ -8,13 +8,13 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Self
 
+from me2e_compress.base import atomic, documents
+from me2e_compress.base.atomic import write_json
+from me2e_compress.base.errors import EvaluationError
 from me2e_compress.driving.policies import Driver
-from me2e_compress.errors import EvaluationError
 from me2e_compress.evaluators.contract import Drive, Driven, Evaluator, Listener
 from me2e_compress.metrics.episode import Episode
 from me2e_compress.metrics.route_scores import route_score
-from me2e_compress.registry import documents, drafts
-from me2e_compress.runtime.atomic import write_json
 from me2e_compress.simulator.routes import VERSION, check_version, is_route_id
 
 MANIFEST = "evaluation.json"
@@ -47,7 +47,7 @@ class ResultsFolder:
         from; None if none are drawn.
         """
         # Claim an empty folder
-        with drafts.writing_errors(path, EvaluationError):
+        with atomic.writing_errors(path, EvaluationError):
             path.mkdir(parents=True, exist_ok=True)
             if not (path / MANIFEST).exists():
                 # A killed run of ours leaves only drafts
@@ -100,7 +100,7 @@ class ResultsFolder:
     def keep(self, episode: Episode) -> None:
         """Write one route."""
         record = {"fingerprint": self._digest, "episode": episode.to_json()}
-        with drafts.writing_errors(self._file(episode.route), EvaluationError):
+        with atomic.writing_errors(self._file(episode.route), EvaluationError):
             write_json(self._file(episode.route), record)
 
     @property
@@ -146,10 +146,10 @@ def log_cost(folder: Path, driven: Driven) -> None:
         "memory_mb": round(driven.memory_bytes / 1e6, 1),
     }
     with (
-        drafts.writing_errors(log, EvaluationError),
+        atomic.writing_errors(log, EvaluationError),
         log.open("a", encoding="utf-8") as lines,
     ):
-        mark = {} if lines.tell() else drafts.IN_JSON
+        mark = {} if lines.tell() else atomic.IN_JSON
         lines.write(f"{json.dumps(cost | mark)}\n")
 
 

@@ -11,9 +11,9 @@ import numpy as np
 import numpy.typing as npt
 import pydantic
 
-from me2e_compress.errors import EvaluationError, GraphError
+from me2e_compress.base import documents
+from me2e_compress.base.errors import EvaluationError, GraphError
 from me2e_compress.graph.recurrence import SETS
-from me2e_compress.registry import documents
 from me2e_compress.runtime.frames import Array, Frame, Frames
 from me2e_compress.runtime.plan_adapter import PLAN, PlanAdapter
 from me2e_compress.runtime.session import Session, detached, replay

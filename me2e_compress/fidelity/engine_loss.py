@@ -6,9 +6,9 @@ from typing import TypeAlias
 
 import numpy as np
 
+from me2e_compress.base.errors import EvaluationError
 from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.calibration.engine_dump import EngineDump
-from me2e_compress.errors import EvaluationError
 from me2e_compress.fidelity import ALIVE
 from me2e_compress.fidelity.compare import Tally
 from me2e_compress.fidelity.liveness import OutputTally

@@ -11,7 +11,7 @@ import numpy as np
 import onnx_ir as ir
 
 from me2e_compress import graph
-from me2e_compress.errors import EvaluationError
+from me2e_compress.base.errors import EvaluationError
 from me2e_compress.fidelity import SQNR_FLOOR_DB
 from me2e_compress.fidelity.compare import Tally
 from me2e_compress.fidelity.engine_loss import EngineRun

@@ -12,7 +12,7 @@ from typing import Literal, TypeAlias
 
 import numpy as np
 
-from me2e_compress.display import Table, format_number, table
+from me2e_compress.base.display import Table, format_number, table
 from me2e_compress.fidelity import ALIVE
 from me2e_compress.runtime.frames import Array, Frame
 from me2e_compress.runtime.session import Session

@@ -10,9 +10,12 @@ from pathlib import Path
 import onnx_ir as ir
 
 from me2e_compress import graph
+from me2e_compress.base import atomic
+from me2e_compress.base.atomic import write_bytes
+from me2e_compress.base.display import format_significant
+from me2e_compress.base.documents import toml_string
+from me2e_compress.base.errors import EvaluationError
 from me2e_compress.calibration.ranges import Ranges
-from me2e_compress.display import format_significant
-from me2e_compress.errors import EvaluationError
 from me2e_compress.fidelity.compare import (
     Fidelity,
     OutputFidelity,
@@ -30,9 +33,6 @@ from me2e_compress.quantization.decision import (
 from me2e_compress.quantization.plan import make_plan
 from me2e_compress.quantization.rules import RuleSet
 from me2e_compress.quantization.scheme import QuantScheme
-from me2e_compress.registry import drafts
-from me2e_compress.registry.documents import toml_string
-from me2e_compress.runtime.atomic import write_bytes
 from me2e_compress.runtime.frames import Frames
 from me2e_compress.runtime.providers import CPU, Provider
 from me2e_compress.runtime.session import Session
@@ -357,11 +357,11 @@ def write_recipe(
             options.append(f"overrides = {toml_string(overrides.name)}")
         lines.append("\n".join(options) + "\n")
     # recipe and overrides together, or neither
-    with drafts.all_or_none():
-        write_bytes(path, (drafts.IN_TOML + "\n".join(lines)).encode())
+    with atomic.all_or_none():
+        write_bytes(path, (atomic.IN_TOML + "\n".join(lines)).encode())
         if not choice.floats or not choice.modules:
             return None
-        text = drafts.IN_TOML + overrides_text(choice.overrides().override)
+        text = atomic.IN_TOML + overrides_text(choice.overrides().override)
         write_bytes(overrides, text.encode())
     return overrides
 

@@ -13,15 +13,15 @@ import onnx_ir as ir
 import onnx_ir.passes.common as common
 from google.protobuf.message import DecodeError
 
-from me2e_compress.display import error_line, join_names
-from me2e_compress.errors import GraphError
+from me2e_compress.base import atomic
+from me2e_compress.base.display import error_line, join_names
+from me2e_compress.base.errors import GraphError
 from me2e_compress.graph import provenance, structure
 from me2e_compress.graph.nodes import STANDARD, bodies, nodes_of
 from me2e_compress.graph.opset import fit_runtime, note_change
 from me2e_compress.graph.recurrence import recurrent_inputs
 from me2e_compress.graph.summary import weight_bytes
 from me2e_compress.graph.validity import PLAIN_INITIALIZERS_SINCE_IR
-from me2e_compress.registry import drafts
 
 INLINE_LIMIT_BYTES = 1_900_000_000
 """Weights beyond this go to a data file: protobuf cannot hold 2 GiB in one message."""
@@ -152,7 +152,7 @@ def save(model: ir.Model, path: str | Path, *, external: bool | None = None) -> 
     if external is None:
         external = bool(stored) or weight_bytes(model) > INLINE_LIMIT_BYTES
     with (
-        drafts.naming_file(path),
+        atomic.naming_file(path),
         tempfile.TemporaryDirectory(dir=path.parent, prefix=".saving-") as folder,
     ):
         draft = Path(folder) / path.name
@@ -164,18 +164,18 @@ def save(model: ir.Model, path: str | Path, *, external: bool | None = None) -> 
         draft_data = draft.with_name(data.name)
         if draft_data.exists():
             with draft_data.open("ab") as stream:
-                stream.write(drafts.BYTES)
-            drafts.put_in_place(draft_data, data)
-        drafts.put_in_place(draft, path)
+                stream.write(atomic.BYTES)
+            atomic.put_in_place(draft_data, data)
+        atomic.put_in_place(draft, path)
     for old in earlier:
-        drafts.remove(old)
+        atomic.remove(old)
 
 
 @contextlib.contextmanager
 def _named_producer(model: ir.Model) -> Iterator[None]:
     """Name this toolkit as a model's producer while it is written."""
     before = model.producer_name, model.producer_version
-    model.producer_name, model.producer_version = drafts.PRODUCER, None
+    model.producer_name, model.producer_version = atomic.PRODUCER, None
     try:
         yield
     finally:

@@ -5,7 +5,7 @@ from pathlib import Path
 import onnx
 import onnx_ir as ir
 
-from me2e_compress.errors import GraphError
+from me2e_compress.base.errors import GraphError
 from me2e_compress.graph.nodes import bodies, converted_opset, is_standard, opset_of
 from me2e_compress.graph.rewrite.raise_opset import OLDEST_OPSET, write_in
 from me2e_compress.graph.runtime_operators import (

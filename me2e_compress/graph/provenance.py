@@ -16,9 +16,9 @@ from collections.abc import Iterable, Iterator
 
 import onnx_ir as ir
 
-from me2e_compress.errors import GraphError
+from me2e_compress.base.documents import MalformedError
+from me2e_compress.base.errors import GraphError
 from me2e_compress.graph.nodes import nodes_in, nodes_of
-from me2e_compress.registry.documents import MalformedError
 
 MODULE, ORIGINS, PASSES = "me2e.module", "me2e.origins", "me2e.passes"
 _TRACE = "stack_trace"

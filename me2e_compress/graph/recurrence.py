@@ -5,8 +5,8 @@ from collections.abc import Mapping
 
 import onnx_ir as ir
 
-from me2e_compress.errors import GraphError
-from me2e_compress.registry import documents
+from me2e_compress.base import documents
+from me2e_compress.base.errors import GraphError
 
 SETS = "me2e.sets"
 """Metadata key of the outputs whose rows are agents, in no order."""

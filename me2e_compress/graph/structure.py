@@ -16,7 +16,7 @@ import onnx_ir as ir
 from onnx import TensorProto
 from onnx.onnx_cpp2py_export.checker import CheckerContext
 
-from me2e_compress.errors import GraphError
+from me2e_compress.base.errors import GraphError
 from me2e_compress.graph.nodes import STANDARD
 
 LARGEST_ELEMENTS = 2**40

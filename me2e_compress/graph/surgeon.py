@@ -12,7 +12,7 @@ import onnx_graphsurgeon as gs
 import onnx_ir as ir
 from onnx_graphsurgeon.util.exception import OnnxGraphSurgeonException
 
-from me2e_compress.errors import GraphError
+from me2e_compress.base.errors import GraphError
 from me2e_compress.graph import provenance
 from me2e_compress.graph.files import inlined
 

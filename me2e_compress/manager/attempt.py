@@ -10,8 +10,13 @@ import onnx
 import onnx_ir as ir
 
 from me2e_compress import graph
-from me2e_compress.display import plural
-from me2e_compress.errors import GraphError, Me2eError, PassError, VerificationError
+from me2e_compress.base.display import plural
+from me2e_compress.base.errors import (
+    GraphError,
+    Me2eError,
+    PassError,
+    VerificationError,
+)
 from me2e_compress.graph import provenance
 from me2e_compress.graph.nodes import has_subgraph, is_standard, nodes_in, opset_of
 from me2e_compress.graph.provenance import is_same

@@ -10,14 +10,14 @@ from time import process_time
 import onnx_ir as ir
 
 from me2e_compress import graph
-from me2e_compress.calibration.dataset import CalibrationSet
-from me2e_compress.errors import (
+from me2e_compress.base.errors import (
     GraphError,
     Me2eError,
     PassError,
     PreconditionError,
     VerificationError,
 )
+from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.graph.opset import read_as
 from me2e_compress.manager import equivalence, reproducer
 from me2e_compress.manager.attempt import attempt, blame_file

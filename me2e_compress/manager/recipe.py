@@ -17,9 +17,9 @@ from collections.abc import Iterable
 from importlib import resources
 from pathlib import Path
 
-from me2e_compress.errors import RecipeError
+from me2e_compress.base import documents
+from me2e_compress.base.errors import RecipeError
 from me2e_compress.passes import PASSES, Pass
-from me2e_compress.registry import documents
 
 __all__ = ["load", "parse", "shipped", "to_text"]
 

@@ -9,7 +9,13 @@ from pathlib import Path
 import onnx_ir as ir
 
 from me2e_compress import graph
-from me2e_compress.display import LOWER_BOUND, Table, format_gmacs, format_mb, table
+from me2e_compress.base.display import (
+    LOWER_BOUND,
+    Table,
+    format_gmacs,
+    format_mb,
+    table,
+)
 from me2e_compress.graph.summary import Size
 from me2e_compress.passes.base import Pass
 

@@ -13,8 +13,8 @@ import numpy as np
 import numpy.typing as npt
 import onnx_ir as ir
 
+from me2e_compress.base.errors import FramesError, GraphError, PreconditionError
 from me2e_compress.calibration.dataset import CalibrationSet, draw_frames
-from me2e_compress.errors import FramesError, GraphError, PreconditionError
 from me2e_compress.graph.shapes import static_shape
 from me2e_compress.passes.fix_shapes import open_dimensions, sized_inputs
 from me2e_compress.runtime.frames import Frame

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 from statistics import fmean
 from typing import Any
 
-from me2e_compress.display import Table, format_number, missing_note, plural, table
+from me2e_compress.base.display import Table, format_number, missing_note, plural, table
 from me2e_compress.metrics import BUDGET_MS
 from me2e_compress.metrics.episode import FRAME_US, Episode
 from me2e_compress.metrics.measure import Measure, percentile, too_few

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from me2e_compress.errors import EvaluationError
+from me2e_compress.base.errors import EvaluationError
 from me2e_compress.metrics.episode import FAILURES
 from me2e_compress.metrics.measure import Estimate, mean_estimate
 from me2e_compress.metrics.route_scores import CHECKPOINTS

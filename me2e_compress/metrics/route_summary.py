@@ -11,7 +11,7 @@ from typing import Any, Self
 import numpy as np
 from pydantic import ConfigDict, with_config
 
-from me2e_compress.errors import EvaluationError
+from me2e_compress.base.errors import EvaluationError
 from me2e_compress.metrics import bench2drive
 from me2e_compress.metrics import route_scores as scored
 from me2e_compress.metrics.episode import COLLISIONS, Episode, InfractionKind

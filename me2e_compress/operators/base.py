@@ -8,7 +8,8 @@ from typing import ClassVar
 
 import onnx_ir as ir
 
-from me2e_compress.errors import PreconditionError, RecipeError
+from me2e_compress.base.errors import PreconditionError, RecipeError
+from me2e_compress.base.registry import Registry
 from me2e_compress.graph.nodes import is_plugin, is_standard
 from me2e_compress.graph.shapes import Dims, open_shape, product
 from me2e_compress.graph.summary import total_bytes
@@ -22,7 +23,6 @@ from me2e_compress.operators.dialect import (
     Shapes,
     Values,
 )
-from me2e_compress.registry import Registry
 
 
 @dataclasses.dataclass(frozen=True)

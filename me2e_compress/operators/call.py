@@ -8,7 +8,7 @@ from typing import TypeAlias
 import numpy as np
 import onnx_ir as ir
 
-from me2e_compress.errors import GraphError
+from me2e_compress.base.errors import GraphError
 from me2e_compress.graph import array_of, provenance
 from me2e_compress.graph.nodes import Array
 from me2e_compress.graph.rewrite import (

@@ -7,7 +7,7 @@ from collections.abc import Iterable
 import numpy as np
 import onnx_ir as ir
 
-from me2e_compress.errors import PreconditionError
+from me2e_compress.base.errors import PreconditionError
 from me2e_compress.graph import array_of
 from me2e_compress.graph.nodes import maker, permutation_of
 from me2e_compress.graph.shapes import Dims, product, static_shape

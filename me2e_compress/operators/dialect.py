@@ -7,7 +7,7 @@ from typing import Any, TypeAlias
 import numpy.typing as npt
 import onnx_ir as ir
 
-from me2e_compress.errors import PreconditionError
+from me2e_compress.base.errors import PreconditionError
 from me2e_compress.graph.nodes import input_at
 from me2e_compress.graph.shapes import Dims, open_shape
 from me2e_compress.operators.call import Attributes, AttributeValue, FusedCall

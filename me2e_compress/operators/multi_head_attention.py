@@ -6,7 +6,7 @@ import math
 import numpy as np
 import onnx_ir as ir
 
-from me2e_compress.errors import PreconditionError
+from me2e_compress.base.errors import PreconditionError
 from me2e_compress.operators.base import Operator
 from me2e_compress.operators.call import Attributes, FusedCall
 from me2e_compress.operators.dialect import (

@@ -11,7 +11,7 @@ from collections.abc import Mapping
 import numpy as np
 import onnx_ir as ir
 
-from me2e_compress.errors import PreconditionError
+from me2e_compress.base.errors import PreconditionError
 from me2e_compress.operators.call import Attributes, FusedCall, Size
 from me2e_compress.operators.dialect import (
     FLOATS,

@@ -6,7 +6,7 @@ from collections.abc import Iterable
 
 import onnx_ir as ir
 
-from me2e_compress.errors import GraphError, PreconditionError
+from me2e_compress.base.errors import GraphError, PreconditionError
 from me2e_compress.graph import opset_of
 from me2e_compress.graph.nodes import STANDARD, bodies, is_read, nodes_in
 from me2e_compress.graph.rewrite import value_names

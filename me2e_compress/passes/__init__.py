@@ -1,8 +1,8 @@
 """The compression passes; a new pass is a file here and a row in ``PASSES``."""
 
-from me2e_compress.errors import RecipeError
+from me2e_compress.base.errors import RecipeError
+from me2e_compress.base.registry import Registry
 from me2e_compress.passes.base import Context, Pass, PassResult
-from me2e_compress.registry import Registry
 
 __all__ = ["PASSES", "Context", "Pass", "PassResult"]
 

@@ -7,8 +7,8 @@ from typing import Literal
 import onnx_ir as ir
 
 from me2e_compress import graph
-from me2e_compress.display import plural
-from me2e_compress.errors import PreconditionError, RecipeError
+from me2e_compress.base.display import plural
+from me2e_compress.base.errors import PreconditionError, RecipeError
 from me2e_compress.graph import provenance, rewrite
 from me2e_compress.graph.modules.module_map import ModuleMap, Substitute
 from me2e_compress.graph.nodes import LAYOUT_OPERATORS, makers_of, reads_of

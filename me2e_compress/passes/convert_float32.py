@@ -4,7 +4,7 @@ import dataclasses
 
 import onnx_ir as ir
 
-from me2e_compress.display import plural
+from me2e_compress.base.display import plural
 from me2e_compress.graph import rewrite
 from me2e_compress.passes.base import Context, Pass, PassResult
 from me2e_compress.passes.convert_float16.element_types import (

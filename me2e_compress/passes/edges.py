@@ -10,7 +10,7 @@ import numpy as np
 import onnx_ir as ir
 
 from me2e_compress import graph
-from me2e_compress.errors import PreconditionError, RecipeError
+from me2e_compress.base.errors import PreconditionError, RecipeError
 from me2e_compress.graph import rewrite
 from me2e_compress.graph.modules.module_map import ModuleMap
 from me2e_compress.graph.nodes import makers_of

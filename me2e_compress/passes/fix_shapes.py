@@ -9,7 +9,7 @@ import onnx
 import onnx_ir as ir
 
 from me2e_compress import graph
-from me2e_compress.errors import PreconditionError, RecipeError
+from me2e_compress.base.errors import PreconditionError, RecipeError
 from me2e_compress.passes.base import Context, Pass, PassResult
 
 FIXED = "me2e.fixed"

@@ -6,7 +6,7 @@ import math
 import numpy as np
 import onnx_ir as ir
 
-from me2e_compress.display import plural
+from me2e_compress.base.display import plural
 from me2e_compress.graph import is_standard, opset_of, static_shape
 from me2e_compress.graph.nodes import VIEWS, graphs_of
 from me2e_compress.graph.rewrite import remove_dead, remove_unread, value_names

@@ -6,7 +6,7 @@ from collections.abc import Callable
 import onnx_graphsurgeon as gs
 import onnx_ir as ir
 
-from me2e_compress.errors import PassError
+from me2e_compress.base.errors import PassError
 from me2e_compress.graph import digest, node_count, provenance
 from me2e_compress.graph.surgeon import from_graphsurgeon, to_graphsurgeon
 from me2e_compress.passes.base import Context, Pass, PassResult

@@ -7,8 +7,8 @@ import math
 import numpy as np
 import onnx_ir as ir
 
+from me2e_compress.base.errors import FramesError, PreconditionError, RecipeError
 from me2e_compress.calibration import dataset
-from me2e_compress.errors import FramesError, PreconditionError, RecipeError
 from me2e_compress.graph.nodes import nodes_of, producer_of
 from me2e_compress.graph.recurrence import recurrent_inputs
 from me2e_compress.graph.shapes import static_shape

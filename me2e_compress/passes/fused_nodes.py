@@ -6,7 +6,7 @@ from collections import Counter
 import onnx_ir as ir
 
 from me2e_compress import operators
-from me2e_compress.errors import PreconditionError, RecipeError
+from me2e_compress.base.errors import PreconditionError, RecipeError
 from me2e_compress.graph import rewrite
 from me2e_compress.passes.base import Context, Pass, PassResult
 

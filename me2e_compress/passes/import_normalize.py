@@ -8,7 +8,7 @@ from collections.abc import Iterator
 import numpy as np
 import onnx_ir as ir
 
-from me2e_compress.display import plural
+from me2e_compress.base.display import plural
 from me2e_compress.graph import graphs_of, provenance
 from me2e_compress.graph.modules.assign import assign
 from me2e_compress.graph.nodes import (

@@ -6,8 +6,8 @@ from pathlib import Path
 import onnx_ir as ir
 
 from me2e_compress import graph
+from me2e_compress.base.display import plural
 from me2e_compress.calibration.observers import DEFAULT_METHOD
-from me2e_compress.display import plural
 from me2e_compress.graph import provenance
 from me2e_compress.passes.base import Context, PassResult
 from me2e_compress.passes.quantizer import Quantizer

@@ -8,9 +8,9 @@ import numpy as np
 import onnx_ir as ir
 
 from me2e_compress import graph
+from me2e_compress.base.display import plural
+from me2e_compress.base.errors import FramesError, PreconditionError
 from me2e_compress.calibration.means import token_means
-from me2e_compress.display import plural
-from me2e_compress.errors import FramesError, PreconditionError
 from me2e_compress.graph import provenance
 from me2e_compress.graph.modules.module_map import (
     ModuleMap,

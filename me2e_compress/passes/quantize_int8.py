@@ -6,9 +6,10 @@ from pathlib import Path
 
 import onnx_ir as ir
 
+from me2e_compress.base.display import plural
+from me2e_compress.base.errors import PreconditionError
+from me2e_compress.base.registry import IN_TEXT
 from me2e_compress.calibration.review import review
-from me2e_compress.display import plural
-from me2e_compress.errors import PreconditionError
 from me2e_compress.passes.base import Context, PassResult
 from me2e_compress.passes.quantizer import Quantizer
 from me2e_compress.quantization.decision import (
@@ -20,7 +21,6 @@ from me2e_compress.quantization.decision import (
 from me2e_compress.quantization.plan import make_plan
 from me2e_compress.quantization.rules import DEFAULT_RULES, RULE_SETS, RuleSet
 from me2e_compress.quantization.scheme import QuantScheme
-from me2e_compress.registry.registry import IN_TEXT
 from me2e_compress.targets import DEFAULT_TARGET, TARGETS, Target, onnxruntime
 from me2e_compress.targets.quantized import describe_quantized
 

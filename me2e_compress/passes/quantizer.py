@@ -8,9 +8,9 @@ from typing import ClassVar
 import onnx_ir as ir
 
 from me2e_compress import graph
+from me2e_compress.base.errors import FramesError
 from me2e_compress.calibration.calibrator import Calibrator
 from me2e_compress.calibration.ranges import Ranges
-from me2e_compress.errors import FramesError
 from me2e_compress.passes.base import Context, Pass
 
 

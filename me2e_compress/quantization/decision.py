@@ -11,14 +11,14 @@ from typing import Self
 import onnx_ir as ir
 import pydantic
 
-from me2e_compress.display import Table, table
-from me2e_compress.errors import RecipeError
+from me2e_compress.base import documents
+from me2e_compress.base.atomic import write_document
+from me2e_compress.base.display import Table, table
+from me2e_compress.base.documents import toml_string
+from me2e_compress.base.errors import RecipeError
 from me2e_compress.graph import WEIGHTED, provenance
 from me2e_compress.operators import int8_op_types
 from me2e_compress.quantization.scheme import QuantScheme
-from me2e_compress.registry import documents
-from me2e_compress.registry.documents import toml_string
-from me2e_compress.runtime.atomic import write_document
 
 METADATA = "me2e.quant_plan"
 """Key of the model's metadata under which a quantized graph carries its plan."""

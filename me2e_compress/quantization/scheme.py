@@ -3,7 +3,7 @@
 import dataclasses
 from typing import Self
 
-from me2e_compress.errors import ModuleMapError, RecipeError
+from me2e_compress.base.errors import ModuleMapError, RecipeError
 from me2e_compress.graph.modules.module_map import ModuleMap, Role
 
 SCHEMES: dict[str, tuple[Role, ...]] = {

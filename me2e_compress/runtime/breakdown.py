@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import onnx_ir as ir
 
-from me2e_compress.errors import ProviderError
+from me2e_compress.base.errors import ProviderError
 from me2e_compress.runtime.frames import Frames
 from me2e_compress.runtime.latency_trace import Microseconds
 from me2e_compress.runtime.optimized import optimize, origins, with_unique_names

@@ -14,8 +14,8 @@ from typing import Annotated, TypeVar
 
 from pydantic import BaseModel, Field, TypeAdapter
 
-from me2e_compress.errors import EvaluationError
-from me2e_compress.registry import documents
+from me2e_compress.base import documents
+from me2e_compress.base.errors import EvaluationError
 from me2e_compress.runtime.latency_trace import LatencyTrace
 
 FORMATS = "times or a profile of trtexec, or a latency trace, is expected"

@@ -10,11 +10,11 @@ from typing import Annotated, Any, Self, TypeAlias
 import psutil
 from pydantic import ConfigDict, Field, TypeAdapter, model_validator, with_config
 
-from me2e_compress.display import Table, missing_note, plural, table
-from me2e_compress.errors import EvaluationError
+from me2e_compress.base import atomic, documents
+from me2e_compress.base.atomic import write_document
+from me2e_compress.base.display import Table, missing_note, plural, table
+from me2e_compress.base.errors import EvaluationError
 from me2e_compress.metrics.measure import percentile, too_few
-from me2e_compress.registry import documents, drafts
-from me2e_compress.runtime.atomic import write_document
 
 BUSY_SHARE = 0.1
 """Share of the cores that other processes may take before a latency is in doubt: they
@@ -226,7 +226,7 @@ class LatencyTrace:
 
     def save(self, path: Path) -> None:
         """Write the trace atomically; an EvaluationError if it cannot be written."""
-        with drafts.writing_errors(path, EvaluationError):
+        with atomic.writing_errors(path, EvaluationError):
             write_document(path, self.to_json())
 
     @classmethod

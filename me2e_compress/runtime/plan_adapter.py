@@ -8,8 +8,8 @@ import numpy as np
 import numpy.typing as npt
 import pydantic
 
-from me2e_compress.errors import EvaluationError, GraphError
-from me2e_compress.registry import documents
+from me2e_compress.base import documents
+from me2e_compress.base.errors import EvaluationError, GraphError
 
 Floats = npt.NDArray[np.float64]
 

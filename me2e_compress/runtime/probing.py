@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 import onnx_ir as ir
 
-from me2e_compress.errors import GraphError
+from me2e_compress.base.errors import GraphError
 from me2e_compress.graph import rewrite
 
 READINGS = "me2e_readings"

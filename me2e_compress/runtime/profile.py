@@ -7,8 +7,8 @@ from collections.abc import Callable, Mapping, Sequence
 from itertools import chain, islice, repeat
 from pathlib import Path
 
-from me2e_compress.display import plural
-from me2e_compress.errors import EvaluationError
+from me2e_compress.base.display import plural
+from me2e_compress.base.errors import EvaluationError
 from me2e_compress.graph import sha256_of
 from me2e_compress.runtime.frames import Array, Frames
 from me2e_compress.runtime.latency_trace import LatencyTrace, OthersLoad

@@ -13,8 +13,8 @@ from onnxruntime.capi import onnxruntime_pybind11_state as _native  # pyright: i
 from pydantic import GetCoreSchemaHandler
 from pydantic_core import CoreSchema
 
-from me2e_compress.errors import ProviderError
-from me2e_compress.registry import Registry
+from me2e_compress.base.errors import ProviderError
+from me2e_compress.base.registry import Registry
 
 Chain: TypeAlias = list[str | tuple[str, dict[str, str]]]
 """Providers in onnxruntime's form; each runs what those before it cannot."""

@@ -17,7 +17,7 @@ import onnxruntime as ort
 from onnxruntime.capi import onnxruntime_pybind11_state as _native  # pyright: ignore[reportAttributeAccessIssue]
 
 from me2e_compress import graph, operators
-from me2e_compress.errors import GraphError, PreconditionError
+from me2e_compress.base.errors import GraphError, PreconditionError
 from me2e_compress.graph.nodes import (
     array_of,
     bodies_of,

@@ -16,7 +16,7 @@ import onnxruntime as ort
 from onnxruntime.capi import onnxruntime_pybind11_state as _native  # pyright: ignore[reportAttributeAccessIssue]
 
 from me2e_compress import graph
-from me2e_compress.errors import FramesError, GraphError
+from me2e_compress.base.errors import FramesError, GraphError
 from me2e_compress.graph.files import INLINE_LIMIT_BYTES
 from me2e_compress.graph.nodes import NATIVE, is_read
 from me2e_compress.graph.recurrence import SessionPort, not_fed_back, recurrence

@@ -7,10 +7,10 @@ from typing import Self
 
 import pydantic
 
-from me2e_compress.errors import GraphError
-from me2e_compress.registry import drafts
-from me2e_compress.registry.documents import reading
-from me2e_compress.runtime.atomic import write_bytes
+from me2e_compress.base import atomic
+from me2e_compress.base.atomic import write_bytes
+from me2e_compress.base.documents import reading
+from me2e_compress.base.errors import GraphError
 
 
 def write_model_file(path: Path, content: bytes) -> Path:
@@ -21,7 +21,7 @@ def write_model_file(path: Path, content: bytes) -> Path:
         raise GraphError(
             f"{path}: its folder cannot be made: {error.strerror}"
         ) from error
-    with drafts.writing_errors(path, GraphError):
+    with atomic.writing_errors(path, GraphError):
         write_bytes(path, content)
     return path
 

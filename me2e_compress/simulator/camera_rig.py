@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import ConfigDict, Field, with_config
 
-from me2e_compress.errors import EvaluationError
+from me2e_compress.base.errors import EvaluationError
 
 Floats = npt.NDArray[np.float64]
 

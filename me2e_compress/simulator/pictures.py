@@ -11,8 +11,8 @@ import numpy as np
 import numpy.typing as npt
 from PIL import Image, ImageDraw, ImageFont
 
-from me2e_compress.errors import EvaluationError
-from me2e_compress.runtime.atomic import write_bytes
+from me2e_compress.base.atomic import write_bytes
+from me2e_compress.base.errors import EvaluationError
 from me2e_compress.simulator.camera_rig import CAMERA_NAMES
 from me2e_compress.simulator.cameras.ground import RESOLUTION_M, GroundTexture
 from me2e_compress.simulator.plane_geometry import corners

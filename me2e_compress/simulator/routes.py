@@ -16,11 +16,10 @@ from typing import Any
 
 from pydantic import TypeAdapter
 
-from me2e_compress.errors import EvaluationError
+from me2e_compress.base import atomic, documents
+from me2e_compress.base.atomic import IN_JSON, write_bytes
+from me2e_compress.base.errors import EvaluationError
 from me2e_compress.metrics.bench2drive import TRAFFIC_SIGNS
-from me2e_compress.registry import documents, drafts
-from me2e_compress.registry.drafts import IN_JSON
-from me2e_compress.runtime.atomic import write_bytes
 
 _TYPES: tuple[tuple[str | int, ...], ...] = (
     ("Accident", 12, "Overtaking"),
@@ -195,7 +194,7 @@ def save_routes(routes: Sequence[Route], path: Path) -> None:
     if records:  # a list has no other place for what holds for all
         records[0] = {**IN_JSON, **made, **records[0]}
     lines = ",\n".join(map(json.dumps, records))
-    with drafts.writing_errors(path, EvaluationError):
+    with atomic.writing_errors(path, EvaluationError):
         write_bytes(path, f"[\n{lines}\n]\n".encode())
 
 

@@ -2,7 +2,7 @@
 
 import math
 
-from me2e_compress.errors import EvaluationError
+from me2e_compress.base.errors import EvaluationError
 from me2e_compress.metrics.episode import Ending
 from me2e_compress.simulator.plane_geometry import Roadmap, RoutePath
 from me2e_compress.simulator.routes import Route

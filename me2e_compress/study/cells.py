@@ -1,6 +1,6 @@
 """Cells of a study's tables: one content for the terminal, Markdown and HTML."""
 
-from me2e_compress.display import Cell, format_number
+from me2e_compress.base.display import Cell, format_number
 from me2e_compress.metrics.measure import FEWEST_TYPES, Estimate, Measure
 
 MISSING = "\N{EN DASH}"

@@ -20,11 +20,12 @@ from pydantic import (
 )
 from pydantic_core import PydanticCustomError
 
+from me2e_compress.base.errors import EvaluationError, FramesError, StudyError
 from me2e_compress.calibration.dataset import CalibrationSet
+from me2e_compress.commands.checks import model_path
 from me2e_compress.driving.contract import Count, Positive, RouteInfo
 from me2e_compress.driving.policies import POLICIES, driver_named
 from me2e_compress.driving.shipped_adapters import adapter_file, shipped_adapters
-from me2e_compress.errors import EvaluationError, FramesError, StudyError
 from me2e_compress.evaluators.contract import Evaluator, evaluator_named
 from me2e_compress.evaluators.highway.drivers import OnnxDriver
 from me2e_compress.manager import recipe as recipes
@@ -32,7 +33,6 @@ from me2e_compress.passes import Pass
 from me2e_compress.runtime.providers import CPU, Provider
 from me2e_compress.shipped.drivers import SHIPPED
 from me2e_compress.study.condition import FORM, Condition, check_name
-from me2e_compress.workflows.checks import model_path
 
 
 def check_unique(kind: str, names: Iterable[str]) -> None:

@@ -4,7 +4,15 @@ import dataclasses
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
-from me2e_compress.display import Cell, Table
+from me2e_compress.base.display import Cell, Table
+from me2e_compress.commands.checks import check_folder, check_replaceable
+from me2e_compress.commands.compare import CompareResult, compare
+from me2e_compress.commands.compress import CompressResult, compress, sidecar
+from me2e_compress.commands.files import export_stack
+from me2e_compress.commands.frames import record_frames
+from me2e_compress.commands.inspect import InspectResult, inspect
+from me2e_compress.commands.options import CompressOptions, FramesOptions
+from me2e_compress.commands.result import Listener, Result, View
 from me2e_compress.evaluators.highway.engine import LocalEngine
 from me2e_compress.quantization.decision import plan_of
 from me2e_compress.simulator.routes import load_routes, pick_routes
@@ -21,14 +29,6 @@ from me2e_compress.study.run import run_study
 from me2e_compress.study.study_result import StudyResult
 from me2e_compress.study.workspace import HTML, JSON, MARKDOWN
 from me2e_compress.targets import DEFAULT_TARGET
-from me2e_compress.workflows.checks import check_folder, check_replaceable
-from me2e_compress.workflows.compare import CompareResult, compare
-from me2e_compress.workflows.compress import CompressResult, compress, sidecar
-from me2e_compress.workflows.files import export_stack
-from me2e_compress.workflows.frames import record_frames
-from me2e_compress.workflows.inspect import InspectResult, inspect
-from me2e_compress.workflows.options import CompressOptions, FramesOptions
-from me2e_compress.workflows.result import Listener, Result, View
 
 CALIBRATION_FRAMES, HELD_OUT_FRAMES = 64, 24
 LATENCY_SAMPLES, WORKERS = 100, 2

@@ -13,7 +13,9 @@ from typing import Any, Self
 
 from pydantic import TypeAdapter
 
-from me2e_compress.errors import StudyError
+from me2e_compress.base import atomic, documents
+from me2e_compress.base.atomic import write_bytes
+from me2e_compress.base.errors import StudyError
 from me2e_compress.metrics.episode import Episode
 from me2e_compress.metrics.measure import Estimate
 from me2e_compress.metrics.route_summary import (
@@ -26,8 +28,6 @@ from me2e_compress.metrics.route_summary import (
     RouteValues,
 )
 from me2e_compress.metrics.scores import Scores
-from me2e_compress.registry import documents, drafts
-from me2e_compress.runtime.atomic import write_bytes
 
 
 @dataclass(frozen=True)
@@ -119,7 +119,7 @@ class DriveRecord:
         head = asdict(_Head(self.variant, self.condition, dict(self.made_by)))
         rows = [_ROUTE.dump_python(route, mode="json") for route in self.routes]
         lines = [json.dumps(row, ensure_ascii=False) for row in (head, *rows)]
-        with drafts.writing_errors(path, StudyError):
+        with atomic.writing_errors(path, StudyError):
             path.parent.mkdir(parents=True, exist_ok=True)
             write_bytes(path, ("\n".join(lines) + "\n").encode())
 

@@ -6,9 +6,9 @@ from pathlib import Path
 
 from pydantic import TypeAdapter, ValidationError
 
+from me2e_compress.base import documents
+from me2e_compress.base.errors import StudyError
 from me2e_compress.driving.policies import PythonDriver, driver_named
-from me2e_compress.errors import StudyError
-from me2e_compress.registry import documents
 from me2e_compress.study.definition import Study
 
 _STUDY = TypeAdapter(Study)

@@ -12,9 +12,10 @@ from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
+from me2e_compress.base.errors import EvaluationError, FramesError
 from me2e_compress.calibration.dataset import CalibrationSet
+from me2e_compress.commands.result import Listener
 from me2e_compress.driving.latency import LatencySource
-from me2e_compress.errors import EvaluationError, FramesError
 from me2e_compress.fidelity.compare import compare
 from me2e_compress.metrics.measure import Measure, too_few
 from me2e_compress.runtime.frames import Frame
@@ -26,7 +27,6 @@ from me2e_compress.study.condition import Condition
 from me2e_compress.study.definition import Study, Variant
 from me2e_compress.study.prepared import PlanFidelity, PreparedVariant
 from me2e_compress.study.workspace import Workspace
-from me2e_compress.workflows.result import Listener
 
 LATENCY_PERCENTILES = (50, 99)
 

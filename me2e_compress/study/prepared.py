@@ -9,26 +9,26 @@ from typing import Any
 from google.protobuf.message import DecodeError
 
 from me2e_compress import graph
+from me2e_compress.base import documents
+from me2e_compress.base.errors import GraphError, Me2eError, StudyError
 from me2e_compress.calibration.dataset import CalibrationSet
+from me2e_compress.commands.checks import try_first
+from me2e_compress.commands.compress import compress, sidecar
+from me2e_compress.commands.inspect import WEIGHTS
+from me2e_compress.commands.options import CompressOptions
+from me2e_compress.commands.result import Listener
 from me2e_compress.driving.adapter.outputs import state_and_plan
 from me2e_compress.driving.host_stage import HOST_STAGES
 from me2e_compress.driving.policies import Driver, driver_named
-from me2e_compress.errors import GraphError, Me2eError, StudyError
 from me2e_compress.evaluators.highway.drivers import OnnxDriver
 from me2e_compress.graph.modules.module_map import ModuleMap
 from me2e_compress.manager.recipe import to_text
 from me2e_compress.metrics.measure import Measure
-from me2e_compress.registry import documents
 from me2e_compress.runtime.providers import CPU, PROVIDERS
 from me2e_compress.study.definition import Study, Variant
 from me2e_compress.study.workspace import Workspace
 from me2e_compress.targets.onnxruntime import slow_here
 from me2e_compress.version import __version__
-from me2e_compress.workflows.checks import try_first
-from me2e_compress.workflows.compress import compress, sidecar
-from me2e_compress.workflows.inspect import WEIGHTS
-from me2e_compress.workflows.options import CompressOptions
-from me2e_compress.workflows.result import Listener
 
 
 @dataclass(frozen=True)

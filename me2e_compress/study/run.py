@@ -4,8 +4,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
+from me2e_compress.base.errors import StudyError
+from me2e_compress.commands.checks import check_folder, check_replaceable, writing
+from me2e_compress.commands.frames import record_frames
+from me2e_compress.commands.options import FramesOptions
+from me2e_compress.commands.result import SILENT, Listener
 from me2e_compress.driving.latency import FixedLatency
-from me2e_compress.errors import StudyError
 from me2e_compress.evaluators.contract import Drive, Engine
 from me2e_compress.evaluators.highway.engine import LocalEngine
 from me2e_compress.evaluators.results import MEASURED, ResultsFolder, drive_routes
@@ -20,10 +24,6 @@ from me2e_compress.study.outcome import Clock, compare_plans, this_machine, time
 from me2e_compress.study.prepared import PreparedVariant, prepare_all
 from me2e_compress.study.study_result import StudyResult
 from me2e_compress.study.workspace import HTML, JSON, MARKDOWN, Workspace
-from me2e_compress.workflows.checks import check_folder, check_replaceable, writing
-from me2e_compress.workflows.frames import record_frames
-from me2e_compress.workflows.options import FramesOptions
-from me2e_compress.workflows.result import SILENT, Listener
 
 
 def run_study(

@@ -6,7 +6,8 @@ from functools import cached_property
 from itertools import chain
 from typing import Any
 
-from me2e_compress.display import Cell, Table, plural
+from me2e_compress.base.display import Cell, Table, plural
+from me2e_compress.commands.result import Result, View, plain
 from me2e_compress.metrics.bench2drive import ABILITIES
 from me2e_compress.metrics.route_summary import COLUMNS, PairedDifference, holm
 from me2e_compress.runtime.latency_trace import Load
@@ -16,7 +17,6 @@ from me2e_compress.study.condition import Condition
 from me2e_compress.study.definition import Study
 from me2e_compress.study.drive_record import Comparison, DriveRecord, compared
 from me2e_compress.study.prepared import PreparedVariant
-from me2e_compress.workflows.result import Result, View, plain
 
 SCORES = tuple(column.name for column in COLUMNS)
 MOST_ROUTES = 40

@@ -6,13 +6,13 @@ from pathlib import Path
 
 import numpy as np
 
-from me2e_compress.display import format_duration, plural, table
+from me2e_compress.base.display import format_duration, plural, table
+from me2e_compress.commands.result import Result, View
 from me2e_compress.driving.latency import DecisionFacts
 from me2e_compress.driving.realtime import LatencyModel, skipped_decisions
 from me2e_compress.study.condition import Condition
 from me2e_compress.study.definition import Study
 from me2e_compress.study.workspace import Workspace
-from me2e_compress.workflows.result import Result, View
 
 FRAME_S, DECISION_S = 0.0024, 0.021
 """CPU seconds of a frame of the world, and of a decision: six pictures and one

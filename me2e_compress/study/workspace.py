@@ -3,8 +3,8 @@
 from dataclasses import dataclass
 from pathlib import Path
 
-from me2e_compress.errors import StudyError
-from me2e_compress.registry import drafts
+from me2e_compress.base import atomic
+from me2e_compress.base.errors import StudyError
 from me2e_compress.study.condition import Condition
 from me2e_compress.study.definition import Variant
 
@@ -41,6 +41,6 @@ class Workspace:
 
     def _made(self, name: str) -> Path:
         path = self.folder / name
-        with drafts.writing_errors(path, StudyError):
+        with atomic.writing_errors(path, StudyError):
             path.mkdir(parents=True, exist_ok=True)
         return path

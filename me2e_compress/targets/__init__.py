@@ -13,15 +13,15 @@ import onnx
 import onnx_ir as ir
 
 from me2e_compress import graph
+from me2e_compress.base.errors import PreconditionError, RecipeError
+from me2e_compress.base.registry import Registry
 from me2e_compress.calibration.ranges import Ranges
-from me2e_compress.errors import PreconditionError, RecipeError
 from me2e_compress.graph import is_standard, opset_of
 from me2e_compress.graph.nodes import LAYOUT_OPERATORS, grid_of
 from me2e_compress.graph.rewrite.raise_opset import OLDEST_OPSET, raise_opset
 from me2e_compress.graph.validity import refusal
 from me2e_compress.quantization.costs import Costs
 from me2e_compress.quantization.decision import KeptFloat, QuantPlan
-from me2e_compress.registry import Registry
 from me2e_compress.runtime.providers import CPU, Provider
 
 __all__ = [

@@ -10,8 +10,8 @@ import numpy.typing as npt
 import onnx_ir as ir
 
 from me2e_compress import graph
+from me2e_compress.base.errors import PreconditionError
 from me2e_compress.calibration.observers import QUANT_MAX
-from me2e_compress.errors import PreconditionError
 from me2e_compress.graph import CONVOLUTIONS, producer_of, rewrite
 from me2e_compress.graph.nodes import array_of, sole_reader, unrenamed
 from me2e_compress.graph.shapes import extent

@@ -8,9 +8,9 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from me2e_compress.base.errors import EvaluationError, VerificationError
 from me2e_compress.driving.latency import FixedLatency
 from me2e_compress.driving.policies import Driver
-from me2e_compress.errors import EvaluationError, VerificationError
 from me2e_compress.evaluators import EVALUATORS, Drive, Evaluator
 from me2e_compress.evaluators.contract import with_abilities
 from me2e_compress.metrics.episode import Episode

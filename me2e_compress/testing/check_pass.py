@@ -5,7 +5,7 @@ import dataclasses
 import onnx_ir as ir
 
 from me2e_compress import graph
-from me2e_compress.errors import VerificationError
+from me2e_compress.base.errors import VerificationError
 from me2e_compress.graph import provenance
 from me2e_compress.graph.modules.assign import map_of
 from me2e_compress.manager import equivalence

@@ -6,6 +6,7 @@ from typing import TypeAlias
 import numpy as np
 import numpy.typing as npt
 
+from me2e_compress.base.extras import require_extra
 from me2e_compress.driving.contract import (
     Answer,
     Observation,
@@ -16,7 +17,6 @@ from me2e_compress.driving.contract import (
     checked,
 )
 from me2e_compress.driving.policies import POLICIES, Driver
-from me2e_compress.extras import require_extra
 from me2e_compress.testing.form import check_form, require
 
 ROUTE = "HighwayExit_R2_0"

@@ -3,9 +3,13 @@
 import re
 from typing import TypeVar
 
-from me2e_compress.errors import VerificationError
-from me2e_compress.registry import NamedItem, Registry, options_of
-from me2e_compress.registry.registry import is_frozen_dataclass
+from me2e_compress.base.errors import VerificationError
+from me2e_compress.base.registry import (
+    NamedItem,
+    Registry,
+    is_frozen_dataclass,
+    options_of,
+)
 
 _KEBAB = re.compile(r"[a-z][a-z0-9]*(-[a-z0-9]+)*")
 

@@ -16,16 +16,16 @@ from typing import Any
 
 from pydantic import TypeAdapter
 
+from me2e_compress.base import documents
+from me2e_compress.base.atomic import write_document
+from me2e_compress.base.errors import EvaluationError
 from me2e_compress.driving.realtime import ControlClock
-from me2e_compress.errors import EvaluationError
 from me2e_compress.evaluators.highway.controller import AnchoredPlan
 from me2e_compress.evaluators.highway.driven_frames import propose, seed_of
 from me2e_compress.evaluators.highway.episode_recorder import EpisodeRecorder
 from me2e_compress.evaluators.highway.observe import ObservationBuilder
 from me2e_compress.evaluators.highway.runner import EndingRules
 from me2e_compress.metrics.episode import Ending, InfractionKind
-from me2e_compress.registry import documents
-from me2e_compress.runtime.atomic import write_document
 from me2e_compress.runtime.children import process_pool
 from me2e_compress.simulator.camera_rig import CameraRig
 from me2e_compress.simulator.routes import (

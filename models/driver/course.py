@@ -4,10 +4,10 @@ from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
+from me2e_compress.commands.result import SILENT, Listener
 from me2e_compress.driving.latency import FixedLatency, LatencySource
 from me2e_compress.graph import sha256_of
 from me2e_compress.metrics.scores import Scores
-from me2e_compress.workflows.result import SILENT, Listener
 from models.driver import trial
 from models.driver.checkpoint import Start, TrainingCheckpoint, fit
 from models.driver.curriculum import Course, Round, held_out_files

@@ -1,6 +1,6 @@
 """What training raises on purpose."""
 
-from me2e_compress.errors import Me2eError
+from me2e_compress.base.errors import Me2eError
 
 
 class TrainingError(Me2eError):

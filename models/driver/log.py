@@ -4,7 +4,7 @@ import json
 from pathlib import Path
 from typing import Any
 
-from me2e_compress.runtime.atomic import write_bytes
+from me2e_compress.base.atomic import write_bytes
 from models.driver.errors import TrainingError
 
 Row = dict[str, Any]

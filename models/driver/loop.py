@@ -108,7 +108,7 @@ def _cause(error: ProcessException) -> str:
     kind, _, words = last.partition(": ")
     return (
         words
-        if kind.startswith(("me2e_compress.errors.", "models.driver.errors."))
+        if kind.startswith(("me2e_compress.base.errors.", "models.driver.errors."))
         else last
     )
 

@@ -5,7 +5,7 @@ from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any
 
-from me2e_compress.runtime.atomic import write_json
+from me2e_compress.base.atomic import write_json
 from models.driver.errors import TrainingError
 
 Words = tuple[str, str, str]

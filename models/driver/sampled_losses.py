@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from me2e_compress.runtime.atomic import write_bytes
+from me2e_compress.base.atomic import write_bytes
 from models.driver.data import Episodes, Indices, Sequences
 from models.driver.losses import LampHead
 from models.driver.network.interfaces import PlannerInput

@@ -10,7 +10,7 @@ from zipfile import BadZipFile
 import numpy as np
 import numpy.typing as npt
 
-from me2e_compress.errors import EvaluationError
+from me2e_compress.base.errors import EvaluationError
 from models.driver.episodes import GRID, decode
 from models.driver.errors import TrainingError
 from models.driver.network.config import CAMERAS, STEPS

@@ -8,12 +8,12 @@ The same command again goes on where it was interrupted.
 
 import sys
 
+from me2e_compress.base.errors import OptionError
+from me2e_compress.base.extras import require_extra
 from me2e_compress.cli import RUN_AGAIN, run_command
 from me2e_compress.cli.app import build_app
 from me2e_compress.cli.commands import Output
 from me2e_compress.cli.console import listening, show
-from me2e_compress.errors import OptionError
-from me2e_compress.extras import require_extra
 
 
 def command(

@@ -4,6 +4,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from me2e_compress.commands.result import Listener
 from me2e_compress.driving.latency import LatencySource
 from me2e_compress.evaluators import Drive
 from me2e_compress.evaluators.highway.drivers import OnnxDriver
@@ -18,7 +19,6 @@ from me2e_compress.simulator.routes import (
     load_routes,
     pick_routes,
 )
-from me2e_compress.workflows.result import Listener
 from models.driver.admission import make_routes
 from models.driver.curriculum import Trial
 from models.driver.episodes.collection import refuse_shipped

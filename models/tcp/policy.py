@@ -11,12 +11,12 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
+from me2e_compress.base.errors import EvaluationError
 from me2e_compress.driving.adapter import Adapter
 from me2e_compress.driving.contract import Observation, PedalsAndWheel, RouteInfo
 from me2e_compress.driving.input_sources import Axes
 from me2e_compress.driving.onnx_policy import OnnxPolicy
 from me2e_compress.driving.shipped_adapters import adapter_file
-from me2e_compress.errors import EvaluationError
 from me2e_compress.runtime.frames import Array
 from models.tcp.config import ActionHeads
 from models.tcp.fusion import HeadFusion, Rule

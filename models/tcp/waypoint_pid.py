@@ -6,8 +6,8 @@ from collections import deque
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
+from me2e_compress.base.errors import EvaluationError
 from me2e_compress.driving.contract import PedalsAndWheel, Plan, timed
-from me2e_compress.errors import EvaluationError
 from me2e_compress.runtime.plan_adapter import Trajectory
 
 Place = tuple[float, float]

@@ -9,8 +9,8 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
+from me2e_compress.base.errors import GraphError
 from me2e_compress.driving.adapter import ImageNormalization
-from me2e_compress.errors import GraphError
 from me2e_compress.runtime.plan_adapter import PlanAdapter
 from models import export as exporting
 from models.export import export

@@ -10,7 +10,7 @@ import onnxruntime
 import pytest
 import torch
 
-from me2e_compress.errors import GraphError, RecipeError
+from me2e_compress.base.errors import GraphError, RecipeError
 from models import export as exporting
 from models.export import ExportOptions, build, export_stack
 from models.published_names import PUBLISHED

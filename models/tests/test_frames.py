@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from me2e_compress.errors import FramesError
+from me2e_compress.base.errors import FramesError
 from models.stacks import VAD_TINY
 from models.synthetic_cameras import HEIGHT, WIDTH, rig
 from models.synthetic_frames import Frame, frames

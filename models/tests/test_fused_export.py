@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from torch import nn
 
 from me2e_compress import graph
-from me2e_compress.errors import RecipeError
+from me2e_compress.base.errors import RecipeError
 from me2e_compress.operators import expand, find, fused_nodes, import_domains
 from me2e_compress.operators.deformable_attention import DeformableAttention
 from models.bev.attention import DecoderAttention

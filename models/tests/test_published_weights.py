@@ -9,7 +9,7 @@ import onnxruntime
 import pytest
 import torch
 
-from me2e_compress.errors import GraphError
+from me2e_compress.base.errors import GraphError
 from models.export import trace
 from models.published_names import PUBLISHED, NameMatch
 from models.published_weights import (

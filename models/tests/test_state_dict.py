@@ -8,7 +8,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from me2e_compress.errors import GraphError
+from me2e_compress.base.errors import GraphError
 from models.state_dict import read_state_dict
 from models.tests.published_files import Tensors, lightning, mmcv, parallel, saved
 

@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import nn
 
-from me2e_compress.errors import GraphError
+from me2e_compress.base.errors import GraphError
 from models.regions import listening, region
 from models.stacks import VAD_TINY
 from models.tests import truth

@@ -19,7 +19,7 @@ from torch import nn
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils.flop_counter import flop_registry
 
-from me2e_compress.errors import GraphError
+from me2e_compress.base.errors import GraphError
 from models.export import build, example, trace
 from models.regions import listening
 from models.stacks import Stack, find

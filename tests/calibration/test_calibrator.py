@@ -8,12 +8,12 @@ import pytest
 from onnxruntime.quantization import calibrate as peer
 
 from me2e_compress import graph
+from me2e_compress.base.errors import FramesError, GraphError, RecipeError
 from me2e_compress.calibration.calibrator import Calibrator
 from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.calibration.observers import OBSERVERS
 from me2e_compress.calibration.ranges import Ranges
 from me2e_compress.calibration.statistics import Statistics
-from me2e_compress.errors import FramesError, GraphError, RecipeError
 from me2e_compress.runtime.frames import Array, Frame
 from me2e_compress.runtime.providers import CPU, CpuProvider, Provider
 from me2e_compress.runtime.session import Session, replay

@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from me2e_compress.base.errors import FramesError
 from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.calibration.engine_dump import EngineDump
-from me2e_compress.errors import FramesError
 from me2e_compress.runtime.frames import Array
 from tests.support.frames import record
 

@@ -7,10 +7,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from me2e_compress.base.errors import FramesError, RecipeError
 from me2e_compress.calibration.exchange import pick_ranges, read_cache
 from me2e_compress.calibration.observers import QUANT_MAX, scale_of
 from me2e_compress.calibration.ranges import IMPORTED, Ranges
-from me2e_compress.errors import FramesError, RecipeError
 from me2e_compress.graph import digest, provenance
 from me2e_compress.graph.provenance import Provenance
 from tests.support.frames import tensorrt_cache

@@ -8,9 +8,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from me2e_compress import graph
+from me2e_compress.base.errors import FramesError, GraphError
 from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.calibration.means import token_means
-from me2e_compress.errors import FramesError, GraphError
 from me2e_compress.runtime.frames import Frame
 from me2e_compress.runtime.session import run_once
 from tests.support.frames import record

@@ -9,10 +9,10 @@ import numpy as np
 import onnx_ir as ir
 import pytest
 
+from me2e_compress.base.atomic import IN_JSON
+from me2e_compress.base.errors import FramesError
 from me2e_compress.calibration.dataset import CalibrationSet, PixelInput
 from me2e_compress.calibration.recording import Begin, Source, write_recording
-from me2e_compress.errors import FramesError
-from me2e_compress.registry.drafts import IN_JSON
 from me2e_compress.runtime.frames import Frame
 from tests.support.frames import record
 from tests.support.nets import parsed

@@ -14,6 +14,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from me2e_compress.base.errors import FramesError, RecipeError
 from me2e_compress.calibration.calibrator import Calibrator
 from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.calibration.observers import (
@@ -28,7 +29,6 @@ from me2e_compress.calibration.observers import (
 from me2e_compress.calibration.ranges import Activity, Ranges
 from me2e_compress.calibration.review import review
 from me2e_compress.calibration.statistics import BINS, Statistics
-from me2e_compress.errors import FramesError, RecipeError
 from me2e_compress.graph import infer_shapes
 from tests.support.frames import record
 from tests.support.installed import install

@@ -8,11 +8,11 @@ import pytest
 from me2e_compress import graph
 from me2e_compress.cli.app import COMMANDS
 from me2e_compress.cli.console import print_json
+from me2e_compress.commands.frames import FramesResult
+from me2e_compress.commands.listing import KINDS, REGISTRIES
+from me2e_compress.commands.options import FramesOptions
 from me2e_compress.graph.modules.module_map import presets
 from me2e_compress.manager import recipe
-from me2e_compress.workflows.frames import FramesResult
-from me2e_compress.workflows.listing import KINDS, REGISTRIES
-from me2e_compress.workflows.options import FramesOptions
 from tests.docs.documents import faults
 from tests.docs.pages import ROOT
 from tests.support.command import Cli, strict

@@ -6,8 +6,8 @@ from pathlib import Path
 import pytest
 
 from me2e_compress import graph
+from me2e_compress.commands.frames import FramesResult
 from me2e_compress.study import demo
-from me2e_compress.workflows.frames import FramesResult
 from tests.support.command import Cli
 from tests.support.in_process import Here
 

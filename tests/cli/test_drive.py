@@ -8,17 +8,17 @@ import numpy as np
 import pynvml
 import pytest
 
-from me2e_compress.registry.drafts import IN_JSON
+from me2e_compress.base.atomic import IN_JSON
 from me2e_compress.runtime.energy import EnergyResult
 from me2e_compress.runtime.latency_trace import LatencyTrace
 from me2e_compress.simulator.routes import save_routes
+from tests.commands.test_check_model import ADAPTER, PLAN, tcp_like
 from tests.evaluators.highway.drivers import CROSSING, PARKED, straight_on
 from tests.runtime.energy.opened import Driver
 from tests.simulator.world.driving import route_of
 from tests.support.command import Cli
 from tests.support.frames import record
 from tests.support.nets import save_text
-from tests.workflows.test_check_model import ADAPTER, PLAN, tcp_like
 
 pytestmark = pytest.mark.usefixtures("here")
 

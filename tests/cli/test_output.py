@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from me2e_compress import graph
+from me2e_compress.base.errors import FramesError, GraphError
 from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.calibration.recording import write_recording
-from me2e_compress.errors import FramesError, GraphError
 from me2e_compress.graph import rewrite
 from me2e_compress.runtime.frames import Frame
 from models.state_dict import read_state_dict

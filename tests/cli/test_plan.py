@@ -9,8 +9,8 @@ import pytest
 
 import me2e_compress as me2e
 from me2e_compress import graph
+from me2e_compress.base.atomic import IN_JSON
 from me2e_compress.quantization.decision import KeptFloat, load_plan, plan_of, save_plan
-from me2e_compress.registry.drafts import IN_JSON
 from tests.support.command import Cli
 from tests.support.nets import net
 

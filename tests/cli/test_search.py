@@ -54,7 +54,7 @@ def test_search_keeps_size_time_and_energy_at_once(
     cli: Cli, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     battery = SimpleNamespace(j_per_frame=0.5)
-    budgets = "me2e_compress.workflows.search"
+    budgets = "me2e_compress.commands.search"
     monkeypatch.setattr(f"{budgets}.open_counter", lambda: None)
     monkeypatch.setattr(
         f"{budgets}.measure_energy", lambda models, *_, **__: {"model": battery}

@@ -6,11 +6,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from me2e_compress.errors import GraphError
-from me2e_compress.registry.drafts import IN_JSON
+from me2e_compress.base.atomic import IN_JSON
+from me2e_compress.base.errors import GraphError
+from me2e_compress.commands.checks import model_path
 from me2e_compress.shipped import drivers as shipped
 from me2e_compress.simulator.routes import save_routes
-from me2e_compress.workflows.checks import model_path
 from tests.evaluators.highway.drivers import EXIT, straight_on
 from tests.support.command import Cli
 from tests.support.stand_in import record_driver, write_model

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from me2e_compress.registry.drafts import IN_JSON
+from me2e_compress.base.atomic import IN_JSON
 from me2e_compress.simulator.routes import save_routes
 from me2e_compress.study import load_study
 from tests.evaluators.highway.drivers import CROSSING, straight_on

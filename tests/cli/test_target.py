@@ -9,15 +9,15 @@ import onnx_ir as ir
 import pytest
 
 from me2e_compress import graph
-from me2e_compress.errors import RecipeError
+from me2e_compress.base.errors import RecipeError
+from me2e_compress.commands.lint import retarget
+from me2e_compress.commands.options import LintOptions
 from me2e_compress.graph.provenance import decompressed
 from me2e_compress.manager import recipe
 from me2e_compress.passes.quantize_int8 import QuantizeInt8
 from me2e_compress.quantization.decision import plan_of
 from me2e_compress.runtime.providers import CudaProvider
 from me2e_compress.simulator.routes import save_routes
-from me2e_compress.workflows.lint import retarget
-from me2e_compress.workflows.options import LintOptions
 from tests.evaluators.highway.drivers import PARKED, slow_here, straight_on
 from tests.support.command import Cli, write_frames
 

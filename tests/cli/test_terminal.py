@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from me2e_compress.base.display import Cell, Table, format_duration, table
 from me2e_compress.cli import console
 from me2e_compress.cli.app import COMMANDS
 from me2e_compress.cli.console import (
@@ -15,7 +16,6 @@ from me2e_compress.cli.console import (
     listening,
     print_table,
 )
-from me2e_compress.display import Cell, Table, format_duration, table
 from me2e_compress.version import __version__
 from tests.support.command import Cli
 

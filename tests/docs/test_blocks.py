@@ -12,11 +12,11 @@ from pathlib import Path
 
 import pytest
 
+from me2e_compress.base.errors import GraphError
+from me2e_compress.base.registry import Registry
 from me2e_compress.cli.app import app
-from me2e_compress.errors import GraphError
-from me2e_compress.registry import Registry
+from me2e_compress.commands import listing
 from me2e_compress.testing import check_form
-from me2e_compress.workflows import listing
 from tests.docs.conftest import run, write_model
 from tests.docs.pages import EXAMPLE, PAGES, ROOT, WRITING, Block, blocks
 from tests.support.command import Cli

@@ -15,6 +15,7 @@ import onnx
 import pytest
 
 import me2e_compress as me2e
+from me2e_compress.commands.inspect import inspect
 from me2e_compress.driving.adapter import Adapter
 from me2e_compress.driving.adapter.inputs import ModelInputs
 from me2e_compress.driving.onnx_policy import FirstValues, OnnxPolicy, recurrent_of
@@ -22,7 +23,6 @@ from me2e_compress.driving.shipped_adapters import adapter_file
 from me2e_compress.runtime.frames import Array
 from me2e_compress.runtime.session import DTYPES, Session, replay
 from me2e_compress.shipped.drivers import frames_of, shipped_model
-from me2e_compress.workflows.inspect import inspect
 from tests.docs.pages import ROOT, Block, blocks
 from tests.driving.observed import motion, observation
 from tests.evaluators.highway.drivers import straight_on

@@ -6,14 +6,14 @@ from typing import Any
 import numpy as np
 import pytest
 
+from me2e_compress.base.errors import EvaluationError
 from me2e_compress.calibration.dataset import CalibrationSet
+from me2e_compress.commands.frames import record_frames
+from me2e_compress.commands.options import FramesOptions
 from me2e_compress.driving.adapter import Adapter
 from me2e_compress.driving.adapter.inputs import ModelInputs
 from me2e_compress.driving.onnx_policy import OnnxPolicy
-from me2e_compress.errors import EvaluationError
 from me2e_compress.runtime.session import Session
-from me2e_compress.workflows.frames import record_frames
-from me2e_compress.workflows.options import FramesOptions
 from tests.driving.observed import RIG, motion, observation
 from tests.evaluators.highway.drivers import straight_on
 

@@ -5,10 +5,10 @@ import numpy.typing as npt
 import pytest
 from scipy.optimize import check_grad
 
+from me2e_compress.base.errors import EvaluationError
 from me2e_compress.driving.host_stage import HOST_STAGES, CollisionOptimizer, cost
 from me2e_compress.driving.latency import parse_latency
 from me2e_compress.driving.policies import driver_named
-from me2e_compress.errors import EvaluationError
 from me2e_compress.evaluators import Drive
 from me2e_compress.evaluators.highway.drivers import OnnxDriver
 from me2e_compress.evaluators.highway.runner import drive

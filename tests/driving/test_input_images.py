@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from me2e_compress.base.errors import EvaluationError
 from me2e_compress.driving.adapter.image_inputs import (
     CAMERA_NAMES,
     ImageInput,
@@ -16,7 +17,6 @@ from me2e_compress.driving.adapter.image_inputs import (
     rendered_size,
 )
 from me2e_compress.driving.input_sources import INPUT_SOURCES, Axes
-from me2e_compress.errors import EvaluationError
 from me2e_compress.simulator.camera_rig import CAMERA_NAMES as RIG_NAMES
 from me2e_compress.simulator.camera_rig import CameraRig
 from me2e_compress.testing import check_form

@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from me2e_compress.base.errors import EvaluationError
 from me2e_compress.driving.latency import (
     LATENCY_SOURCES,
     DecisionFacts,
@@ -26,7 +27,6 @@ from me2e_compress.driving.realtime import (
     delayed_frames,
     skipped_decisions,
 )
-from me2e_compress.errors import EvaluationError
 from me2e_compress.evaluators import Drive
 from me2e_compress.runtime.latency_trace import LatencyTrace
 from me2e_compress.testing import check_form

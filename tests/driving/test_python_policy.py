@@ -8,9 +8,9 @@ from typing import ClassVar
 
 import pytest
 
+from me2e_compress.base.errors import EvaluationError
 from me2e_compress.driving.contract import Policy
 from me2e_compress.driving.policies import Driver, PythonDriver, driver_named, opened
-from me2e_compress.errors import EvaluationError
 from me2e_compress.evaluators.highway.drivers import OnnxDriver
 from me2e_compress.testing import check_policy
 from models.driver.expert.blind import Blind, BlindDriver

@@ -5,17 +5,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from me2e_compress.base.errors import EvaluationError
 from me2e_compress.calibration.dataset import CalibrationSet
+from me2e_compress.commands.frames import record_frames
+from me2e_compress.commands.options import FramesOptions
 from me2e_compress.driving.adapter import Adapter
 from me2e_compress.driving.adapter.inputs import ModelInputs
 from me2e_compress.driving.contract import Trajectory, checked
 from me2e_compress.driving.onnx_policy import OnnxPolicy
 from me2e_compress.driving.shipped_adapters import adapter_file, shipped_adapters
-from me2e_compress.errors import EvaluationError
 from me2e_compress.evaluators.highway.drivers import OnnxDriver
 from me2e_compress.runtime.session import Session
-from me2e_compress.workflows.frames import record_frames
-from me2e_compress.workflows.options import FramesOptions
 from models.stacks import STACKS, TCP, VAD_TINY
 from tests.driving.observed import motion, observation
 from tests.evaluators.highway.drivers import EXIT, straight_on

@@ -7,10 +7,10 @@ from typing import ClassVar
 
 import pytest
 
+from me2e_compress.base.errors import EvaluationError
 from me2e_compress.driving.contract import RouteInfo
 from me2e_compress.driving.latency import DecisionFacts
 from me2e_compress.driving.policies import Driver
-from me2e_compress.errors import EvaluationError
 from me2e_compress.evaluators import EVALUATORS, Drive, Evaluator
 from me2e_compress.evaluators.contract import Listener
 from me2e_compress.metrics.episode import Episode, InferenceRecord

@@ -9,16 +9,16 @@ from typing import Any, ClassVar, cast
 import pytest
 
 from me2e_compress import EvaluateOptions, evaluate
+from me2e_compress.base import registry
+from me2e_compress.base.errors import EvaluationError
+from me2e_compress.commands.evaluate import drive_of
 from me2e_compress.driving.contract import RouteInfo
 from me2e_compress.driving.latency import FrameRate
 from me2e_compress.driving.policies import Driver
-from me2e_compress.errors import EvaluationError
 from me2e_compress.evaluators import EVALUATORS, Drive, Evaluator
 from me2e_compress.evaluators.contract import Listener, evaluator_named
 from me2e_compress.evaluators.highway.evaluator import Highway
 from me2e_compress.metrics.episode import Episode
-from me2e_compress.registry import registry
-from me2e_compress.workflows.evaluate import drive_of
 from tests.evaluators.lanes import Lane
 
 

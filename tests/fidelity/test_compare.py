@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 
 from me2e_compress import graph
+from me2e_compress.base.errors import EvaluationError, GraphError
 from me2e_compress.calibration.recording import write_recording
-from me2e_compress.errors import EvaluationError, GraphError
+from me2e_compress.commands.compare import compare as compare_files
+from me2e_compress.commands.options import CompareOptions
 from me2e_compress.fidelity.compare import (
     Displacement,
     Fidelity,
@@ -23,8 +25,6 @@ from me2e_compress.fidelity.floor import Floor
 from me2e_compress.runtime.frames import Array, Frame
 from me2e_compress.runtime.plan_adapter import PlanAdapter
 from me2e_compress.runtime.session import Session
-from me2e_compress.workflows.compare import compare as compare_files
-from me2e_compress.workflows.options import CompareOptions
 from tests.support.command import write_frames
 from tests.support.nets import parsed, save_text
 

@@ -7,7 +7,7 @@ import numpy.typing as npt
 import onnx_ir as ir
 import pytest
 
-from me2e_compress.errors import EvaluationError, FramesError, GraphError
+from me2e_compress.base.errors import EvaluationError, FramesError, GraphError
 from me2e_compress.fidelity.engine_loss import EngineRun
 from me2e_compress.fidelity.first_difference import (
     FirstDifference,

@@ -9,7 +9,7 @@ import pytest
 from onnx import TensorProto
 
 from me2e_compress import graph
-from me2e_compress.errors import GraphError
+from me2e_compress.base.errors import GraphError
 from me2e_compress.graph.shapes import can_propagate, infer_shapes, static_shape
 from me2e_compress.graph.summary import macs
 from me2e_compress.manager.equivalence import random_outputs

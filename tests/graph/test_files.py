@@ -7,9 +7,9 @@ import onnx_ir as ir
 import pytest
 
 from me2e_compress import graph
-from me2e_compress.errors import GraphError
+from me2e_compress.base.atomic import BYTES
+from me2e_compress.base.errors import GraphError
 from me2e_compress.graph import files
-from me2e_compress.registry.drafts import BYTES
 from tests.support.nets import parsed, stored
 
 

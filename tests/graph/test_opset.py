@@ -7,8 +7,8 @@ import onnx_ir as ir
 import pytest
 
 from me2e_compress import graph
+from me2e_compress.base.errors import FramesError, GraphError
 from me2e_compress.calibration.dataset import CalibrationSet, draw_frames
-from me2e_compress.errors import FramesError, GraphError
 from me2e_compress.graph.nodes import Array
 from me2e_compress.graph.opset import read_as
 from me2e_compress.graph.runtime_operators import newest_ir, newest_opset

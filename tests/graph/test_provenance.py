@@ -5,10 +5,10 @@ import onnx_ir as ir
 import pytest
 
 from me2e_compress import graph
-from me2e_compress.errors import GraphError
+from me2e_compress.base.documents import MalformedError
+from me2e_compress.base.errors import GraphError
 from me2e_compress.graph import provenance
 from me2e_compress.graph.provenance import ORIGINS, PASSES, Provenance
-from me2e_compress.registry.documents import MalformedError
 from tests.support.nets import parsed
 
 

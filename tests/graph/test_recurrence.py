@@ -5,7 +5,7 @@ import re
 import numpy as np
 import pytest
 
-from me2e_compress.errors import FramesError, GraphError
+from me2e_compress.base.errors import FramesError, GraphError
 from me2e_compress.graph.recurrence import SessionPort, not_fed_back, recurrence
 from me2e_compress.runtime.session import Session
 from tests.support.nets import conv_attention

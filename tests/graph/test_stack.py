@@ -7,7 +7,7 @@ import onnx_ir as ir
 import pytest
 
 from me2e_compress import graph
-from me2e_compress.errors import GraphError
+from me2e_compress.base.errors import GraphError
 from me2e_compress.graph.modules.module_map import ModuleMap
 from me2e_compress.graph.rewrite import add_constant
 from me2e_compress.graph.stack.join import End, JoinedStack

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from me2e_compress.errors import GraphError
+from me2e_compress.base.errors import GraphError
 from me2e_compress.graph.stack.join import JoinedStack
 from tests.support.stacks import HEAD, TWO_PARTS, write_stack
 

@@ -9,7 +9,7 @@ import onnx_ir as ir
 import pytest
 
 from me2e_compress import graph
-from me2e_compress.errors import GraphError
+from me2e_compress.base.errors import GraphError
 from me2e_compress.graph.shapes import open_shape
 from me2e_compress.runtime.session import Session
 from tests.fuzz.graphs import FAULTS, branch_graph, seed_graph

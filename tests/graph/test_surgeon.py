@@ -6,7 +6,7 @@ import onnx_ir as ir
 import pytest
 
 from me2e_compress import graph
-from me2e_compress.errors import GraphError
+from me2e_compress.base.errors import GraphError
 from me2e_compress.graph import provenance
 from me2e_compress.graph.surgeon import from_graphsurgeon, to_graphsurgeon
 

@@ -8,7 +8,7 @@ import onnx_ir as ir
 import pytest
 
 from me2e_compress import graph
-from me2e_compress.errors import GraphError, PassError, VerificationError
+from me2e_compress.base.errors import GraphError, PassError, VerificationError
 from me2e_compress.graph import provenance, shapes
 from me2e_compress.manager import PassManager, Report, attempt
 from me2e_compress.passes.base import Context, Pass

@@ -8,8 +8,8 @@ import numpy as np
 import onnx_ir as ir
 import pytest
 
+from me2e_compress.base.errors import VerificationError
 from me2e_compress.calibration.dataset import CalibrationSet
-from me2e_compress.errors import VerificationError
 from me2e_compress.graph import infer_shapes
 from me2e_compress.manager import PassManager, Verification, equivalence, recipe
 from me2e_compress.manager.pieces import steps_after_changes

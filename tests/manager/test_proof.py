@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from me2e_compress.errors import VerificationError
+from me2e_compress.base.errors import VerificationError
 from me2e_compress.manager import (
     PassManager,
     Verification,

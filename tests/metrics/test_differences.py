@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from me2e_compress.errors import EvaluationError
+from me2e_compress.base.errors import EvaluationError
 from me2e_compress.metrics.episode import Infraction, InfractionKind
 from me2e_compress.metrics.measure import (
     Estimate,

@@ -6,6 +6,9 @@ from pathlib import Path
 
 import pytest
 
+from me2e_compress.commands.evaluate import EvaluateResult
+from me2e_compress.commands.result import Result, plain
+from me2e_compress.commands.score import ScoreResult, scores_table
 from me2e_compress.metrics.bench2drive import ABILITIES
 from me2e_compress.metrics.deadlines import charged, deadlines, deadlines_table
 from me2e_compress.metrics.episode import (
@@ -28,9 +31,6 @@ from me2e_compress.metrics.route_scores import (
 )
 from me2e_compress.metrics.route_summary import RouteSummary
 from me2e_compress.metrics.scores import score
-from me2e_compress.workflows.evaluate import EvaluateResult
-from me2e_compress.workflows.result import Result, plain
-from me2e_compress.workflows.score import ScoreResult, scores_table
 from tests.metrics.drives import cruise, drive, infraction
 
 CRASH = infraction(InfractionKind.COLLISION_VEHICLE)

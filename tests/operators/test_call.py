@@ -5,7 +5,7 @@ import onnx_ir as ir
 import pytest
 
 from me2e_compress import graph
-from me2e_compress.errors import GraphError
+from me2e_compress.base.errors import GraphError
 from me2e_compress.operators.call import FusedCall
 
 # A Constant node of a file read by onnx_ir has neither type nor shape.

@@ -5,7 +5,7 @@ import onnx_ir as ir
 import onnxruntime
 import pytest
 
-from me2e_compress.errors import PreconditionError, RecipeError
+from me2e_compress.base.errors import PreconditionError, RecipeError
 from me2e_compress.graph.validity import ORIGINAL_DOMAIN, PLUGIN_DOMAIN
 from me2e_compress.operators.deformable_attention import DeformableAttention
 from me2e_compress.operators.multi_head_attention import FusedMultiHeadAttention

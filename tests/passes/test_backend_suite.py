@@ -8,7 +8,7 @@ import dataclasses
 import onnx_ir as ir
 import pytest
 
-from me2e_compress.errors import Me2eError
+from me2e_compress.base.errors import Me2eError
 from me2e_compress.graph import provenance
 from me2e_compress.manager import PassManager, recipe
 from me2e_compress.passes.fold_constants import FoldConstants

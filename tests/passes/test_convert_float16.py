@@ -10,8 +10,8 @@ import onnx_ir as ir
 import pytest
 
 from me2e_compress import graph
+from me2e_compress.base.errors import PreconditionError, ProviderError
 from me2e_compress.calibration.dataset import CalibrationSet
-from me2e_compress.errors import PreconditionError, ProviderError
 from me2e_compress.graph.modules.module_map import ModuleMap
 from me2e_compress.manager.verification_inputs import relative_error
 from me2e_compress.passes import Context

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from me2e_compress import graph
-from me2e_compress.errors import ModuleMapError, PreconditionError, RecipeError
+from me2e_compress.base.errors import ModuleMapError, PreconditionError, RecipeError
 from me2e_compress.manager import PassManager, recipe
 from me2e_compress.passes import PASSES
 from me2e_compress.passes.ablate_modules import AblateModules

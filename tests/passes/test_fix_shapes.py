@@ -6,7 +6,7 @@ import onnx_ir as ir
 import pytest
 
 from me2e_compress import graph
-from me2e_compress.errors import Me2eError, PreconditionError, RecipeError
+from me2e_compress.base.errors import Me2eError, PreconditionError, RecipeError
 from me2e_compress.graph.modules.module_map import ModuleMap
 from me2e_compress.manager import PassManager, Report, recipe
 from me2e_compress.passes import Context

@@ -6,7 +6,7 @@ import onnxruntime as ort
 import pytest
 
 from me2e_compress import graph
-from me2e_compress.errors import PassError
+from me2e_compress.base.errors import PassError
 from me2e_compress.graph import provenance
 from me2e_compress.graph.provenance import Provenance
 from me2e_compress.passes import fold_with_onnxsim

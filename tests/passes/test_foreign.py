@@ -8,7 +8,7 @@ import onnx_ir as ir
 import pytest
 
 from me2e_compress import graph
-from me2e_compress.errors import PassError
+from me2e_compress.base.errors import PassError
 from me2e_compress.graph import provenance
 from me2e_compress.graph.provenance import Provenance
 from me2e_compress.passes.foreign import SurgeonFunction

@@ -6,8 +6,13 @@ import onnx_ir as ir
 import pytest
 
 from me2e_compress import graph
+from me2e_compress.base.errors import (
+    FramesError,
+    Me2eError,
+    PreconditionError,
+    RecipeError,
+)
 from me2e_compress.calibration.dataset import CalibrationSet
-from me2e_compress.errors import FramesError, Me2eError, PreconditionError, RecipeError
 from me2e_compress.graph.modules.module_map import ModuleMap
 from me2e_compress.manager import PassManager
 from me2e_compress.manager.report import Report

@@ -9,14 +9,14 @@ import onnx_ir as ir
 import pytest
 
 from me2e_compress import graph
-from me2e_compress.calibration.calibrator import Calibrator
-from me2e_compress.calibration.dataset import CalibrationSet
-from me2e_compress.errors import (
+from me2e_compress.base.errors import (
     FramesError,
     ModuleMapError,
     PreconditionError,
     RecipeError,
 )
+from me2e_compress.calibration.calibrator import Calibrator
+from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.fidelity.compare import compare
 from me2e_compress.graph import provenance
 from me2e_compress.manager import PassManager

@@ -5,7 +5,7 @@ import numpy.typing as npt
 import onnx_ir as ir
 import pytest
 
-from me2e_compress.errors import RecipeError
+from me2e_compress.base.errors import RecipeError
 from me2e_compress.graph.nodes import constant_values
 from me2e_compress.quantization.decision import Decision, Overrides
 from me2e_compress.quantization.find_attention import Attention, find_attention

@@ -5,7 +5,7 @@ from pathlib import Path
 import onnx_ir as ir
 import pytest
 
-from me2e_compress.errors import RecipeError
+from me2e_compress.base.errors import RecipeError
 from me2e_compress.graph import provenance
 from me2e_compress.graph.provenance import Provenance
 from me2e_compress.quantization.decision import Overrides, QuantPlan

@@ -5,7 +5,8 @@ import onnx_ir as ir
 import pytest
 
 from me2e_compress import graph
-from me2e_compress.errors import ModuleMapError, RecipeError
+from me2e_compress.base.errors import ModuleMapError, RecipeError
+from me2e_compress.commands.int8_outcome import float_bytes
 from me2e_compress.graph.modules.module_map import Module, ModuleMap
 from me2e_compress.passes import Context
 from me2e_compress.passes.quantize_int8 import QuantizeInt8
@@ -20,7 +21,6 @@ from me2e_compress.quantization.plan import make_plan, tensors_of
 from me2e_compress.quantization.rules import RuleSet
 from me2e_compress.quantization.rules.rule_sets import PaperRules, SafeRules
 from me2e_compress.quantization.scheme import QuantScheme
-from me2e_compress.workflows.int8_outcome import float_bytes
 from tests.support.calls import calls
 from tests.support.nets import FULL, MODULES, PAPER, conv_attention, net
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from me2e_compress.errors import RecipeError
+from me2e_compress.base.errors import RecipeError
 from me2e_compress.quantization.decision import Decision
 from me2e_compress.quantization.plan import make_plan
 from me2e_compress.quantization.rules import RULE_SETS

@@ -6,7 +6,7 @@ import numpy as np
 import onnx_ir as ir
 import pytest
 
-from me2e_compress.errors import ProviderError
+from me2e_compress.base.errors import ProviderError
 from me2e_compress.runtime.breakdown import (
     NO_MODULE,
     OUTSIDE,

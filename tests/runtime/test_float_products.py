@@ -11,10 +11,10 @@ import onnxruntime as ort
 import pytest
 
 from me2e_compress import graph
+from me2e_compress.base.errors import EvaluationError, GraphError
 from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.driving import onnx_policy
 from me2e_compress.driving.onnx_policy import OnnxPolicy
-from me2e_compress.errors import EvaluationError, GraphError
 from me2e_compress.manager import PassManager
 from me2e_compress.passes.base import Context
 from me2e_compress.passes.import_normalize import ImportNormalize

@@ -6,7 +6,7 @@ import onnxruntime as ort
 import pytest
 
 from me2e_compress import graph
-from me2e_compress.errors import GraphError
+from me2e_compress.base.errors import GraphError
 from me2e_compress.graph.files import external_tensors
 from me2e_compress.graph.rewrite import add_constant
 from me2e_compress.runtime.kernel_types import nodes_without_kernel

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from me2e_compress import graph
+from me2e_compress.base.errors import EvaluationError, FramesError
 from me2e_compress.calibration.dataset import CalibrationSet
-from me2e_compress.errors import EvaluationError, FramesError
 from me2e_compress.graph import sha256_of
 from me2e_compress.runtime.frames import Array, Frame
 from me2e_compress.runtime.latency_trace import LatencyTrace, time_shares

@@ -15,7 +15,7 @@ import onnx_ir as ir
 import onnxruntime as ort
 import pytest
 
-from me2e_compress.errors import ProviderError
+from me2e_compress.base.errors import ProviderError
 from me2e_compress.evaluators.highway.drivers import OnnxDriver
 from me2e_compress.runtime.providers import (
     CPU,

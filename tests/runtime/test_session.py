@@ -6,7 +6,7 @@ import onnx_ir as ir
 import pytest
 
 from me2e_compress import graph
-from me2e_compress.errors import FramesError, GraphError
+from me2e_compress.base.errors import FramesError, GraphError
 from me2e_compress.graph.nodes import constant_values
 from me2e_compress.runtime.frames import Array, Frame
 from me2e_compress.runtime.runnable import why_endless, why_unsupported

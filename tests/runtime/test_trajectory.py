@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from me2e_compress.errors import EvaluationError, GraphError
+from me2e_compress.base.errors import EvaluationError, GraphError
 from me2e_compress.runtime.plan_adapter import PlanAdapter, Trajectory
 
 OUT = {"way": np.arange(8, dtype=np.float32).reshape(1, 4, 2)}

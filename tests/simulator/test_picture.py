@@ -7,7 +7,7 @@ import numpy.typing as npt
 import pytest
 from PIL import Image
 
-from me2e_compress.errors import EvaluationError
+from me2e_compress.base.errors import EvaluationError
 from me2e_compress.simulator.camera_rig import CAMERA_NAMES
 from me2e_compress.simulator.pictures import (
     EGO,

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from me2e_compress.errors import EvaluationError
+from me2e_compress.base.errors import EvaluationError
 from me2e_compress.simulator.routes import (
     SCENARIO_ABILITIES,
     SHIPPED,

@@ -5,9 +5,9 @@ from typing import Any
 
 import pytest
 
+from me2e_compress.base.errors import Me2eError, StudyError
 from me2e_compress.driving.latency import HostStageLatency, LimitedLatency, TraceLatency
 from me2e_compress.driving.realtime import LatencyModel
-from me2e_compress.errors import Me2eError, StudyError
 from me2e_compress.manager import recipe
 from me2e_compress.study import Condition, Study, Timing, Variant, run_study
 from me2e_compress.study.definition import StudyBlock

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from me2e_compress.errors import EvaluationError, StudyError
+from me2e_compress.base.errors import EvaluationError, StudyError
 from me2e_compress.evaluators.highway.engine import LocalEngine
 from me2e_compress.runtime.profile import in_turn_text
 from me2e_compress.runtime.providers import CpuProvider

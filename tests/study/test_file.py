@@ -4,7 +4,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from me2e_compress.errors import (
+from me2e_compress.base.errors import (
     EvaluationError,
     GraphError,
     ProviderError,

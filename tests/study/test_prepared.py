@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from me2e_compress import graph
-from me2e_compress.errors import StudyError
+from me2e_compress.base.errors import StudyError
+from me2e_compress.commands.result import SILENT
 from me2e_compress.manager import PassManager, recipe
 from me2e_compress.study import Listener, Study, Variant
 from me2e_compress.study.prepared import PreparedVariant, prepare_variant
 from me2e_compress.study.workspace import Workspace
-from me2e_compress.workflows.result import SILENT
 from tests.evaluators.highway.drivers import slow_here, straight_on
 from tests.study.conftest import Make
 from tests.support.command import write_frames

@@ -7,9 +7,9 @@ import matplotlib.pyplot as plt
 import pytest
 from markupsafe import Markup
 
-from me2e_compress.display import Cell, Table
-from me2e_compress.errors import StudyError
-from me2e_compress.registry.drafts import IN_JSON, IN_MARKDOWN, is_marked
+from me2e_compress.base.atomic import IN_JSON, IN_MARKDOWN, is_marked
+from me2e_compress.base.display import Cell, Table
+from me2e_compress.base.errors import StudyError
 from me2e_compress.runtime.latency_trace import Load
 from me2e_compress.study import StudyResult
 from me2e_compress.study.cells import (

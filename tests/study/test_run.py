@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from me2e_compress.errors import EvaluationError, StudyError
+from me2e_compress.base.errors import EvaluationError, StudyError
 from me2e_compress.evaluators.results import ResultsFolder
 from me2e_compress.manager import recipe
 from me2e_compress.metrics.route_summary import RouteSummary

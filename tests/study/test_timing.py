@@ -5,9 +5,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from me2e_compress.base.errors import EvaluationError
 from me2e_compress.calibration.dataset import CalibrationSet
+from me2e_compress.commands.result import SILENT
 from me2e_compress.driving.latency import NoLatency, TraceLatency
-from me2e_compress.errors import EvaluationError
 from me2e_compress.graph import sha256_of
 from me2e_compress.metrics.measure import Measure
 from me2e_compress.runtime.latency_trace import LatencyTrace
@@ -16,7 +17,6 @@ from me2e_compress.study import Condition, Listener, Study, Timing, Variant, out
 from me2e_compress.study.outcome import Clock, time_all
 from me2e_compress.study.prepared import prepare_variant
 from me2e_compress.study.workspace import Workspace
-from me2e_compress.workflows.result import SILENT
 from tests.study.conftest import BLIND, IDEAL, Make
 from tests.support.command import write_frames
 

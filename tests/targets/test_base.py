@@ -1,7 +1,7 @@
 import onnx_ir as ir
 import pytest
 
-from me2e_compress.errors import RecipeError
+from me2e_compress.base.errors import RecipeError
 from me2e_compress.targets import TARGETS
 from me2e_compress.targets.quantized import describe_quantized
 

@@ -6,7 +6,7 @@ import numpy as np
 import onnx_ir as ir
 import pytest
 
-from me2e_compress.errors import VerificationError
+from me2e_compress.base.errors import VerificationError
 from me2e_compress.graph.shapes import Dims
 from me2e_compress.operators import (
     OPERATORS,

@@ -4,11 +4,11 @@ from typing import ClassVar
 import onnx_ir as ir
 import pytest
 
-from me2e_compress.errors import VerificationError
+from me2e_compress.base.errors import VerificationError
+from me2e_compress.base.registry import options_of
 from me2e_compress.graph import provenance
 from me2e_compress.passes import PASSES, Context, Pass, PassResult
 from me2e_compress.passes.ablate_modules import AblateModules
-from me2e_compress.registry import options_of
 from me2e_compress.testing import check_pass
 from tests.manager import passes
 from tests.support.nets import parsed

@@ -7,6 +7,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
+from me2e_compress.base.errors import VerificationError
 from me2e_compress.driving.contract import (
     Answer,
     Observation,
@@ -16,7 +17,6 @@ from me2e_compress.driving.contract import (
     Trajectory,
 )
 from me2e_compress.driving.policies import Driver
-from me2e_compress.errors import VerificationError
 from me2e_compress.evaluators.highway.drivers import OnnxDriver
 from me2e_compress.simulator.scene import Control
 from me2e_compress.simulator.world import World

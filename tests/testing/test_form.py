@@ -3,9 +3,9 @@ from typing import Any, ClassVar
 
 import pytest
 
-from me2e_compress.errors import StudyError, VerificationError
+from me2e_compress.base.errors import StudyError, VerificationError
+from me2e_compress.base.registry import Registry
 from me2e_compress.quantization.rules import RULE_SETS, RULES
-from me2e_compress.registry import Registry
 from me2e_compress.targets import TARGETS
 from me2e_compress.testing import check_form
 

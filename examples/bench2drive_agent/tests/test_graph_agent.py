@@ -10,8 +10,8 @@ import pytest
 from pydantic import ValidationError
 
 from agent_files import options, straight_on
+from me2e_compress.base.errors import EvaluationError
 from me2e_compress.driving.realtime import ControlClock
-from me2e_compress.errors import EvaluationError
 from me2e_compress.evaluators.bench2drive.recordings import (
     read_decisions,
     read_recording,

@@ -15,9 +15,9 @@ from driving_logs.moments import (
     LogScene,
 )
 from driving_logs.pictures import read_pixels
+from me2e_compress.base.errors import EvaluationError, FramesError
 from me2e_compress.driving.contract import EgoKinematics, Observation
 from me2e_compress.driving.onnx_policy import OnnxPolicy
-from me2e_compress.errors import EvaluationError, FramesError
 from me2e_compress.runtime.frames import Array
 
 

@@ -23,8 +23,8 @@ from driving_logs.moments import (
     intrinsics,
     matrix_of,
 )
-from me2e_compress.errors import FramesError
-from me2e_compress.registry import documents
+from me2e_compress.base import documents
+from me2e_compress.base.errors import FramesError
 
 PERIOD_US = 100_000
 DEEPEST = 3

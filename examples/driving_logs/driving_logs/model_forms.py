@@ -6,10 +6,10 @@ import onnx_ir as ir
 
 from driving_logs.model_inputs import InputForm, LoggedInputs
 from me2e_compress import graph
+from me2e_compress.base.errors import EvaluationError, FramesError
 from me2e_compress.calibration.dataset import PixelInput
 from me2e_compress.driving.adapter import ImageNormalization
 from me2e_compress.driving.adapter.image_inputs import Triple
-from me2e_compress.errors import EvaluationError, FramesError
 from me2e_compress.graph.recurrence import recurrent_inputs
 
 STACK = "me2e.stack"

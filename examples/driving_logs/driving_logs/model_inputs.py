@@ -10,8 +10,8 @@ import numpy as np
 from driving_logs.commands import command_at
 from driving_logs.moments import CameraLog, Floats, LogMoment, LogScene
 from driving_logs.pictures import read_picture
+from me2e_compress.base.errors import FramesError
 from me2e_compress.calibration.dataset import PixelInput
-from me2e_compress.errors import FramesError
 from me2e_compress.runtime.frames import Array, Frame
 
 MADE = (

@@ -15,8 +15,8 @@ from typing import ClassVar, Self, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
+from me2e_compress.base.errors import FramesError
 from me2e_compress.calibration.recording import DriveLog
-from me2e_compress.errors import FramesError
 
 Floats: TypeAlias = npt.NDArray[np.float64]
 

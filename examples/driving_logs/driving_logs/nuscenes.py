@@ -19,7 +19,7 @@ from driving_logs.moments import (
     matrix_of,
 )
 from driving_logs.nuscenes_tables import NuScenesTables, Row, rows
-from me2e_compress.errors import FramesError
+from me2e_compress.base.errors import FramesError
 
 LIDAR = "LIDAR_TOP"
 CENTRE_M = 0.5

@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Any, TypeAlias
 
 from driving_logs.moments import Floats, matrix_of, pose
-from me2e_compress.errors import FramesError
-from me2e_compress.registry import documents
+from me2e_compress.base import documents
+from me2e_compress.base.errors import FramesError
 
 Row: TypeAlias = Mapping[str, Any]
 

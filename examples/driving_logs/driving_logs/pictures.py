@@ -14,9 +14,9 @@ import numpy as np
 import numpy.typing as npt
 
 from driving_logs.moments import Floats
+from me2e_compress.base.documents import MalformedError, check_regular
+from me2e_compress.base.errors import FramesError
 from me2e_compress.calibration.dataset import PixelInput
-from me2e_compress.errors import FramesError
-from me2e_compress.registry.documents import MalformedError, check_regular
 
 Bytes: TypeAlias = npt.NDArray[np.uint8]
 

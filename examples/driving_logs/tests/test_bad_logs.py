@@ -20,8 +20,8 @@ from driving_logs.model_inputs import (
 )
 from driving_logs.nuscenes_tables import rows
 from driving_logs.pictures import read_picture
+from me2e_compress.base.errors import FramesError
 from me2e_compress.calibration.dataset import PixelInput
-from me2e_compress.errors import FramesError
 from read_logs import opened
 from small_logs import (
     CLIP,

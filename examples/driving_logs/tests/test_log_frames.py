@@ -17,9 +17,9 @@ from driving_logs.model_inputs import (
 from driving_logs.moments import CameraLog
 from driving_logs.nuscenes import NuScenesLog
 from driving_logs.pictures import Picture, read_picture
+from me2e_compress.base.errors import FramesError
 from me2e_compress.calibration.dataset import PixelInput
 from me2e_compress.calibration.recording import LOGS
-from me2e_compress.errors import FramesError
 from me2e_compress.testing import check_form
 from read_logs import F32, FORMS, MODEL, PIXELS, frames, opened, to_lidar
 from small_logs import (

@@ -10,10 +10,10 @@ import onnx_ir as ir
 import pytest
 
 from me2e_compress import graph
+from me2e_compress.base.errors import FramesError
 from me2e_compress.calibration.dataset import CalibrationSet
-from me2e_compress.errors import FramesError
-from me2e_compress.workflows.frames import record_frames
-from me2e_compress.workflows.options import FramesOptions
+from me2e_compress.commands.frames import record_frames
+from me2e_compress.commands.options import FramesOptions
 from small_logs import MAKERS, SPEED, car_at, pixel, seen_point, write_nuscenes
 
 FRONT = """

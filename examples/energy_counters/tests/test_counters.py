@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from me2e_compress.errors import EnergyError
+from me2e_compress.base.errors import EnergyError
 from me2e_compress.runtime.energy.energy_counter import ENERGY_COUNTERS
 from me2e_compress.runtime.energy.energy_result import Absent, Reader
 from me2e_compress.testing import check_form

@@ -6,13 +6,13 @@ from typing import Annotated, ClassVar
 import numpy as np
 from pydantic import Field
 
+from me2e_compress.base.errors import EvaluationError
 from me2e_compress.driving.latency import (
     DecisionFacts,
     LatencySource,
     LayeredLatency,
     NoLatency,
 )
-from me2e_compress.errors import EvaluationError
 
 
 @dataclass(frozen=True)

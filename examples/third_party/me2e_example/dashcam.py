@@ -7,9 +7,9 @@ from typing import ClassVar
 
 import numpy as np
 
+from me2e_compress.base.errors import FramesError
 from me2e_compress.calibration.dataset import PixelInput
 from me2e_compress.calibration.recording import Begin, DriveLog, LogRequest
-from me2e_compress.errors import FramesError
 from me2e_compress.runtime.frames import Frame
 
 PIXELS = PixelInput(

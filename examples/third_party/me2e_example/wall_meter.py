@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar
 
-from me2e_compress.errors import EnergyError
+from me2e_compress.base.errors import EnergyError
 from me2e_compress.runtime.energy.energy_counter import EnergyCounter
 from me2e_compress.runtime.energy.energy_result import Absent, Reader
 

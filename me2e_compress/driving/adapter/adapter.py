@@ -15,6 +15,8 @@ from pydantic import (
     model_validator,
 )
 
+from me2e_compress.base import documents
+from me2e_compress.base.errors import EvaluationError
 from me2e_compress.driving.adapter.image_inputs import ImageInput, ImageNormalization
 from me2e_compress.driving.input_sources import (
     INPUT_SOURCES,
@@ -22,9 +24,7 @@ from me2e_compress.driving.input_sources import (
     InputSource,
     Observed,
 )
-from me2e_compress.errors import EvaluationError
 from me2e_compress.graph.recurrence import RECURRENT, declared_pairs
-from me2e_compress.registry import documents
 from me2e_compress.runtime.frames import Array
 from me2e_compress.runtime.plan_adapter import PLAN, PlanAdapter
 

@@ -15,10 +15,10 @@ from pydantic import (
     model_validator,
 )
 
+from me2e_compress.base import documents
+from me2e_compress.base.errors import EvaluationError
+from me2e_compress.base.extras import with_install_hint
 from me2e_compress.driving.contract import DEFAULT_IMAGE_SIZE, Shape, fits
-from me2e_compress.errors import EvaluationError
-from me2e_compress.extras import with_install_hint
-from me2e_compress.registry import documents
 from me2e_compress.runtime.frames import Array
 
 IMAGE = "me2e.image"

@@ -6,6 +6,7 @@ from typing import Literal, Self
 
 import numpy as np
 
+from me2e_compress.base.errors import EvaluationError
 from me2e_compress.driving.adapter.adapter import Adapter, Feed
 from me2e_compress.driving.adapter.image_inputs import (
     CAMERA_NAMES,
@@ -25,7 +26,6 @@ from me2e_compress.driving.contract import (
     shaped,
 )
 from me2e_compress.driving.input_sources import INPUT_SOURCES, EgoTrack, Observed
-from me2e_compress.errors import EvaluationError
 from me2e_compress.runtime.frames import Array
 from me2e_compress.runtime.session import DTYPES, Session, SessionPort
 

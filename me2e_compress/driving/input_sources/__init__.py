@@ -14,9 +14,9 @@ from typing import ClassVar
 import numpy as np
 import numpy.typing as npt
 
+from me2e_compress.base.errors import EvaluationError
+from me2e_compress.base.registry import Registry
 from me2e_compress.driving.contract import CAN_BUS_SIZE, EgoKinematics, Observation
-from me2e_compress.errors import EvaluationError
-from me2e_compress.registry import Registry
 from me2e_compress.runtime.frames import Array
 
 __all__ = ["INPUT_SOURCES", "InputSource", "Observed"]

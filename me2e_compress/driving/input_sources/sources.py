@@ -8,9 +8,9 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import Field
 
+from me2e_compress.base.errors import EvaluationError
 from me2e_compress.driving.contract import Count, Positive
 from me2e_compress.driving.input_sources import InputSource, Observed
-from me2e_compress.errors import EvaluationError
 from me2e_compress.runtime.frames import Array
 
 

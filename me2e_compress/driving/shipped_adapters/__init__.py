@@ -3,7 +3,7 @@
 from importlib import resources
 from pathlib import Path
 
-from me2e_compress.errors import EvaluationError
+from me2e_compress.base.errors import EvaluationError
 
 __all__ = ["adapter_file", "shipped_adapters"]
 

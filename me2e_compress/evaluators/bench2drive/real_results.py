@@ -8,8 +8,9 @@ from pathlib import Path
 from typing import ClassVar, Self
 from xml.etree import ElementTree
 
+from me2e_compress.base import documents
+from me2e_compress.base.errors import EvaluationError
 from me2e_compress.driving.policies import Driver
-from me2e_compress.errors import EvaluationError
 from me2e_compress.evaluators.bench2drive.recordings import (
     TICK_S,
     BrokenRecordingError,
@@ -25,7 +26,6 @@ from me2e_compress.evaluators.bench2drive.result_files import (
 from me2e_compress.evaluators.contract import Drive, Evaluator, Listener
 from me2e_compress.metrics.episode import EgoFrame, Episode, InferenceRecord
 from me2e_compress.metrics.scores import FULL_SET
-from me2e_compress.registry import documents
 
 _IDS = json.loads(Path(__file__).with_name("route_ids.json").read_bytes())
 ROUTE_SETS: dict[str, frozenset[str]] = {

@@ -14,8 +14,8 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
+from me2e_compress.base import documents
 from me2e_compress.metrics.episode import LARGEST, EgoFrame, InferenceRecord
-from me2e_compress.registry import documents
 
 TICK_S = 0.05
 """Simulated seconds between two ticks of a leaderboard run."""

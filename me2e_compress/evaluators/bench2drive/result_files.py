@@ -10,7 +10,8 @@ from typing import Annotated, Any
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from me2e_compress.errors import EvaluationError
+from me2e_compress.base import documents
+from me2e_compress.base.errors import EvaluationError
 from me2e_compress.metrics.episode import (
     FAILURES,
     LARGEST,
@@ -20,7 +21,6 @@ from me2e_compress.metrics.episode import (
     Infraction,
     InfractionKind,
 )
-from me2e_compress.registry import documents
 from me2e_compress.simulator.routes import SCENARIO_ABILITIES
 
 _PERCENT = re.compile(r"\b\d+\.?\d*%")

@@ -7,9 +7,9 @@ from dataclasses import replace
 
 import numpy as np
 
+from me2e_compress.base.errors import FramesError
 from me2e_compress.driving.onnx_policy import OnnxPolicy
 from me2e_compress.driving.realtime import DT_US
-from me2e_compress.errors import FramesError
 from me2e_compress.evaluators.highway.controller import AnchoredPlan
 from me2e_compress.evaluators.highway.observe import ObservationBuilder, cameras_of
 from me2e_compress.evaluators.highway.runner import EndingRules

@@ -7,11 +7,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar
 
+from me2e_compress.base.errors import EvaluationError
 from me2e_compress.driving.contract import DEFAULT_IMAGE_SIZE, Policy
 from me2e_compress.driving.host_stage import HOST_STAGES, HostStage
 from me2e_compress.driving.policies import POLICIES, Driver, SizedPolicy
 from me2e_compress.driving.shipped_adapters import adapter_file, shipped_adapters
-from me2e_compress.errors import EvaluationError
 from me2e_compress.graph import load, sha256_of
 from me2e_compress.graph.modules.module_map import ModuleMap
 from me2e_compress.runtime.providers import CPU, Provider

@@ -18,10 +18,10 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 
 import psutil
 
+from me2e_compress.base.errors import EvaluationError, Me2eError
+from me2e_compress.base.extras import with_install_hint
 from me2e_compress.driving.policies import Driver
-from me2e_compress.errors import EvaluationError, Me2eError
 from me2e_compress.evaluators.contract import Drive, Driven, Engine
-from me2e_compress.extras import with_install_hint
 from me2e_compress.runtime.children import end_with_parent, spawn_context
 from me2e_compress.simulator.routes import Route
 

@@ -5,9 +5,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, ClassVar
 
+from me2e_compress.base.errors import EvaluationError
+from me2e_compress.base.extras import require_extra
 from me2e_compress.driving.contract import RouteInfo
 from me2e_compress.driving.policies import Driver, opened
-from me2e_compress.errors import EvaluationError
 from me2e_compress.evaluators.contract import (
     ABILITIES,
     Drive,
@@ -18,7 +19,6 @@ from me2e_compress.evaluators.contract import (
 from me2e_compress.evaluators.highway.drivers import image_size_of
 from me2e_compress.evaluators.highway.engine import LocalEngine
 from me2e_compress.evaluators.results import log_cost
-from me2e_compress.extras import require_extra
 from me2e_compress.metrics.episode import Episode
 from me2e_compress.simulator.routes import (
     EXPERT_S,

@@ -11,6 +11,7 @@ from typing import TypeVar
 import numpy as np
 import numpy.typing as npt
 
+from me2e_compress.base.errors import EvaluationError
 from me2e_compress.driving.contract import (
     HostedPolicy,
     PedalsAndWheel,
@@ -19,7 +20,6 @@ from me2e_compress.driving.contract import (
 )
 from me2e_compress.driving.latency import DecisionFacts
 from me2e_compress.driving.realtime import ControlClock
-from me2e_compress.errors import EvaluationError
 from me2e_compress.evaluators.contract import Drive
 from me2e_compress.evaluators.highway.controller import AnchoredPlan, control_of
 from me2e_compress.evaluators.highway.drivers import image_size_of

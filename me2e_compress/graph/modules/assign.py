@@ -7,8 +7,8 @@ from typing import Literal
 
 import onnx_ir as ir
 
-from me2e_compress.display import join_names
-from me2e_compress.errors import ModuleMapError
+from me2e_compress.base.display import join_names
+from me2e_compress.base.errors import ModuleMapError
 from me2e_compress.graph.modules.module_map import (
     ModuleMap,
     PathGlob,

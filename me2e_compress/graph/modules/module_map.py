@@ -14,8 +14,8 @@ from typing import ClassVar, Literal, Self
 import onnx_ir as ir
 import pydantic
 
-from me2e_compress.errors import ModuleMapError
-from me2e_compress.registry import documents
+from me2e_compress.base import documents
+from me2e_compress.base.errors import ModuleMapError
 
 _SCOPES = "pkg.torch.onnx.name_scopes"
 _NAMESPACE = "namespace"

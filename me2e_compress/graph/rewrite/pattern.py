@@ -20,7 +20,7 @@ from typing import TypeAlias
 import numpy as np
 import onnx_ir as ir
 
-from me2e_compress.errors import GraphError
+from me2e_compress.base.errors import GraphError
 from me2e_compress.graph.nodes import (
     FLOATS,
     Array,

@@ -9,12 +9,12 @@ from typing import NamedTuple, Self
 
 import onnx_ir as ir
 
-from me2e_compress.errors import GraphError
+from me2e_compress.base import documents
+from me2e_compress.base.errors import GraphError
 from me2e_compress.graph.nodes import STANDARD, graphs_of, nodes_of, opset_of
 from me2e_compress.graph.recurrence import RECURRENT, SessionPort, recurrence
 from me2e_compress.graph.rewrite.raise_opset import raise_opset
 from me2e_compress.graph.stack.stack_file import Part, StackFile
-from me2e_compress.registry import documents
 
 
 class End(NamedTuple):

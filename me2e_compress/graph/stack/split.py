@@ -4,7 +4,7 @@ from collections.abc import Mapping
 
 import onnx_ir as ir
 
-from me2e_compress.errors import GraphError
+from me2e_compress.base.errors import GraphError
 from me2e_compress.graph.nodes import STANDARD, nodes_of, reads_of
 from me2e_compress.graph.stack.join import End, JoinedStack
 from me2e_compress.graph.stack.stack_file import Part

@@ -11,10 +11,10 @@ from typing import Any, Self
 import onnx_ir as ir
 import pydantic
 
-from me2e_compress.errors import GraphError
+from me2e_compress.base import documents
+from me2e_compress.base.errors import GraphError
 from me2e_compress.graph.files import load
 from me2e_compress.graph.recurrence import SessionPort, declared_pairs, port_of
-from me2e_compress.registry import documents
 
 _NAME = re.compile(r"[A-Za-z0-9_-]+")
 _STRICT = pydantic.ConfigDict(frozen=True, extra="forbid")

@@ -17,7 +17,7 @@ from typing import Any
 
 from llvmlite import binding as llvm
 
-from me2e_compress.errors import GraphError
+from me2e_compress.base.errors import GraphError
 from me2e_compress.operators.kernels.kernel import CompiledKernel
 from me2e_compress.operators.kernels.trampoline import keep, private
 

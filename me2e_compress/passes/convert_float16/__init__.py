@@ -10,10 +10,10 @@ from fnmatch import fnmatchcase
 import numpy as np
 import onnx_ir as ir
 
+from me2e_compress.base.display import plural
+from me2e_compress.base.errors import PreconditionError
 from me2e_compress.calibration.calibrator import Calibrator
 from me2e_compress.calibration.dataset import CalibrationSet
-from me2e_compress.display import plural
-from me2e_compress.errors import PreconditionError
 from me2e_compress.graph import (
     array_of,
     has_subgraph,

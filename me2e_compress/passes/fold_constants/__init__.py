@@ -18,7 +18,7 @@ from collections.abc import Container, Iterable
 import onnx_ir as ir
 
 from me2e_compress import graph as graphs
-from me2e_compress.display import plural
+from me2e_compress.base.display import plural
 from me2e_compress.graph import provenance
 from me2e_compress.graph.digest import digest_of_tensor
 from me2e_compress.graph.nodes import Array, graphs_of

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import onnx_ir as ir
 
-from me2e_compress.errors import PassError, RecipeError
+from me2e_compress.base.errors import PassError, RecipeError
 from me2e_compress.graph import digest, load, node_count, save
 from me2e_compress.graph.rewrite import lift_constants, sweep
 from me2e_compress.graph.surgeon import restore

@@ -6,8 +6,8 @@ from collections.abc import Callable, Mapping
 
 import onnx_ir as ir
 
-from me2e_compress.display import plural
-from me2e_compress.errors import PreconditionError
+from me2e_compress.base.display import plural
+from me2e_compress.base.errors import PreconditionError
 from me2e_compress.graph import graphs_of, opset_of
 from me2e_compress.graph.nodes import STANDARD
 from me2e_compress.graph.rewrite import remove_dead, replace_value, value_names

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import onnx_ir as ir
 
-from me2e_compress.errors import PreconditionError
+from me2e_compress.base.errors import PreconditionError
 from me2e_compress.graph import array_of, static_shape
 from me2e_compress.graph.nodes import input_at, is_standard, sole_maker, sole_reader
 from me2e_compress.operators import OWN_DOMAIN, FusedCall

@@ -14,7 +14,7 @@ import dataclasses
 import numpy as np
 import onnx_ir as ir
 
-from me2e_compress.errors import PreconditionError
+from me2e_compress.base.errors import PreconditionError
 from me2e_compress.graph import static_shape
 from me2e_compress.graph.nodes import (
     VIEWS,

@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 import onnx_ir as ir
 
-from me2e_compress.errors import PreconditionError
+from me2e_compress.base.errors import PreconditionError
 from me2e_compress.graph import array_of, is_standard, static_shape
 from me2e_compress.graph.nodes import producer_of, sole_reader
 from me2e_compress.operators import OWN_DOMAIN, FusedCall

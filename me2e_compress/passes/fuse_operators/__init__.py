@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator, Sequence
 
 import onnx_ir as ir
 
-from me2e_compress.errors import GraphError, PreconditionError
+from me2e_compress.base.errors import GraphError, PreconditionError
 from me2e_compress.graph import array_of, graphs_of, is_standard, opset_of
 from me2e_compress.graph.nodes import is_read, nodes_in
 from me2e_compress.graph.provenance import inherit

@@ -10,7 +10,7 @@ import math
 
 import onnx_ir as ir
 
-from me2e_compress.errors import PreconditionError
+from me2e_compress.base.errors import PreconditionError
 from me2e_compress.graph import is_standard, static_shape
 from me2e_compress.graph.nodes import (
     LAYOUT_OPERATORS,

@@ -8,7 +8,7 @@ from collections.abc import Callable, Container, Sequence
 import numpy as np
 import onnx_ir as ir
 
-from me2e_compress.errors import PreconditionError
+from me2e_compress.base.errors import PreconditionError
 from me2e_compress.operators import OWN_DOMAIN, FusedCall
 from me2e_compress.passes.digits import (
     Digit,

@@ -14,7 +14,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 import onnx_ir as ir
 
-from me2e_compress.errors import PreconditionError
+from me2e_compress.base.errors import PreconditionError
 from me2e_compress.graph import array_of, is_standard, static_shape
 from me2e_compress.graph.nodes import (
     ELEMENTWISE,

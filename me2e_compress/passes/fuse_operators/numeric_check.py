@@ -6,7 +6,7 @@ from typing import TypeAlias
 import numpy as np
 import onnx_ir as ir
 
-from me2e_compress.errors import PreconditionError
+from me2e_compress.base.errors import PreconditionError
 from me2e_compress.graph import array_of, digest, opset_of
 from me2e_compress.graph.nodes import Array
 from me2e_compress.operators import OWN_DOMAIN, expand

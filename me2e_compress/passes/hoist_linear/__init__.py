@@ -4,7 +4,7 @@ import dataclasses
 
 import onnx_ir as ir
 
-from me2e_compress.display import plural
+from me2e_compress.base.display import plural
 from me2e_compress.graph import macs, nodes_of, opset_of
 from me2e_compress.graph.nodes import graphs_of
 from me2e_compress.graph.rewrite import remove_dead, value_names

@@ -12,8 +12,9 @@ from typing import ClassVar, TypeAlias
 
 import onnx_ir as ir
 
+from me2e_compress.base.errors import RecipeError
+from me2e_compress.base.registry import Registry
 from me2e_compress.calibration.observers import DEFAULT_METHOD
-from me2e_compress.errors import RecipeError
 from me2e_compress.graph import WEIGHTED, static_shape
 from me2e_compress.graph.nodes import constant_values
 from me2e_compress.graph.recurrence import recurrent_inputs
@@ -28,7 +29,6 @@ from me2e_compress.quantization.geometry import (
     find_coordinates,
     find_geometry,
 )
-from me2e_compress.registry import Registry
 
 __all__ = ["DEFAULT_RULES", "RULES", "RULE_SETS", "Rule", "RuleFacts", "RuleSet"]
 

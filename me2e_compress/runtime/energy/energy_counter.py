@@ -15,9 +15,10 @@ from typing import Any, ClassVar
 import numpy as np
 import numpy.typing as npt
 
-from me2e_compress.display import with_prefix
-from me2e_compress.errors import EnergyError
-from me2e_compress.registry import Registry, documents
+from me2e_compress.base import documents
+from me2e_compress.base.display import with_prefix
+from me2e_compress.base.errors import EnergyError
+from me2e_compress.base.registry import Registry
 from me2e_compress.runtime.energy.energy_result import (
     FEWEST_WINDOWS,
     Absent,

@@ -10,10 +10,10 @@ from typing import Annotated, Self, TypeAlias
 import numpy as np
 from pydantic import Field, TypeAdapter
 
-from me2e_compress.display import Table, table
-from me2e_compress.errors import EnergyError
-from me2e_compress.registry import documents, drafts
-from me2e_compress.runtime.atomic import write_document
+from me2e_compress.base import atomic, documents
+from me2e_compress.base.atomic import write_document
+from me2e_compress.base.display import Table, table
+from me2e_compress.base.errors import EnergyError
 
 
 class Reader(abc.ABC):
@@ -232,7 +232,7 @@ class EnergyResult:
 
     def save(self, path: Path) -> None:
         """Write the result atomically; an EnergyError if it cannot be written."""
-        with drafts.writing_errors(path, EnergyError):
+        with atomic.writing_errors(path, EnergyError):
             write_document(path, asdict(self), indent=2)
 
     @classmethod

@@ -13,7 +13,7 @@ from threading import Event, Thread
 
 import numpy as np
 
-from me2e_compress.errors import EnergyError
+from me2e_compress.base.errors import EnergyError
 from me2e_compress.graph import sha256_of
 from me2e_compress.runtime.energy.energy_counter import (
     EnergyRecording,

@@ -6,7 +6,7 @@ from typing import Any, ClassVar, TypeVar
 
 import pynvml
 
-from me2e_compress.errors import EnergyError
+from me2e_compress.base.errors import EnergyError
 from me2e_compress.runtime.energy.energy_counter import EnergyCounter
 from me2e_compress.runtime.energy.energy_result import Absent, Reader
 

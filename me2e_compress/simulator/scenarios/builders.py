@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from me2e_compress.errors import EvaluationError
+from me2e_compress.base.errors import EvaluationError
 from me2e_compress.simulator.plane_geometry import Floats
 from me2e_compress.simulator.routes import Route
 from me2e_compress.simulator.scenarios import actors, flows, roads

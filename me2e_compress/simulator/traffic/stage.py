@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from highway_env.vehicle.objects import RoadObject
 
-from me2e_compress.errors import EvaluationError
+from me2e_compress.base.errors import EvaluationError
 from me2e_compress.simulator.camera_rig import DRAWN, drawn_weather
 from me2e_compress.simulator.plane_geometry import Floats, Point, RoutePath
 from me2e_compress.simulator.routes import Parameter, Route

@@ -14,7 +14,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.style import context
 
-from me2e_compress.display import cell_text
+from me2e_compress.base.display import cell_text
 from me2e_compress.metrics.measure import Estimate
 from me2e_compress.metrics.scores import Scores
 from me2e_compress.study.cells import estimate_cell, measure_cell, number

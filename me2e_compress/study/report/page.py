@@ -8,17 +8,16 @@ from typing import NamedTuple
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 
-from me2e_compress.display import Table, escape_markdown, plural
-from me2e_compress.errors import StudyError
+from me2e_compress.base import atomic
+from me2e_compress.base.atomic import MARK, write_bytes, write_document
+from me2e_compress.base.display import Table, escape_markdown, plural
+from me2e_compress.base.errors import StudyError
+from me2e_compress.commands.checks import writing
 from me2e_compress.metrics.route_summary import shown_by
-from me2e_compress.registry import drafts
-from me2e_compress.registry.drafts import MARK
-from me2e_compress.runtime.atomic import write_bytes, write_document
 from me2e_compress.study.cells import estimate_cell
 from me2e_compress.study.report.figures import MOST_DRIVES, answer, differences, road
 from me2e_compress.study.study_result import StudyResult
 from me2e_compress.study.workspace import HTML, JSON, MARKDOWN
-from me2e_compress.workflows.checks import writing
 
 
 @dataclass(frozen=True)
@@ -260,13 +259,13 @@ def write_study(
     # Paths, and all tables as Markdown
     folder = Path(folder)
     written = StudyFiles(folder / JSON, folder / MARKDOWN, folder / HTML)
-    heading = f"{drafts.IN_MARKDOWN}# {escape_markdown(outcome.title)}\n\n"
+    heading = f"{atomic.IN_MARKDOWN}# {escape_markdown(outcome.title)}\n\n"
     text = heading + "\n".join(table.markdown() for table in outcome.tables())
     page = study_page(outcome, command, sections)
     # Write all files, or none
-    with drafts.writing_errors(folder, StudyError):
+    with atomic.writing_errors(folder, StudyError):
         folder.mkdir(parents=True, exist_ok=True)
-        with writing(written, force=force), drafts.all_or_none():
+        with writing(written, force=force), atomic.all_or_none():
             write_document(written.record, outcome.to_json(), indent=1)
             write_bytes(written.tables, text.encode())
             write_bytes(written.report, page.html().encode())

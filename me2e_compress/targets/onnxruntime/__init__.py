@@ -7,8 +7,8 @@ from typing import ClassVar
 import onnx_ir as ir
 
 from me2e_compress import graph
+from me2e_compress.base.errors import GraphError
 from me2e_compress.calibration.ranges import Ranges
-from me2e_compress.errors import GraphError
 from me2e_compress.operators import int8_inputs, int8_op_types
 from me2e_compress.quantization.costs import Costs
 from me2e_compress.quantization.decision import Decision, KeptFloat, QuantPlan

@@ -8,9 +8,9 @@ import numpy.typing as npt
 import onnx_ir as ir
 
 from me2e_compress import graph
+from me2e_compress.base.errors import PreconditionError
 from me2e_compress.calibration.observers import QUANT_MAX
 from me2e_compress.calibration.ranges import Ranges
-from me2e_compress.errors import PreconditionError
 from me2e_compress.graph import (
     CONVOLUTIONS,
     WEIGHTED,

@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 import onnx_ir as ir
 
-from me2e_compress.errors import PreconditionError
+from me2e_compress.base.errors import PreconditionError
 from me2e_compress.graph import rank_of, rewrite
 from me2e_compress.graph.nodes import sole_reader
 from me2e_compress.operators import FusedCall

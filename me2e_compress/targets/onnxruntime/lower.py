@@ -21,7 +21,7 @@ import numpy as np
 import onnx_ir as ir
 
 from me2e_compress import graph
-from me2e_compress.errors import FramesError
+from me2e_compress.base.errors import FramesError
 from me2e_compress.graph import provenance, rewrite
 from me2e_compress.graph.shapes import open_shape, static_shape
 from me2e_compress.targets.onnxruntime.layer_forms import write_layer

@@ -15,7 +15,7 @@ from typing import Any
 import onnx_ir as ir
 
 from me2e_compress import graph
-from me2e_compress.errors import (
+from me2e_compress.base.errors import (
     BrokenPackageError,
     GraphError,
     MissingExtraError,

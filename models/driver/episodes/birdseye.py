@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from me2e_compress.errors import EvaluationError
+from me2e_compress.base.errors import EvaluationError
 from me2e_compress.simulator.camera_rig import SUBPIXEL_BITS, fixed_point
 from me2e_compress.simulator.cameras.ground import RESOLUTION_M, GroundTexture
 from me2e_compress.simulator.scene import Actor, ActorKind, Ego, PixelClass, Scene

@@ -10,12 +10,12 @@ from pathlib import Path
 
 import numpy as np
 
+from me2e_compress.base.atomic import write_bytes
 from me2e_compress.driving.onnx_policy import OnnxPolicy
 from me2e_compress.evaluators import Drive
 from me2e_compress.evaluators.highway.runner import drive
 from me2e_compress.graph import sha256_of
 from me2e_compress.metrics.episode import Ending
-from me2e_compress.runtime.atomic import write_bytes
 from me2e_compress.runtime.children import process_pool
 from me2e_compress.simulator.camera_rig import CameraRig
 from models.driver.episodes.collection import (

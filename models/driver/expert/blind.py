@@ -8,6 +8,7 @@ from typing import ClassVar
 
 import numpy as np
 
+from me2e_compress.base.errors import EvaluationError
 from me2e_compress.driving.contract import (
     PLAN_SHAPE,
     PLAN_STEP_US,
@@ -17,7 +18,6 @@ from me2e_compress.driving.contract import (
     RouteInfo,
 )
 from me2e_compress.driving.policies import Driver
-from me2e_compress.errors import EvaluationError
 from me2e_compress.simulator.plane_geometry import RoutePath
 from me2e_compress.simulator.scene import Ego
 from models.driver.expert.privileged import scene_and_world

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from me2e_compress.base.errors import EvaluationError
 from me2e_compress.driving.contract import Observation
-from me2e_compress.errors import EvaluationError
 from me2e_compress.simulator.plane_geometry import Floats
 from me2e_compress.simulator.scene import Scene, SignalState
 from me2e_compress.simulator.traffic.bodies import Car, Walker

@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from me2e_compress.base.errors import EvaluationError
 from me2e_compress.driving.realtime import ControlClock
-from me2e_compress.errors import EvaluationError
 from me2e_compress.evaluators.highway.controller import AnchoredPlan
 from me2e_compress.evaluators.highway.driven_frames import propose, seed_of
 from me2e_compress.metrics.episode import Ending, InfractionKind

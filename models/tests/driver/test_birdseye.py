@@ -3,7 +3,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from me2e_compress.errors import EvaluationError
+from me2e_compress.base.errors import EvaluationError
 from me2e_compress.simulator.cameras.ground import GroundTexture
 from me2e_compress.simulator.scene import ActorKind, PixelClass, Scene
 from models.driver.episodes.birdseye import (

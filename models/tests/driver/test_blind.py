@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
+from me2e_compress.base.errors import EvaluationError
 from me2e_compress.driving.contract import CAN_BUS_SIZE, Observation
-from me2e_compress.errors import EvaluationError
 from me2e_compress.metrics.episode import InfractionKind
 from models.driver.expert.blind import SPEEDS_MPS, Blind, centre_plan
 from tests.evaluators.highway.tiny_world import circle, ego_at, straight

@@ -14,9 +14,9 @@ from pathlib import Path
 import psutil
 import pytest
 
+from me2e_compress.commands.result import Listener
 from me2e_compress.driving.onnx_policy import OnnxPolicy
 from me2e_compress.simulator.routes import load_routes
-from me2e_compress.workflows.result import Listener
 from models.driver.checkpoint import TrainingCheckpoint
 from models.driver.course import frames_in, run
 from models.driver.curriculum import (

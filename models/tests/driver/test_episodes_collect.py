@@ -16,7 +16,7 @@ import numpy as np
 import psutil
 import pytest
 
-from me2e_compress.errors import EvaluationError
+from me2e_compress.base.errors import EvaluationError
 from me2e_compress.evaluators.highway.driven_frames import seed_of
 from me2e_compress.graph import sha256_of
 from me2e_compress.simulator.routes import SCENARIO_ABILITIES, Route, load_routes

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from me2e_compress.errors import EvaluationError
+from me2e_compress.base.errors import EvaluationError
 from me2e_compress.evaluators.highway.driven_frames import propose
 from me2e_compress.simulator.routes import Route, load_routes
 from models.driver import admission as gate

@@ -15,12 +15,12 @@ import torch
 from torch import Tensor, nn
 
 from me2e_compress.calibration.dataset import CalibrationSet
+from me2e_compress.commands.compress import compress
+from me2e_compress.commands.lint import lint
+from me2e_compress.commands.options import CompressOptions, LintOptions
 from me2e_compress.fidelity.compare import compare
 from me2e_compress.graph import load
 from me2e_compress.runtime.session import Session
-from me2e_compress.workflows.compress import compress
-from me2e_compress.workflows.lint import lint
-from me2e_compress.workflows.options import CompressOptions, LintOptions
 from models.tests.field.diffusion_drive import DIFFUSION_DRIVE
 from models.tests.field.transfuser import LEAD, FieldStack
 from tests.support.frames import record

@@ -9,7 +9,7 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
-from me2e_compress.errors import GraphError
+from me2e_compress.base.errors import GraphError
 from me2e_compress.graph.modules.assign import assign, detect
 from me2e_compress.graph.modules.module_map import ModuleMap
 from models.export import ExportOptions, export_stack, trace

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
+from me2e_compress.base.errors import EvaluationError
 from me2e_compress.driving.contract import PedalsAndWheel, Trajectory
-from me2e_compress.errors import EvaluationError
 from models.tcp.fusion import HeadFusion, Rule
 
 AHEAD = (0.0, 30.0)

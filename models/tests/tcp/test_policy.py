@@ -9,9 +9,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from me2e_compress.base.errors import EvaluationError
 from me2e_compress.driving.contract import Answer, PedalsAndWheel, checked
 from me2e_compress.driving.latency import FixedLatency
-from me2e_compress.errors import EvaluationError
 from me2e_compress.evaluators import Drive
 from me2e_compress.evaluators.highway.runner import drive
 from models.export import export

@@ -11,7 +11,7 @@ from scipy.stats import norm
 
 from benchmarks.paper.__main__ import PAGE
 from benchmarks.paper.questions import PaperQuestion, PaperQuestions, PAt
-from me2e_compress.errors import StudyError
+from me2e_compress.base.errors import StudyError
 from me2e_compress.study import load_study
 
 SHIPPED = PaperQuestions.load()

@@ -16,11 +16,11 @@ from benchmarks.paper.accident import FILE as ACCIDENT
 from benchmarks.paper.accident import Accident, plans_before
 from benchmarks.paper.evidence import FEWEST_RUNS
 from benchmarks.paper.records import RECORDS, add_facts, read_paper
-from me2e_compress.errors import StudyError
+from me2e_compress.base.errors import StudyError
+from me2e_compress.commands.result import SILENT
 from me2e_compress.simulator.routes import Route
 from me2e_compress.study import Condition, Study, Timing, Variant, load_study, run_study
 from me2e_compress.study.definition import StudyBlock
-from me2e_compress.workflows.result import SILENT
 from tests.benchmarks.paper.made import write_records
 from tests.evaluators.highway.drivers import straight_on
 from tests.study.conftest import IDEAL

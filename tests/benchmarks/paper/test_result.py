@@ -12,7 +12,7 @@ from benchmarks.paper.findings import Finding, Verdict
 from benchmarks.paper.records import read_paper
 from benchmarks.paper.result import PaperResult, paper_page
 from benchmarks.paper.weigh import weighed
-from me2e_compress.errors import StudyError
+from me2e_compress.base.errors import StudyError
 from me2e_compress.metrics.measure import Measure
 from me2e_compress.study import load_study
 from me2e_compress.study.drive_record import DriveRecord

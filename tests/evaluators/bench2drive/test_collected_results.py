@@ -6,13 +6,13 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from me2e_compress.errors import EvaluationError
+from me2e_compress.base import documents
+from me2e_compress.base.errors import EvaluationError
 from me2e_compress.evaluators.bench2drive.real_results import (
     Bench2DriveResults,
     CollectedResults,
 )
 from me2e_compress.metrics.episode import InferenceRecord
-from me2e_compress.registry import documents
 from me2e_compress.testing import check_evaluator
 from tests.evaluators.bench2drive.files import (
     GOOD,

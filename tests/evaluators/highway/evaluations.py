@@ -5,6 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from me2e_compress.commands.result import SILENT, Listener
 from me2e_compress.driving.latency import TraceLatency
 from me2e_compress.driving.policies import Driver
 from me2e_compress.evaluators import Drive
@@ -13,7 +14,6 @@ from me2e_compress.evaluators.highway.evaluator import Highway
 from me2e_compress.evaluators.results import drive_routes
 from me2e_compress.metrics.episode import Episode
 from me2e_compress.simulator.routes import Route
-from me2e_compress.workflows.result import SILENT, Listener
 from models.driver.expert.blind import BlindDriver
 from tests.evaluators.highway.drivers import ROUTES
 

@@ -4,8 +4,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from me2e_compress.base.errors import FramesError
 from me2e_compress.driving.onnx_policy import OnnxPolicy
-from me2e_compress.errors import FramesError
 from me2e_compress.evaluators.highway import driven_frames as room
 from me2e_compress.evaluators.highway.driven_frames import driven_frames, fresh_routes
 from me2e_compress.runtime.frames import Frame

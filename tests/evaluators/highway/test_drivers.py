@@ -6,9 +6,9 @@ from typing import ClassVar
 
 import pytest
 
+from me2e_compress.base.errors import EvaluationError
 from me2e_compress.driving.contract import Policy
 from me2e_compress.driving.policies import Driver, driver_named
-from me2e_compress.errors import EvaluationError
 from me2e_compress.evaluators.highway.drivers import OnnxDriver, image_size_of
 from models.driver.expert.blind import Blind
 from tests.evaluators.highway.drivers import straight_on

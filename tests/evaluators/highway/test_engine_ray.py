@@ -2,7 +2,7 @@ from pathlib import Path
 
 import pytest
 
-from me2e_compress.errors import EvaluationError
+from me2e_compress.base.errors import EvaluationError
 from me2e_compress.evaluators.highway.engine import RayEngine
 from tests.evaluators.highway.drivers import CROSSING, PARKED
 from tests.evaluators.highway.evaluations import driven

@@ -6,15 +6,15 @@ from typing import Any
 
 import pytest
 
+from me2e_compress.base.atomic import is_marked
+from me2e_compress.base.errors import EvaluationError
+from me2e_compress.commands.result import Listener
 from me2e_compress.driving.latency import FixedLatency, MeasuredLatency
-from me2e_compress.errors import EvaluationError
 from me2e_compress.evaluators import Drive
 from me2e_compress.evaluators.highway.drivers import OnnxDriver
 from me2e_compress.evaluators.highway.engine import LocalEngine
 from me2e_compress.evaluators.highway.evaluator import longest_first
 from me2e_compress.evaluators.results import ResultsFolder
-from me2e_compress.registry.drafts import is_marked
-from me2e_compress.workflows.result import Listener
 from models.driver.expert.blind import BlindDriver
 from tests.evaluators.highway.drivers import CROSSING, EXIT, PARKED, ROUTES
 from tests.evaluators.highway.evaluations import TRACED, driven, made_by

@@ -14,7 +14,7 @@ import pytest
 
 import me2e_compress
 from me2e_compress import EvaluateOptions, evaluate
-from me2e_compress.errors import EvaluationError
+from me2e_compress.base.errors import EvaluationError
 from me2e_compress.evaluators import Drive
 from me2e_compress.evaluators.results import ResultsFolder
 from me2e_compress.metrics.episode import Ending, Episode
@@ -70,7 +70,7 @@ def test_a_full_disk_is_one_line_and_nothing_half_written(
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     with monkeypatch.context() as patch:
-        patch.setattr("me2e_compress.runtime.atomic.os.fsync", no_space)
+        patch.setattr("me2e_compress.base.atomic.os.fsync", no_space)
         with pytest.raises(EvaluationError, match="written: No space") as caught:
             driven(folder, two)
     assert "\n" not in str(caught.value)

@@ -7,16 +7,16 @@ from typing import ClassVar
 
 import pytest
 
+from me2e_compress.base.errors import EvaluationError
+from me2e_compress.commands.evaluate import check_model
+from me2e_compress.commands.options import GraphOptions
 from me2e_compress.driving.adapter import Adapter
 from me2e_compress.driving.contract import Trajectory
 from me2e_compress.driving.host_stage import HostStage, HostWork
 from me2e_compress.driving.onnx_policy import OnnxPolicy
-from me2e_compress.errors import EvaluationError
 from me2e_compress.evaluators.highway.drivers import OnnxDriver
 from me2e_compress.runtime.frames import Array
 from me2e_compress.runtime.plan_adapter import Floats, PlanAdapter
-from me2e_compress.workflows.evaluate import check_model
-from me2e_compress.workflows.options import GraphOptions
 from tests.evaluators.highway.asked import observation
 from tests.evaluators.highway.drivers import EXIT, straight_on
 

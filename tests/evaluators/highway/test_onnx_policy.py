@@ -5,9 +5,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from me2e_compress.base.errors import EvaluationError
 from me2e_compress.driving.adapter import Adapter
 from me2e_compress.driving.onnx_policy import OnnxPolicy
-from me2e_compress.errors import EvaluationError
 from me2e_compress.evaluators import Drive
 from me2e_compress.evaluators.highway.drivers import OnnxDriver, image_size_of
 from me2e_compress.evaluators.highway.runner import drive

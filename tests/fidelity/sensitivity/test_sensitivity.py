@@ -6,8 +6,9 @@ import onnx_ir as ir
 import pytest
 
 from me2e_compress import graph
+from me2e_compress.base.errors import EvaluationError
 from me2e_compress.calibration.dataset import CalibrationSet
-from me2e_compress.errors import EvaluationError
+from me2e_compress.commands.search import SearchResult
 from me2e_compress.fidelity.compare import Displacement, Fidelity, Reference
 from me2e_compress.fidelity.sensitivity import (
     Budget,
@@ -27,7 +28,6 @@ from me2e_compress.passes import Context
 from me2e_compress.passes.quantize_int8 import QuantizeInt8
 from me2e_compress.runtime.frames import Frame
 from me2e_compress.runtime.session import Session
-from me2e_compress.workflows.search import SearchResult
 from tests.fidelity.sensitivity.delicate import delicate, trials
 from tests.support.nets import MODULES, parsed
 

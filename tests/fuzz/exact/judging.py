@@ -24,8 +24,8 @@ import onnx.printer
 import onnx_ir as ir
 
 from me2e_compress import graph
+from me2e_compress.base.errors import Me2eError, PassError, VerificationError
 from me2e_compress.calibration.dataset import CalibrationSet
-from me2e_compress.errors import Me2eError, PassError, VerificationError
 from me2e_compress.graph.modules.module_map import ModuleMap
 from me2e_compress.manager import recipe
 from me2e_compress.manager.pass_manager import PassManager

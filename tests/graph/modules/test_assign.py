@@ -4,7 +4,7 @@ import re
 import onnx_ir as ir
 import pytest
 
-from me2e_compress.errors import ModuleMapError
+from me2e_compress.base.errors import ModuleMapError
 from me2e_compress.graph.modules.assign import Assignment, assign
 from me2e_compress.graph.modules.module_map import ModuleMap
 from me2e_compress.graph.provenance import MODULE

@@ -1,7 +1,7 @@
 import onnx_ir as ir
 import pytest
 
-from me2e_compress.errors import ModuleMapError
+from me2e_compress.base.errors import ModuleMapError
 from me2e_compress.graph.modules.assign import detect
 
 

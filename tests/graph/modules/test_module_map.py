@@ -2,7 +2,7 @@ from pathlib import Path
 
 import pytest
 
-from me2e_compress.errors import ModuleMapError
+from me2e_compress.base.errors import ModuleMapError
 from me2e_compress.graph.modules.module_map import ModuleMap, Substitute, presets
 
 TEXT = """

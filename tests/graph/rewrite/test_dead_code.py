@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from me2e_compress.errors import GraphError
+from me2e_compress.base.errors import GraphError
 from me2e_compress.graph import rewrite
 from me2e_compress.graph.rewrite import Fusion, fuse, op, var
 from me2e_compress.passes.base import Pass

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from onnx.reference import ReferenceEvaluator
 
 from me2e_compress import graph
-from me2e_compress.errors import GraphError
+from me2e_compress.base.errors import GraphError
 from me2e_compress.graph import rewrite
 from me2e_compress.manager.attempt import check_valid
 from tests.support.nets import parsed

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from me2e_compress.errors import FramesError
+from me2e_compress.base.errors import FramesError
 from me2e_compress.operators.multi_head_attention import FusedMultiHeadAttention
 from me2e_compress.runtime import runnable
 from me2e_compress.runtime.session import Session

@@ -14,7 +14,10 @@ import onnxruntime as ort
 import pytest
 
 from me2e_compress import graph
-from me2e_compress.errors import FramesError, GraphError
+from me2e_compress.base.errors import FramesError, GraphError
+from me2e_compress.commands.checks import try_first
+from me2e_compress.commands.listing import doctor
+from me2e_compress.commands.result import SILENT
 from me2e_compress.operators import dialect_of, kernels
 from me2e_compress.operators.deformable_attention import DeformableAttention
 from me2e_compress.operators.kernels import custom_ops, trampoline
@@ -24,9 +27,6 @@ from me2e_compress.runtime.frames import Frame
 from me2e_compress.runtime.providers import CpuProvider
 from me2e_compress.runtime.runnable import replace_fused
 from me2e_compress.runtime.session import Session, open_graph
-from me2e_compress.workflows.checks import try_first
-from me2e_compress.workflows.listing import doctor
-from me2e_compress.workflows.result import SILENT
 from tests.operators.kernels import needs_kernels
 from tests.operators.running import graph_of
 from tests.operators.test_deformable_attention import CALL, arrays_of

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from me2e_compress.errors import FramesError
+from me2e_compress.base.errors import FramesError
 from me2e_compress.operators import kernels
 from me2e_compress.operators.winograd_convolution import WinogradConvolution
 from me2e_compress.runtime.session import Session

@@ -11,7 +11,7 @@ import pynvml
 import pytest
 from scipy import stats
 
-from me2e_compress.errors import EnergyError
+from me2e_compress.base.errors import EnergyError
 from me2e_compress.runtime.energy import EnergyResult, energy_counter
 from me2e_compress.runtime.energy.energy_counter import (
     ENERGY_COUNTERS,

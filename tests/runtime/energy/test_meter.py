@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from me2e_compress.errors import EnergyError
+from me2e_compress.base.errors import EnergyError
 from me2e_compress.graph import sha256_of
 from me2e_compress.runtime.energy.energy_counter import EnergySchedule, Recorded
 from me2e_compress.runtime.energy.energy_result import EnergyResult

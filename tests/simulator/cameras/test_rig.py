@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from me2e_compress.errors import EvaluationError
+from me2e_compress.base.errors import EvaluationError
 from me2e_compress.simulator.camera_rig import CAMERA_NAMES, CameraRig
 
 FRONT, BACK = CAMERA_NAMES.index("FRONT"), CAMERA_NAMES.index("BACK")

@@ -4,7 +4,7 @@ import sys
 
 import pytest
 
-from me2e_compress.errors import EvaluationError
+from me2e_compress.base.errors import EvaluationError
 from me2e_compress.metrics.episode import Ending
 from me2e_compress.simulator.scenarios.roads import two_way
 from me2e_compress.simulator.scene import ActorKind, Control, EventKind

@@ -4,7 +4,7 @@ import onnx_ir as ir
 import pytest
 
 from me2e_compress import graph
-from me2e_compress.errors import PreconditionError
+from me2e_compress.base.errors import PreconditionError
 from me2e_compress.quantization.plan import make_plan
 from me2e_compress.targets.onnxruntime import convert, unranged
 from me2e_compress.targets.tensorrt import TensorRT

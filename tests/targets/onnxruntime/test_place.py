@@ -4,8 +4,8 @@ import onnx_ir as ir
 import pytest
 
 from me2e_compress import graph
+from me2e_compress.base.errors import FramesError
 from me2e_compress.calibration.ranges import Ranges
-from me2e_compress.errors import FramesError
 from me2e_compress.graph import provenance
 from me2e_compress.quantization.plan import make_plan
 from me2e_compress.runtime.optimized import optimize

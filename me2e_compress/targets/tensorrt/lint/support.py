@@ -21,7 +21,7 @@ from typing import TypeAlias
 import onnx_ir as ir
 
 from me2e_compress import graph
-from me2e_compress.errors import PreconditionError
+from me2e_compress.base.errors import PreconditionError
 from me2e_compress.graph import input_at, is_standard, nodes_of, rank_of
 from me2e_compress.graph.nodes import is_plugin
 from me2e_compress.graph.opset import on_disk

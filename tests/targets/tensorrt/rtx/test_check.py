@@ -7,7 +7,7 @@ import onnx_ir as ir
 import pytest
 
 from me2e_compress import graph
-from me2e_compress.errors import MissingExtraError, PreconditionError, RecipeError
+from me2e_compress.base.errors import MissingExtraError, PreconditionError, RecipeError
 from me2e_compress.graph.modules.assign import map_of
 from me2e_compress.manager import PassManager, recipe
 from me2e_compress.passes import Context

@@ -1,0 +1,177 @@
+"""JSON and TOML that someone else wrote: read whole, or refused in one line.
+
+What Python's parsers take or break on is refused here, once for all formats: nesting
+without end, numbers of thousands of digits, lone surrogates, keys of thousands of parts
+(tomllib takes memory by their square), and files that are no files.
+"""
+
+import json
+import re
+import stat
+import tomllib
+import zipfile
+import zlib
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from pydantic import ValidationError
+
+from me2e_compress.base.display import error_line
+
+LARGEST_BYTES = 64_000_000
+"""The largest document that is read; a plan of 30,000 nodes has 15 MB. Read, it may
+take thirty times as much memory."""
+LARGEST_LOG_BYTES = 256_000_000
+"""The largest file of documents that are read line by line."""
+LARGEST_TOML_BYTES = 4_000_000
+"""People write TOML, and Python reads a megabyte a second or less."""
+
+KEY_PARTS = 64
+"""The most parts of a dotted TOML key."""
+
+NPZ_ERRORS = (
+    OSError,
+    EOFError,
+    ValueError,  # pickled objects, headers that lie
+    SyntaxError,  # or are no Python
+    OverflowError,
+    RecursionError,
+    MemoryError,
+    RuntimeError,  # encrypted, or compressed as zipfile does not know
+    zipfile.BadZipFile,
+    zlib.error,
+)
+"""What numpy and zipfile raise on a file that holds no valid arrays."""
+
+
+def _reject_constant(word: str) -> None:
+    raise ValueError(f"{word} is not a number")
+
+
+_DECODER = json.JSONDecoder(parse_constant=_reject_constant)
+_ANY_NUMBER = json.JSONDecoder()
+_TOKEN = re.compile(r'"(?:[^"\\\n]|\\.)*"|\'[^\'\n]*\'|[\w-]+|\.|[^\s.]')
+_LONE_SURROGATE = re.compile("[\ud800-\udfff]")
+
+
+class MalformedError(ValueError):
+    """A text is not what it should be; the message is one line, without the file."""
+
+
+@contextmanager
+def reading(
+    path: Path | str, error: Callable[[str], Exception], otherwise: str
+) -> Iterator[None]:
+    """Turn what is wrong with a file that is read here into one line that names it.
+
+    Args:
+        path: the file, or what a text came from.
+        error: what is raised.
+        otherwise: what the line says of a file that is there and does not fit.
+
+    Raises:
+        Exception: ``error``: the file cannot be read, is malformed, or does not fit;
+            the first place that does not is named.
+    """
+    try:
+        yield
+    except OSError as cause:
+        raise error(f"{path}: {cause.strerror}") from cause
+    except (MalformedError, UnicodeDecodeError) as cause:
+        raise error(f"{path}: {otherwise}: {cause}") from cause
+    except ValidationError as cause:
+        first = cause.errors(include_url=False)[0]
+        location = ".".join(map(str, first["loc"])) or "the file"
+        raise error(f"{path}: {otherwise}: {location}: {first['msg']}") from cause
+
+
+def check_regular(path: Path) -> None:
+    """Raise a MalformedError of a folder, a device or a pipe, which may never end."""
+    if not stat.S_ISREG(path.stat().st_mode):
+        what = "it is a folder, " if path.is_dir() else ""
+        raise MalformedError(f"{what}not a regular file")
+
+
+def read_bytes(path: Path, most: int = LARGEST_BYTES) -> bytes:
+    """Read a text file of at most so many bytes.
+
+    Raises:
+        OSError: it is not there, or may not be read.
+        MalformedError: it is not a regular file, or too large.
+    """
+    check_regular(path)
+    _check_size(path.stat().st_size, most)
+    return path.read_bytes()
+
+
+def from_json(text: bytes | str, *, finite: bool = True) -> Any:
+    """Read a JSON document; anything else is a MalformedError.
+
+    So are NaN and infinities, which Python's own writer writes, unless ``finite`` is
+    False; the caller must then look at the numbers.
+    """
+    try:
+        document = (_DECODER if finite else _ANY_NUMBER).decode(_decode(text))
+    except RecursionError as error:
+        raise MalformedError("nested too deeply") from error
+    except ValueError as error:
+        raise MalformedError(error_line(error)) from error
+    _check_strings(document)
+    return document
+
+
+def from_toml(text: bytes | str) -> dict[str, Any]:
+    """Read a TOML document; anything else is a MalformedError."""
+    try:
+        _check_size(len(text), LARGEST_TOML_BYTES)
+        decoded = _decode(text)
+        _check_keys(decoded)
+        return tomllib.loads(decoded)
+    except RecursionError as error:
+        raise MalformedError("nested too deeply") from error
+    except ValueError as error:
+        raise MalformedError(error_line(error)) from error
+
+
+def _check_size(size: int, most: int) -> None:
+    if size > most:
+        raise MalformedError(f"{size:,} bytes are too many: {most:,} may be")
+
+
+def _decode(text: bytes | str) -> str:
+    # editors of Windows put a byte order mark before it
+    return text if isinstance(text, str) else text.decode("utf-8-sig")
+
+
+def _check_strings(value: object) -> None:
+    """Raise a MalformedError of lone surrogates, which no file can hold."""
+    waiting = [value]
+    while waiting:
+        each = waiting.pop()
+        if isinstance(each, dict):
+            waiting += (*each.keys(), *each.values())
+        elif isinstance(each, list):
+            waiting += each
+        elif isinstance(each, str) and _LONE_SURROGATE.search(each):
+            raise MalformedError("a string holds half a surrogate pair")
+
+
+def _check_keys(text: str) -> None:
+    """Raise a MalformedError of a dotted key with more than `KEY_PARTS` parts."""
+    parts, after_dot = 0, True
+    for token in _TOKEN.finditer(text):
+        word = token.group()
+        if word == ".":
+            after_dot = True
+            continue
+        parts = parts + 1 if after_dot else 1
+        after_dot = False
+        if parts > KEY_PARTS:
+            raise MalformedError(f"a key has more than {KEY_PARTS} parts")
+
+
+def toml_string(text: str) -> str:
+    """Write a TOML string: JSON's escapes are valid in TOML, except for delete."""
+    return json.dumps(text, ensure_ascii=False).replace("\x7f", "\\u007f")

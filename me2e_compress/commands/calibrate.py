@@ -1,0 +1,209 @@
+"""Calibrate int8: measure or import the ranges of tensors, and look at them."""
+
+import dataclasses
+import gc
+from collections.abc import Sequence
+from pathlib import Path
+
+from me2e_compress.base import atomic
+from me2e_compress.base.atomic import write_bytes
+from me2e_compress.base.display import plural
+from me2e_compress.base.errors import FramesError
+from me2e_compress.calibration.calibrator import Calibrator
+from me2e_compress.calibration.dataset import CalibrationSet
+from me2e_compress.calibration.exchange import pick_ranges, read_cache
+from me2e_compress.calibration.observers import OBSERVERS
+from me2e_compress.calibration.ranges import Ranges, rms_of
+from me2e_compress.calibration.review import RangeFinding, missing_ranges, review
+from me2e_compress.calibration.sample import draw
+from me2e_compress.commands.checks import (
+    model_path,
+    output_path,
+    read_graph,
+    try_first,
+    writing,
+)
+from me2e_compress.commands.options import CalibrateOptions
+from me2e_compress.commands.plan import PreparedGraph
+from me2e_compress.commands.result import SILENT, Listener, Result, View
+from me2e_compress.manager import recipe
+from me2e_compress.quantization.decision import keep_readers, overrides_text
+
+
+def checkpoint_beside(output: Path) -> Path:
+    """Return the file of a calibration's progress."""
+    return output.with_name(output.name + ".checkpoint")
+
+
+def overrides_beside(output: Path) -> Path:
+    """Return the file of overrides for what an imported cache lacks."""
+    return output.with_name(f"{output.stem}.overrides.toml")
+
+
+def written_files(output: Path, options: CalibrateOptions) -> list[Path]:
+    """List the files that :func:`calibrate` may write."""
+    files = [output, checkpoint_beside(output)]
+    if options.imported is not None:
+        files.append(overrides_beside(output))
+    return files
+
+
+@dataclasses.dataclass(frozen=True, repr=False)
+class CalibrateResult(Result):
+    """The range of every tensor.
+
+    `findings` say what of the ranges deserves a look. `overrides` is the file that
+    keeps in float what an imported cache has no range for; None where it has all.
+    """
+
+    output: Path
+    frames: int
+    ranges: Ranges
+    findings: tuple[RangeFinding, ...] = ()
+    overrides: Path | None = None
+
+    def view(self) -> View:
+        """Return the ranges that deserve a look, and how to keep floats."""
+        ranges = self.ranges
+        how = f"compress --ranges {self.output} --overrides {self.overrides}"
+        headline = (
+            f"{self.output}: {plural(len(ranges.tensors), 'tensor')}, {ranges.method},"
+            f" {plural(ranges.frames, 'frame')}"
+        )
+        return View(
+            headline,
+            lines=(headline, *_texts(self.findings, "note")),
+            alerts=(
+                *_texts(self.findings, "warning"),
+                *([] if self.overrides is None else [f"These floats: {how}"]),
+            ),
+        )
+
+    def to_json(self) -> object:
+        """Return the ranges and the tensors that are always zero."""
+        ranges = self.ranges
+        own = {**dataclasses.asdict(ranges), "dead": ranges.dead}
+        own |= {"outliers": ranges.outliers, "findings": self.findings}
+        return {**own, "overrides": self.overrides}
+
+
+def calibrate(
+    model: str | Path,
+    frames: str | Path | None,
+    output: str | Path,
+    options: CalibrateOptions | None = None,
+    listener: Listener = SILENT,
+) -> CalibrateResult:
+    """Measure the ranges of every tensor that any scheme, rule set or target needs.
+
+    The model is a float ONNX file or the name of one that ships; frames may be None to
+    import another tool's ranges. The output is ``RANGES.json``. Tensors that an
+    imported cache lacks are kept in float by ``RANGES.overrides.toml``. A run that was
+    killed goes on from ``OUTPUT.checkpoint``.
+
+    Raises:
+        FramesError: There is no source, or frames or a cache do not fit.
+        PreconditionError: The graph is quantized already, or nothing can become int8.
+        GraphError: The model does not exist, or an output would harm an input.
+        RecipeError: The recipe does not exist.
+        ProviderError: The provider is not available.
+    """
+    options = options or CalibrateOptions()
+    source, output = model_path(model), output_path(output)
+    if frames is None and options.imported is None:
+        raise FramesError(
+            "give recorded frames, or another tool's cache (--import, frames then judge"
+            " its scales); ranges are never made up"
+        )
+    named = (options.recipe, options.module_map, options.imported, options.adapter)
+    outputs = written_files(output, options)
+    inputs = (source, frames, *named)
+    with writing(outputs, inputs, force=options.force):
+        prepared, part = _prepare(source, frames, options, listener)
+        gc.collect()  # 150 MB of VAD-tiny as it was read; graphs are cycles
+        with atomic.all_or_none():
+            missing, overrides = list[str](), overrides_beside(output)
+            if options.imported is not None:
+                ranges, missing = _import(prepared, part, options)
+            else:
+                assert part is not None
+                ranges = _measure(prepared, part, output, options, listener)
+            ranges.save(output)
+            # what an imported cache has no range for stays in float
+            cache = Path(options.imported or "")
+            if missing:
+                absent = f"not in {cache.name}"
+                floats = (keep_readers(name, absent) for name in missing)
+                text = atomic.IN_TOML + overrides_text(floats)
+                write_bytes(overrides, text.encode())
+    findings = (*missing_ranges(cache, missing), *review(ranges))
+    written = overrides if missing else None
+    return CalibrateResult(output, ranges.frames, ranges, findings, written)
+
+
+def _prepare(
+    source: Path,
+    frames: str | Path | None,
+    options: CalibrateOptions,
+    listener: Listener,
+) -> tuple[PreparedGraph, CalibrationSet | None]:
+    """Read the graph and its frames, and run the passes before int8, for its ranges."""
+    loaded = read_graph(source, listener, options.adapter, options.module_map)
+    # what is read is checked, and the graph is opened, before any pass runs
+    if options.imported is not None:
+        read_cache(Path(options.imported))
+    part = None
+    if frames is not None:
+        recording = CalibrationSet(frames)
+        recording.check(loaded)
+        part = draw(recording, options.count, 0)
+    try_first(
+        loaded,
+        source.name,
+        listener=listener,
+        file=source,
+        frames=part,
+        provider=options.runs_on,
+    )
+    passes = recipe.load(options.recipe)
+    return PreparedGraph.of(source, loaded, options.module_map, passes), part
+
+
+def _measure(
+    prepared: PreparedGraph,
+    part: CalibrationSet,
+    output: Path,
+    options: CalibrateOptions,
+    listener: Listener,
+) -> Ranges:
+    """Measure the ranges on the frames, going on from a checkpoint if there is one."""
+    tensors = prepared.tensors()
+    # a checkpoint lets a run that was killed go on
+    method, provider = options.method or prepared.method, options.runs_on
+    checkpoint = checkpoint_beside(output)
+    calibrator = Calibrator(
+        method, options.threads, checkpoint=checkpoint, provider=provider
+    )
+    seen = calibrator.collect(
+        prepared.model, tensors, part, listener.counting("calibrate", method)
+    )
+    return Ranges.of(seen, OBSERVERS.parse(method))
+
+
+def _import(
+    prepared: PreparedGraph, part: CalibrationSet | None, options: CalibrateOptions
+) -> tuple[Ranges, list[str]]:
+    """Return another tool's ranges, and the tensors that it has none for."""
+    path, tensors = Path(options.imported or ""), prepared.tensors()
+    ranges = pick_ranges(read_cache(path), path, prepared.model, tensors)
+    # two frames show the size of every tensor; the second has a state
+    if part is not None:
+        few = part.part(part.places[:2])
+        calibrator = Calibrator(threads=options.threads, provider=options.runs_on)
+        seen = calibrator.collect(prepared.model, tuple(ranges.tensors), few)
+        ranges = dataclasses.replace(ranges, rms=rms_of(seen))
+    return ranges, [name for name in tensors if name not in ranges.tensors]
+
+
+def _texts(findings: Sequence[RangeFinding], severity: str) -> tuple[str, ...]:
+    return tuple(str(each) for each in findings if each.severity == severity)

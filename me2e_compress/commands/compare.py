@@ -1,0 +1,393 @@
+"""Compare two graphs on the same frames: outputs, plans, the first difference."""
+
+import dataclasses
+import itertools
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+
+import numpy as np
+import onnx_ir as ir
+
+from me2e_compress import graph
+from me2e_compress.base.display import Table, plural, table
+from me2e_compress.base.errors import (
+    EvaluationError,
+    FramesError,
+    GraphError,
+    ModuleMapError,
+)
+from me2e_compress.calibration.calibrator import Extremes
+from me2e_compress.calibration.dataset import CalibrationSet
+from me2e_compress.calibration.statistics import first_bad_node, index_inputs
+from me2e_compress.commands.checks import model_path, opened
+from me2e_compress.commands.options import CompareOptions, GraphOptions
+from me2e_compress.commands.result import SILENT, Listener, Result, View
+from me2e_compress.commands.runtime_loss import (
+    RuntimeLoss,
+    RuntimeTally,
+    has_int8_kernels,
+)
+from me2e_compress.fidelity import ALIVE
+from me2e_compress.fidelity.compare import (
+    Fidelity,
+    SetFidelity,
+    SetTally,
+    common_adapter,
+)
+from me2e_compress.fidelity.compare import compare as measure
+from me2e_compress.fidelity.first_difference import (
+    BorderValue,
+    FirstDifference,
+    find_first_difference,
+)
+from me2e_compress.fidelity.liveness import Liveness, LivenessTally
+from me2e_compress.graph import provenance
+from me2e_compress.graph.modules.assign import assign, map_of
+from me2e_compress.graph.modules.module_map import ModuleMap
+from me2e_compress.runtime.frames import Array, Frame
+from me2e_compress.runtime.session import Session
+from me2e_compress.targets.onnxruntime import slow_here
+
+
+@dataclasses.dataclass(frozen=True, repr=False)
+class Comparison:
+    """How a graph answers beside another: what `compare` says, and `compress`.
+
+    `agents` is None unless the metadata ``me2e.sets`` names outputs that both graphs
+    have. `liveness` is None if it was not asked for; `runtime`, what onnxruntime's
+    int8 answers otherwise, if there is none to ask.
+    """
+
+    fidelity: Fidelity
+    liveness: Liveness | None
+    runtime: RuntimeLoss | None
+    agents: SetFidelity | None
+
+
+@dataclasses.dataclass(frozen=True, repr=False)
+class CompareResult(Comparison, Result):
+    """How close a graph stays to another.
+
+    `slow_here` tells by file name of int8 whose form is slow on this CPU, `known` from
+    where state and plan are known, `not_finite` which node makes NaN first.
+    """
+
+    keys = (
+        *("*fidelity", "agents", "liveness", "runtime"),
+        *("slow_here", "known", "not_finite"),
+    )
+    reference: Path
+    candidate: Path
+    slow_here: Mapping[str, str]
+    known: str
+    not_finite: tuple[str, ...]
+
+    def view(self) -> View:
+        """Return how far outputs, agents and the plan moved, and what is dead."""
+        fidelity, liveness = self.fidelity, self.liveness
+        title = f"Fidelity over {plural(fidelity.frames, 'frame')}"
+        outputs = outputs_table(title, fidelity, self.agents)
+        faults = () if liveness is None else liveness.faults
+        dead = "; ".join(faults)
+        return View(
+            _plan_text(fidelity),
+            (
+                outputs,
+                *([liveness.table()] if liveness and liveness.outputs else []),
+            ),
+            (
+                *filter(None, [self.known]),
+                _plan_text(fidelity),
+                *(() if liveness is None else liveness.lines()),
+                *(() if self.runtime is None else self.runtime.lines()),
+                *(f"{name}: {why}" for name, why in self.slow_here.items()),
+            ),
+            (*fidelity.stray_texts, *self.not_finite, *faults),
+            EvaluationError(f"{self.candidate}: {dead}") if dead else None,
+        )
+
+
+def outputs_table(
+    title: str,
+    fidelity: Fidelity,
+    agents: SetFidelity | None,
+    floors: Mapping[str, str] | None = None,
+) -> Table:
+    """Return the SQNR and largest error of every output; with `floors`, their words."""
+    matched, n = {} if agents is None else agents.sqnr_db, 4 + (floors is not None)
+    rows = [
+        (
+            each.name,
+            f"{matched.get(each.name, each.sqnr_db):z.1f}",
+            "matched agents" if each.name in matched else each.by_frame,
+            "" if each.name in matched else f"{each.error:.1e}",
+            *([] if floors is None else [floors.get(each.name, "above")]),
+        )
+        for each in fidelity.outputs
+    ]
+    columns = ("output", "SQNR dB", "by frame", "max|a-b|/max|a|", "floor")[:n]
+    rows += [(name, "removed", *[""] * (n - 2)) for name in fidelity.missing]
+    return table(title, columns, rows, _agents_note(agents))
+
+
+def _plan_text(fidelity: Fidelity) -> str:
+    if fidelity.plan is None:
+        return f"plan displacement: not measured ({fidelity.plan_reason})"
+    line = (
+        f"plan displacement: mean {fidelity.plan.mean_m:.4f} m, largest"
+        f" {fidelity.plan.max_m:.4f} m over {plural(fidelity.frames, 'frame')}"
+    )
+    if fidelity.same_choice is None:
+        return line
+    return f"{line}; the same candidate on {fidelity.same_choice:.1%} of them"
+
+
+def _agents_note(sets: SetFidelity | None) -> str:
+    """Describe how outputs that are sets are compared; empty without any."""
+    if sets is None:
+        return ""
+    agents = plural(sets.agents, "agent")
+    return (
+        "matched: agents with a score of 0.5 or more, each against the nearest. The"
+        f" first graph has {agents} of such scores, the second one within 2 m of"
+        f" {sets.matched} of them."
+    )
+
+
+def compare(
+    reference: str | Path,
+    candidate: str | Path,
+    frames: str | Path,
+    options: CompareOptions | None = None,
+    listener: Listener = SILENT,
+) -> CompareResult:
+    """Run two graphs over frames: SQNR of every output, plan displacement in metres.
+
+    Each graph is an ONNX file or the name of a model that ships. Outputs that the
+    metadata ``me2e.sets`` of the first names are matched agent by agent. The option
+    ``as_it_stands`` runs the first graph without onnxruntime's optimizations and the
+    second with all of them: comparing a graph with itself shows what they change. An
+    output is dead whose standard deviation over the frames is less than a share
+    ``alive`` of the first graph's.
+
+    Raises:
+        GraphError: A model does not exist or run, or nothing picks one of a plan's
+            modes.
+        FramesError: A frame does not fit one of the graphs.
+        ProviderError: The provider is not available.
+        EvaluationError: The graphs share no output, or one is not finite.
+    """
+    options = options or CompareOptions()
+    paths = model_path(reference), model_path(candidate)
+    recording, provider = CalibrationSet(Path(frames)), options.runs_on
+    # each graph must take the frames, and open in another process first
+    graphs = {
+        path: opened(path, recording, options, listener, paths)
+        for path in dict.fromkeys(paths)
+    }
+    slow = {
+        path.name: why
+        for path, each in graphs.items()
+        if (why := slow_here(each.model, provider))
+    }
+    total = len(recording)
+
+    def with_progress(frame: Frame) -> Frame:
+        listener.on_progress("frames", frame.index, total, "")
+        return frame
+
+    # the sessions get the adapter's metadata, which the files lack
+    def session(path: Path, *, optimize: bool = True, stock: bool = False) -> Session:
+        return Session(
+            path, optimize=optimize, stock=stock, release=True, provider=provider,
+            metadata=graphs[path].metadata,
+        )  # fmt: skip
+
+    left = session(paths[0], optimize=not options.as_it_stands)
+    right = session(paths[1], stock=options.as_it_stands)
+    try:
+        common_adapter(left, right)
+        sets = SetTally.of(left, right)
+    except GraphError as error:
+        raise GraphError(f"{paths[0]}: {error}") from error
+    # what onnxruntime's int8 answers, beside the nodes as they stand
+    kernels, judged = None, graphs[paths[1]].model
+    if not options.as_it_stands and has_int8_kernels(judged, provider):
+        kernels = session(paths[1], stock=True)
+    shown_frames, bad_frame = map(with_progress, recording), _BadFrame()
+    comparison = compare_sessions(
+        left, right, shown_frames, judged, kernels, sets, bad_frame, alive=options.alive
+    )
+    makers = dict[str, str]()
+    for path, each in zip(paths, (left, right), strict=True):
+        if made := bad_frame.maker(graphs[path].model.clone(), each):
+            makers.setdefault(made, f"{path.name}: {made}")
+    known = "; ".join(dict.fromkeys(graphs[path].known for path in paths))
+    answers = (
+        comparison.fidelity,
+        comparison.liveness,
+        comparison.runtime,
+        comparison.agents,
+    )
+    bad = tuple(makers.values())
+    return CompareResult(*answers, *paths, slow_here=slow, known=known, not_finite=bad)
+
+
+class _BadFrame:
+    """Keeps the first frame, or the first of which an output holds NaN or infinity."""
+
+    def __init__(self) -> None:
+        self._frame: Frame | None = None
+        self._is_bad = False
+
+    def add(
+        self, left: Mapping[str, Array], right: Mapping[str, Array], frame: Frame
+    ) -> None:
+        """Look at a frame's outputs of two graphs."""
+        floats = [v for v in (*left.values(), *right.values()) if v.dtype.kind == "f"]
+        if not self._is_bad and not all(np.isfinite(each).all() for each in floats):
+            self._frame, self._is_bad = frame, True
+        self._frame = self._frame or frame
+
+    def maker(self, model: ir.Model, session: Session) -> str:
+        """Name the node that first makes NaN or infinity, in a sentence; else "".
+
+        State is that of a scene's beginning.
+        """
+        graph.infer_shapes(model)  # untyped values are not looked at
+        places, frame = index_inputs(model), self._frame
+        if frame is None or not (places or self._is_bad):
+            return ""
+        read, probe = {*places, *session.outputs}, Extremes()
+        try:
+            inputs = {**frame.arrays, **session.first_state(frame.arrays)}
+            return first_bad_node(model, inputs, read, probe, session.provider)
+        except (GraphError, FramesError):  # it runs optimized alone
+            return ""
+
+
+def compare_sessions(
+    reference: Session,
+    candidate: Session,
+    frames: Iterable[Frame],
+    model: ir.Model,
+    kernels: Session | None = None,
+    sets: SetTally | None = None,
+    bad_frame: _BadFrame | None = None,
+    *,
+    alive: float = ALIVE,
+) -> Comparison:
+    """Run two sessions over frames, and tally how far outputs are apart and move.
+
+    `model` is the candidate's graph, `kernels` runs it by onnxruntime's int8; outputs
+    of both are added to `sets` and `bad_frame`. With `alive` 0 no output is dead.
+    """
+    liveness = LivenessTally(reference, candidate) if alive else None
+    frames, for_kernels = itertools.tee(frames)
+    runtime = None if kernels is None else RuntimeTally(kernels, for_kernels, sets)
+    del for_kernels  # tee would store every frame that it has not read
+    tallies = (sets, bad_frame, liveness, runtime)
+    watchers = [each.add for each in tallies if each is not None]
+    fidelity = measure(reference, candidate, frames, watchers)
+    agents = None if sets is None else sets.result()
+    return Comparison(
+        fidelity,
+        None if liveness is None else liveness.result(alive),
+        None if runtime is None else runtime.result(model, fidelity, agents),
+        agents,
+    )
+
+
+FRAMES = 2
+"""The second frame is compared: it reads the state of the first."""
+
+
+@dataclasses.dataclass(frozen=True, repr=False)
+class FirstDifferenceResult(Result):
+    """Where a graph begins to differ from its source."""
+
+    keys = ("*difference",)
+    reference: Path
+    candidate: Path
+    difference: FirstDifference
+
+    def view(self) -> View:
+        """Return the worst value that each module hands on."""
+        worst: dict[str, BorderValue] = {}
+        for each in self.difference.values:
+            known = worst.setdefault(each.module, each)
+            if each.sqnr_db < known.sqnr_db:
+                worst[each.module] = each
+        rows = [
+            (each.module or "-", each.value, each.node, f"{each.sqnr_db:z.1f}")
+            for each in worst.values()
+        ]
+        columns = ("module", "worst value", "node", "SQNR dB")
+        note = (
+            f"Of {plural(len(self.difference.values), 'value')} that modules hand on."
+            f" {self.difference.unknown} of either graph have no namesake in the other."
+        )
+        modules = table("Modules", columns, rows, note, words=3)
+        return View(headline_of(self.difference), [modules])
+
+
+def headline_of(difference: FirstDifference) -> str:
+    """Return the line that names the first module that differs, if one does."""
+    if difference.first is not None:
+        return f"first below {difference.floor_db:g} dB: {difference.first}"
+    below = sum(each.sqnr_db < difference.floor_db for each in difference.values)
+    if not below:
+        return (
+            f"no difference: {plural(len(difference.values), 'value')} at"
+            f" {difference.floor_db:g} dB or more"
+        )
+    return (
+        f"{below} of {plural(len(difference.values), 'value')} are below"
+        f" {difference.floor_db:g} dB, but no output is"
+    )
+
+
+def first_difference(
+    reference: str | Path,
+    candidate: str | Path,
+    frames: str | Path,
+    options: GraphOptions | None = None,
+    listener: Listener = SILENT,
+) -> FirstDifferenceResult:
+    """Find the first module after which the second graph differs.
+
+    Both graphs run on one frame, their nodes as they stand, and what their modules hand
+    on is compared by name. A value differs below 80 dB, or below 20 dB where a graph
+    holds int8 or mostly narrow floats.
+
+    Raises:
+        EvaluationError: The graphs share no value.
+        FramesError: A frame does not fit one of the graphs.
+        GraphError: A model does not exist or run.
+        ProviderError: The provider is not available.
+    """
+    options = options or GraphOptions()
+    paths = model_path(reference), model_path(candidate)
+    recording = CalibrationSet(Path(frames))
+    models = {
+        path: stamp_modules(opened(path, recording, options, listener, paths).model)
+        for path in dict.fromkeys(paths)
+    }
+    shown = tuple(itertools.islice(recording, FRAMES))
+    first, second = (models[path] for path in paths)
+    difference = find_first_difference(first, second, shown, options.runs_on)
+    return FirstDifferenceResult(*paths, difference)
+
+
+def stamp_modules(model: ir.Model) -> ir.Model:
+    """Write every node's module into its metadata, if missing; return the model."""
+    if provenance.missing(model):
+        try:
+            placed = assign(model, map_of(model, None))
+        except ModuleMapError:  # names that the preset needs are lost
+            placed = assign(model, ModuleMap.whole())
+        for node, place in placed.placements.items():
+            if provenance.read(node) is None:
+                past = provenance.Provenance(place.module, (node.name or "",))
+                provenance.stamp(node, past)
+    return model

@@ -1,0 +1,222 @@
+"""Check whether the runtime that is to run a graph would accept it."""
+
+import dataclasses
+from collections import Counter
+from collections.abc import Sequence
+from pathlib import Path
+
+import onnx_ir as ir
+
+from me2e_compress import graph
+from me2e_compress.base.display import plural, table
+from me2e_compress.base.errors import PreconditionError, RecipeError
+from me2e_compress.commands.checks import model_path, try_first
+from me2e_compress.commands.options import LintOptions
+from me2e_compress.commands.result import SILENT, Listener, Result, Status, View
+from me2e_compress.passes import Pass
+from me2e_compress.passes.import_normalize import with_own_domains
+from me2e_compress.passes.quantize_int8 import QuantizeInt8
+from me2e_compress.quantization.decision import plan_of
+from me2e_compress.runtime.providers import CPU
+from me2e_compress.targets import (
+    SEVERITIES,
+    TARGETS,
+    LintFinding,
+    Severity,
+    Target,
+    worst_first,
+)
+from me2e_compress.targets.tensorrt import TensorRT
+from me2e_compress.targets.tensorrt.rtx_check import BuildResult, check
+
+
+@dataclasses.dataclass(frozen=True)
+class RuleSummary:
+    """What one rule found: in how many nodes, the first of them, and what of it."""
+
+    severity: Severity
+    rule: str
+    nodes: int
+    first: str
+    message: str
+
+
+@dataclasses.dataclass(frozen=True, repr=False)
+class LintResult(Result):
+    """The findings of our rules, and TensorRT-RTX's answer.
+
+    Attributes:
+        model: the file.
+        options: what was asked, and how.
+        findings: the worst first.
+        build: TensorRT-RTX's answer; None if not asked.
+        asked: whether a user named the target; else a pass did.
+    """
+
+    model: Path
+    options: LintOptions
+    findings: tuple[LintFinding, ...]
+    build: BuildResult | None = None
+    asked: bool = True
+
+    @property
+    def refusal(self) -> str | None:
+        """Why the target would refuse the graph, in one line; None if it would not."""
+        if reason := self._first("error", f"{self.options.target} refuses it"):
+            return reason
+        if self.build is not None and not self.build.passed:
+            return f"{self.model}: {self.build.refusal}"
+        return None
+
+    @property
+    def miscomputed(self) -> str | None:
+        """What the target would run, and compute otherwise; None if nothing."""
+        return self._first("wrong", f"{self.options.target} computes it otherwise")
+
+    def _first(self, severity: Severity, what: str) -> str | None:
+        """Return the count of a severity's findings and the first; None without any."""
+        matches = [each for each in self.findings if each.severity == severity]
+        if not matches:
+            return None
+        first, noun = matches[0], "error" if severity == "error" else "finding"
+        return (
+            f"{self.model}: {what}, {plural(len(matches), noun)};"
+            f" {first.rule} {first.node!r}: {first.message}"
+        )
+
+    def view(self, every: bool = False) -> View:
+        """Return counts and findings, three nodes of each rule unless `every` is set.
+
+        A note counts the others; lines say what TensorRT-RTX answers.
+        """
+        # a rule that fails everywhere would bury the others
+        rows, more, shown = list[tuple[str, ...]](), list[str](), None if every else 3
+        for row in self.summary():
+            key = row.severity, row.rule
+            own = [each for each in self.findings if (each.severity, each.rule) == key]
+            rows += [(*key, each.node, each.message) for each in own[:shown]]
+            if shown is not None and row.nodes > shown:
+                more.append(f"{row.severity} {row.rule}: {row.nodes - shown} more")
+        columns = ("", "rule", "node", "what")
+        findings = table("Findings", columns, rows, "\n".join(more), words=4)
+        answer = list[str]()
+        if (build := self.build) is not None:
+            built = "built" if build.built else "not built"
+            board = "" if build.built is None else f", {built} for SM{self.options.sm}"
+            parsed = "parsed" if build.parsed else "not parsed"
+            version = f"TensorRT-RTX {build.version}, on this CPU"
+            answer.append(f"{version}: {parsed}{board}")
+            if cut := build.cut:
+                answer.append(f"cut at {len(cut)} plugins: {', '.join(cut[:5])}")
+        reason = self.refusal or self.miscomputed
+        return View(
+            self.headline,
+            [findings] if rows else [],
+            (self.headline, *answer),
+            error=None if reason is None else PreconditionError(reason),
+        )
+
+    @property
+    def status(self) -> Status:
+        """``warning`` if there are findings of any severity."""
+        return "warning" if super().status == "ok" and self.findings else super().status
+
+    @property
+    def headline(self) -> str:
+        """The number of findings of each severity, by our own rules and tables."""
+        counts = Counter(each.severity for each in self.findings)
+        always = ("error", "warning")
+        parts = [
+            plural(counts[each], each) if each in always else f"{counts[each]} {each}"
+            for each in SEVERITIES
+            if counts[each] or each in always
+        ]
+        asked = self.options.target, self.options.target_version
+        runtime = " ".join(filter(None, asked))
+        return (
+            f"{self.model.name} for {runtime}: {', '.join(parts)}"
+            " (our own rules and operator tables)"
+        )
+
+    def summary(self) -> tuple[RuleSummary, ...]:
+        """Return one row per severity and rule, in the order of the findings."""
+        rows: dict[tuple[Severity, str], list[LintFinding]] = {}
+        for each in self.findings:
+            rows.setdefault((each.severity, each.rule), []).append(each)
+        return tuple(
+            RuleSummary(*key, len(of_rule), of_rule[0].node, of_rule[0].message)
+            for key, of_rule in rows.items()
+        )
+
+    def to_json(self) -> object:
+        """Return the target, the findings, and the answer of TensorRT-RTX."""
+        asked, build = self.options.target, self.build
+        return {"target": asked, "findings": self.findings, "tensorrt_rtx": build}
+
+
+def lint(
+    model: str | Path, options: LintOptions | None = None, listener: Listener = SILENT
+) -> LintResult:
+    """Check a graph for the runtime that will run it.
+
+    The model is an ONNX file or the name of one that ships. For onnxruntime it is
+    opened too, if no rule says that it would be refused.
+
+    Raises:
+        GraphError: The model does not exist, or onnxruntime crashes on it.
+        ProviderError: The provider is not available.
+        RecipeError: The target does not exist.
+        MissingExtraError: TensorRT-RTX is asked for and not installed.
+    """
+    path = model_path(model)
+    loaded = graph.load(path)
+    options = retarget(loaded, options or LintOptions())
+    target, provider = _target_of(options), options.runs_on
+    findings = target.lint(loaded)
+    if provider.native != CPU.native:  # the list of kernels is the CPU's
+        findings = tuple(each for each in findings if each.rule != "kernel")
+    # a graph that the rules refuse is not opened
+    if not any(each.severity == "error" for each in findings):
+        if target.opens:
+            try_first(loaded, path.name, listener=listener, provider=provider)
+        findings = worst_first((*findings, *target.read_back(loaded, provider)))
+    build = check(loaded, options.sm) if options.trt_check else None
+    return LintResult(path, options, findings, build)
+
+
+def retarget(model: ir.Model, options: LintOptions) -> LintOptions:
+    """Return options with the target named, or the plan's, or tensorrt; or refuse."""
+    if options.target is None:
+        plan = None if options.of_tensorrt else plan_of(model)
+        written_for = "" if plan is None else plan.target
+        options = dataclasses.replace(options, target=written_for or "tensorrt")
+    if options.runs_on != CPU and not _target_of(options).opens:
+        raise RecipeError(
+            f"--provider is onnxruntime's: lint for {options.target} opens no session"
+        )
+    return options
+
+
+def _target_of(options: LintOptions) -> Target:
+    """Return the target whose rules judge the graph; a RecipeError if there is none."""
+    if options.target_version is None:
+        return TARGETS.parse(options.target or "tensorrt")
+    try:
+        return TensorRT(version=options.target_version)
+    except ValueError as reason:
+        raise RecipeError(f"--target-version: {reason}") from reason
+
+
+def lint_written(
+    model: ir.Model, passes: Sequence[Pass], output: Path, asked: str | None
+) -> LintResult | None:
+    """Ask the rules of the target that passes wrote int8 for; None where none did.
+
+    Nothing is opened. `asked` is the target that the user named, if any.
+    """
+    targets = [each.target for each in passes if isinstance(each, QuantizeInt8)]
+    if not targets:
+        return None
+    options = LintOptions(target=targets[-1])
+    findings = _target_of(options).lint(with_own_domains(model))
+    return LintResult(Path(output.name), options, findings, asked=asked is not None)

@@ -1,0 +1,270 @@
+"""What lossy passes, and onnxruntime's own int8, did to a model's outputs."""
+
+import dataclasses
+from collections.abc import Iterator, Sequence
+from functools import partial
+from pathlib import Path
+
+import onnx_ir as ir
+
+from me2e_compress.base.display import Table, plural
+from me2e_compress.base.errors import EvaluationError, FramesError, GraphError
+from me2e_compress.calibration.dataset import CalibrationSet
+from me2e_compress.calibration.sample import hold_out, spread
+from me2e_compress.commands.compare import compare_sessions, outputs_table
+from me2e_compress.commands.result import Listener
+from me2e_compress.commands.runtime_loss import RuntimeLoss, has_int8_kernels
+from me2e_compress.fidelity.compare import Fidelity, SetFidelity, SetTally, compare
+from me2e_compress.fidelity.floor import Floor, Shortfall, format_figure
+from me2e_compress.fidelity.liveness import Liveness
+from me2e_compress.graph.recurrence import recurrent_inputs
+from me2e_compress.manager import Report
+from me2e_compress.passes import Pass
+from me2e_compress.passes.lower_int8 import LowerInt8
+from me2e_compress.passes.quantize_int8 import QuantizeInt8
+from me2e_compress.passes.quantizer import Quantizer
+from me2e_compress.quantization.decision import plan_of
+from me2e_compress.runtime.frames import Frames
+from me2e_compress.runtime.latency_trace import cpu_seconds
+from me2e_compress.runtime.providers import Provider
+from me2e_compress.runtime.session import Session
+from me2e_compress.shipped.drivers import frames_of
+from me2e_compress.targets import TARGETS
+
+NOT_ASKED = "--measure-frames 0"
+FEW_NODES = 3
+"""So many int8 nodes are named where the loss is."""
+FEW_FRAMES = 3
+"""Fewer frames say little: four of one drive lay 12 to 15 dB from four others."""
+
+
+@dataclasses.dataclass(frozen=True)
+class MeasuredLoss:
+    """How true a compressed model stayed, and where it did not.
+
+    Attributes:
+        fidelity: fidelity to the graph before the first lossy pass; None if not
+            measured.
+        on: which frames were used, or why nothing was measured, in words.
+        incomparable: whether an output is not finite, or of another shape than before.
+        shortfalls: outputs below the floor, the worst first.
+        guilty: the lossy passes, which cause the shortfalls between them.
+        int8_nodes: the nodes that are int8, where they are three at most.
+        advice: the command that measures int8 module by module; empty where nothing is
+            below the floor, or nothing is int8.
+        liveness: which outputs still move; None if not asked.
+        agents: outputs that are sets, by their matched agents; None without any.
+        runtime: what onnxruntime's int8 answers otherwise; None if it is not for it.
+        seconds: CPU time of measuring.
+    """
+
+    fidelity: Fidelity | None
+    on: str
+    floor: Floor
+    liveness: Liveness | None = None
+    runtime: RuntimeLoss | None = None
+    agents: SetFidelity | None = None
+    shortfalls: tuple[Shortfall, ...] = ()
+    guilty: tuple[str, ...] = ()
+    int8_nodes: tuple[str, ...] = ()
+    advice: str = ""
+    seconds: float = 0.0
+    incomparable: bool = False
+
+    def lines(self) -> Iterator[str]:
+        """Yield how far the outputs moved, and which are alive or not judged."""
+        fidelity = self.fidelity
+        if fidelity is not None:
+            parts = list[str]()
+            if fidelity.plan is not None:
+                parts.append(
+                    f"the plan moves {fidelity.plan.mean_m:.3f} m on average,"
+                    f" {fidelity.plan.max_m:.2f} m at most"
+                )
+            matched = {} if self.agents is None else self.agents.sqnr_db
+            judged = [
+                each
+                for each in fidelity.outputs
+                if each.name not in (fidelity.plan_output, *matched)
+                and not each.discrete
+            ]
+            if judged:
+                worst = min(judged, key=lambda each: each.sqnr_db)
+                noise, reach = format_figure(worst.sqnr_db, "dB"), worst.by_frame
+                every = fidelity.seen and f" of {fidelity.frames + fidelity.seen}"
+                reach = f" ({reach} by frame{every or ''})" if reach else ""
+                parts.append(f"the noisiest output is {worst.name}, {noise}{reach}")
+            frames_text = f"on {plural(fidelity.frames, 'frame')} {self.on}"
+            yield f"{'; '.join(parts) or 'no output could be judged'} ({frames_text})"
+        elif self.on != NOT_ASKED:
+            yield f"fidelity: not measured ({self.on})"
+        if self.liveness is not None:
+            yield from self.liveness.lines()
+        if self.runtime is not None:
+            yield from self.runtime.lines()
+
+    def alerts(self) -> Iterator[str]:
+        """Yield what cannot be compared or is below the floor, and what helps."""
+        if self.incomparable:
+            yield f"the outputs cannot be compared: {self.on}"
+        if self.liveness is not None:
+            yield from self.liveness.faults
+        if self.fidelity is not None and self.fidelity.frames < FEW_FRAMES:
+            yield (
+                f"this verdict rests on {plural(self.fidelity.frames, 'frame')}:"
+                f" record {3 * FEW_FRAMES} or more, a third of which is measured on"
+            )
+        if self.fidelity is not None:
+            yield from self.fidelity.stray_texts
+        if self.shortfalls:
+            low, guilty = ", ".join(map(str, self.shortfalls)), ", ".join(self.guilty)
+            nodes = f" ({', '.join(self.int8_nodes)})" if self.int8_nodes else ""
+            yield f"below the floor ({self.floor}): {low}; lost in {guilty}{nodes}"
+        if self.advice:
+            yield f"{self.advice} measures which modules lose it"
+
+    def table(self) -> Table | None:
+        """Return the SQNR and largest error of every output; None if not measured."""
+        fidelity = self.fidelity
+        if fidelity is None:
+            return None
+        below = {each.output for each in self.shortfalls}
+        verdicts = {
+            each.name: "not judged: whole numbers"
+            for each in fidelity.outputs
+            if each.discrete
+        }
+        verdicts |= dict.fromkeys(below, "below")
+        title = f"Fidelity on {plural(fidelity.frames, 'frame')} {self.on}"
+        return outputs_table(title, fidelity, self.agents, verdicts)
+
+    def record(self) -> dict[str, object]:
+        """Return what the report says of it: all but the time."""
+        names = (each.name for each in dataclasses.fields(self))
+        return {name: getattr(self, name) for name in names if name != "seconds"}
+
+
+RUN_FRAMES = 4
+"""Frames measured in a row of a model that has a state."""
+KEPT_OUT = "kept out of calibration"
+SHARED = "calibrated on as well: there is no other"
+PERHAPS_SHARED = "that the saved ranges may have been measured on"
+SHIPPED_FRAMES = "that ship with the model"
+ADVICE = "me2e-compress sensitivity MODEL FRAMES -o RECIPE.toml"
+
+
+@dataclasses.dataclass(frozen=True)
+class SplitFrames:
+    """Frames that passes see, and those that the result is measured on.
+
+    Attributes:
+        kind: what kind the measured frames are, or why there are none, in words.
+        seen: as many of those calibrated on at most.
+        samples: frames that exact passes are checked on where the user gave none.
+    """
+
+    calibration: CalibrationSet | None
+    measured: Frames | None
+    kind: str
+    samples: CalibrationSet | None = None
+    seen: CalibrationSet | None = None
+
+
+def split_frames(
+    source: Path,
+    model: ir.Model,
+    folder: str | Path | None,
+    passes: Sequence[Pass],
+    most: int,
+) -> SplitFrames:
+    """Open the recording, or the frames that ship with the model, and split it.
+
+    Up to `most` frames are kept to measure on, where a pass is lossy; nothing is kept
+    out of calibration where ranges are saved.
+    """
+    recording = samples = None
+    if folder is not None:
+        recording = CalibrationSet(folder)
+        recording.check(model)
+    elif (shipped := frames_of(source)) is not None:
+        samples = CalibrationSet(shipped)
+    if not most or all(each.exact for each in passes):
+        return SplitFrames(recording, None, NOT_ASKED, samples)
+    if recording is None:
+        reason = "no recorded frames" if samples is None else SHIPPED_FRAMES
+        return SplitFrames(None, samples, reason, samples)
+    run = RUN_FRAMES if recurrent_inputs(model) else 1
+    calibration, measured = hold_out(recording, most, run)
+    if any(isinstance(each, Quantizer) and not each.needs_frames for each in passes):
+        return SplitFrames(recording, measured, PERHAPS_SHARED)
+    if len(recording) == 1:
+        return SplitFrames(calibration, measured, SHARED)
+    seen = spread(calibration, most, run)
+    return SplitFrames(calibration, measured, KEPT_OUT, seen=seen)
+
+
+def measure_loss(
+    report: Report,
+    provider: Provider,
+    frames: SplitFrames,
+    floor: Floor,
+    listener: Listener,
+) -> MeasuredLoss | None:
+    """Compare with the graph before the first lossy pass; None if all are exact."""
+    if not report.lossy:
+        return None
+    loss = MeasuredLoss(None, frames.kind, floor)
+    if frames.measured is None:
+        return loss
+    start = cpu_seconds()
+    listener.on_progress("fidelity", 0, 1, "")
+    # a graph that does not run or compare is a finding, not a failure
+    try:
+        loss = _compare(loss, report, provider, frames.measured, frames.seen)
+    except (FramesError, GraphError) as error:
+        loss = dataclasses.replace(loss, on=str(error))
+    except EvaluationError as error:  # not finite, or of another shape
+        loss = dataclasses.replace(loss, on=str(error), incomparable=True)
+    return dataclasses.replace(loss, seconds=cpu_seconds() - start)
+
+
+def _compare(
+    loss: MeasuredLoss,
+    report: Report,
+    provider: Provider,
+    frames: Frames,
+    seen: Frames | None,
+) -> MeasuredLoss:
+    """Return the loss with fidelity, liveness and the outputs below the floor."""
+    passes = [each.applied for each in report.lossy]
+    before, after = report.lossy[0].before, report.model
+    open_session = partial(Session, release=True, provider=provider)
+    reference, session = open_session(before), open_session(after)
+    # a graph that was written for onnxruntime is run by its int8 kernels, too
+    kernels = None
+    written = any(
+        isinstance(each, LowerInt8)
+        or (isinstance(each, QuantizeInt8) and TARGETS.parse(each.target).opens)
+        for each in passes
+    )
+    if written and has_int8_kernels(after, provider):
+        kernels = open_session(after, stock=True)
+    sets = SetTally.of(reference, session)
+    comparison = compare_sessions(reference, session, frames, after, kernels, sets)
+    if seen is not None:
+        beside = comparison.fidelity.widen(compare(reference, session, seen))
+        comparison = dataclasses.replace(comparison, fidelity=beside)
+    loss = dataclasses.replace(loss, **vars(comparison))
+    below = loss.floor.shortfalls(comparison.fidelity, comparison.agents)
+    if not below:
+        return loss
+    int8 = any(isinstance(each, QuantizeInt8) for each in passes)
+    plan = plan_of(after) if int8 else None
+    placed = () if plan is None else plan.placed
+    return dataclasses.replace(
+        loss,
+        shortfalls=below,
+        guilty=tuple(each.name for each in passes),
+        int8_nodes=tuple(e.node for e in placed) if len(placed) <= FEW_NODES else (),
+        advice=ADVICE if int8 else "",
+    )

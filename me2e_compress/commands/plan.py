@@ -1,0 +1,227 @@
+"""Plan which nodes become int8 and which stay float, by which rule, and why."""
+
+import dataclasses
+import itertools
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Self
+
+import onnx_ir as ir
+
+from me2e_compress import graph
+from me2e_compress.base.display import table
+from me2e_compress.base.errors import PreconditionError, RecipeError
+from me2e_compress.calibration.observers import DEFAULT_METHOD
+from me2e_compress.commands.checks import (
+    load_graph,
+    load_map,
+    model_path,
+    shortcomings,
+    writing,
+)
+from me2e_compress.commands.options import PlanOptions
+from me2e_compress.commands.result import Result, View
+from me2e_compress.driving.adapter.outputs import adapted
+from me2e_compress.graph.modules.module_map import ModuleMap
+from me2e_compress.manager import PassManager, recipe
+from me2e_compress.passes import Context, Pass
+from me2e_compress.passes.freeze_inputs import advice
+from me2e_compress.passes.quantize_int8 import QuantizeInt8, refuse_quantized
+from me2e_compress.passes.quantizer import Quantizer
+from me2e_compress.quantization.decision import (
+    METADATA,
+    QuantPlan,
+    load_plan,
+    plan_of,
+    save_plan,
+)
+from me2e_compress.quantization.rules import DEFAULT_RULES, RULE_SETS
+from me2e_compress.shipped.drivers import map_name
+from me2e_compress.targets import DEFAULT_TARGET, TARGETS
+
+_MOST_RANGES = "paper{without=[fused-operator]}"
+"""The rules that need all ranges that others do: an override may lift those."""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class PreparedGraph:
+    """A graph in the state in which the pass that reads ranges finds it.
+
+    `reader` is that pass; None where the recipe has none.
+    """
+
+    file: Path
+    model: ir.Model
+    modules: ModuleMap
+    reader: Quantizer | None
+
+    @classmethod
+    def of(
+        cls,
+        file: Path,
+        loaded: ir.Model,
+        module_map: str | Path | ModuleMap | None,
+        passes: Sequence[Pass] | None = None,
+    ) -> Self:
+        """Run the passes before the first that reads ranges, unverified.
+
+        A module map of None finds the preset; passes of None stand for the recipe
+        ``exact``. A graph that a plan quantized, and is to become int8, raises
+        PreconditionError.
+        """
+        chosen = tuple(recipe.load("exact") if passes is None else passes)
+        readers = (each for each in chosen if isinstance(each, Quantizer))
+        reader = next(readers, None)
+        at = None if reader is None else chosen.index(reader)
+        # what a plan quantized may only be rewritten, not quantized again
+        if (reader is None or reader.takes_float) and METADATA in loaded.metadata_props:
+            refuse_quantized(loaded)
+        if not isinstance(module_map, ModuleMap):
+            module_map = load_map(module_map, loaded)
+        # exact passes are verified when the graph is compressed
+        manager = PassManager(chosen[:at], verify_frames=0)
+        model = manager.run(loaded, Context(module_map)).model
+        graph.infer_shapes(model)
+        # weights are copied out of the protobuf message that the file was read into: a
+        # single one left there would keep the whole message in memory
+        for value in (v for g in model.graphs() for v in g.initializers.values()):
+            tensor = value.const_value
+            if isinstance(tensor, ir.serde.TensorProtoTensor):
+                array, name = tensor.numpy().copy(), value.name
+                value.const_value = ir.Tensor(array, dtype=tensor.dtype, name=name)
+        return cls(file, model, module_map, reader)
+
+    @property
+    def method(self) -> str:
+        """Return how the pass that reads ranges wants them measured."""
+        return DEFAULT_METHOD if self.reader is None else self.reader.method_of_ranges
+
+    def tensors(self) -> tuple[str, ...]:
+        """Return every tensor that any scheme, rule set or target needs a range of.
+
+        For a quantized graph to be rewritten, these are the tensors without a range in
+        it. If there is none, PreconditionError is raised.
+        """
+        context, names = Context(self.modules), dict[str, None]()
+        if self.reader is not None and not self.reader.takes_float:
+            names |= dict.fromkeys(self.reader.ranged_tensors(self.model, context))
+            none = (
+                f"it tells every range that {self.reader.name} needs: none to measure"
+            )
+        else:
+            sets, none = (*RULE_SETS.usable(), _MOST_RANGES), "no node can become int8"
+            for rules, target in itertools.product(sets, TARGETS.usable()):
+                every = QuantizeInt8(
+                    modules=self.modules.names(), rules=rules, target=target
+                )
+                plan = every.plan(self.model, context)
+                tensors = TARGETS.parse(target).tensors(plan, self.model)
+                names |= dict.fromkeys(tensors)
+        if not names:
+            raise PreconditionError(f"{self.file}: {none}")
+        return tuple(names)
+
+
+@dataclasses.dataclass(frozen=True, repr=False)
+class PlanResult(Result):
+    """A plan.
+
+    Attributes:
+        plan: the decision for every node.
+        hint: what the graph lacks for more to be known, else empty.
+    """
+
+    keys = ("*plan",)
+    plan: QuantPlan
+    hint: str = ""
+
+    def view(self, every: bool = False) -> View:
+        """Return how many nodes of each module became what by which rule.
+
+        With `every` a row a node that could be int8, and what was decided together.
+        """
+        lines = filter(None, (self.hint, self.plan.headline))
+        tables = list(self.plan.tables())
+        if not every:
+            return View(self.plan.headline, tables, lines)
+        rows = list[tuple[str, str]]()
+        for each in self.plan.decisions:
+            if each.could_be_int8:
+                of_module = f" of {each.module}" if each.module else ""
+                why = f"{each.dtype} by {each.rule}, {each.reason}"
+                rows.append((each.node or each.output, f"{each.op}{of_module}: {why}"))
+        what = ("node", "what, by which rule, why")
+        tables.append(table("Decisions", what, rows, words=2))
+        groups = [
+            (group.name, ", ".join(group.tensors), ", ".join(group.nodes))
+            for group in self.plan.groups
+        ]
+        if groups:
+            columns = ("Concat", "tensors", "read by")
+            tables.append(table("On one scale", columns, groups, words=3))
+        return View(self.plan.headline, tables, lines)
+
+
+def plan(
+    model: str | Path,
+    output: str | Path | None = None,
+    options: PlanOptions | None = None,
+) -> PlanResult:
+    """Decide for every node whether it becomes int8, as ``compress`` will.
+
+    The model is an ONNX file, the name of one that ships, or a saved plan; a file that
+    carries its plan is not planned again. The plan is written as JSON if `output` is
+    given.
+
+    Raises:
+        GraphError: The model does not exist, or the output would harm an input.
+        RecipeError: A plan, scheme or rule set is not usable, or options are given for
+            a plan that is made already.
+        PreconditionError: The graph is quantized and carries no plan, or its opset or
+            float type has no int8.
+    """
+    options = options or PlanOptions()
+    source = model_path(model)
+    written = None if output is None else Path(output)
+    inputs = (source, options.overrides, options.module_map)
+    with writing([written], inputs, force=options.force):
+        # a file is a plan, carries one, or is a float graph to plan
+        read = _read_file(source)
+        if isinstance(read, QuantPlan):
+            # options that would change nothing
+            names = ("overrides", "scheme", "rules", "target")
+            if option := next((each for each in names if getattr(options, each)), None):
+                raise RecipeError(
+                    f"--{option} is for a plan that is yet to be made, and {source} has"
+                    " its own: give the float model"
+                )
+            result = PlanResult(read)
+        else:
+            result = _plan(source, read, options)
+        if written is not None:
+            save_plan(result.plan, written)
+    return result
+
+
+def _read_file(path: Path) -> QuantPlan | ir.Model:
+    """Read the plan that a file is or carries, else its graph."""
+    if path.suffix == ".json":
+        return load_plan(path)
+    model = load_graph(path)
+    return plan_of(model) or model
+
+
+def _plan(file: Path, model: ir.Model, options: PlanOptions) -> PlanResult:
+    """Plan a float graph after the exact passes."""
+    quantizer = QuantizeInt8(
+        scheme=options.scheme or "full",
+        rules=options.rules or DEFAULT_RULES,
+        target=options.target or DEFAULT_TARGET,
+        overrides=None if options.overrides is None else Path(options.overrides),
+    )
+    adapted(model, None, options.module_map or map_name(file))
+    ready = PreparedGraph.of(file, model, options.module_map)
+    decided = quantizer.plan(ready.model, Context(ready.modules))
+    TARGETS.parse(quantizer.target).check_types(decided, ready.model)
+    hints = filter(None, (shortcomings(model), advice(model)))
+    return PlanResult(decided, "; ".join(hints))

@@ -1,0 +1,155 @@
+"""Results of commands, the document of `--json`, and who is told of progress."""
+
+import dataclasses
+import math
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import field
+from pathlib import Path
+from typing import Any, ClassVar, Literal
+
+from me2e_compress.base.display import Table
+from me2e_compress.base.errors import Me2eError
+
+SCHEMA = 3
+"""Version of the documents that ``--json`` prints; docs/json.md tells their keys. It
+grows where a key goes or changes its meaning, not where one is added."""
+
+Status = Literal["ok", "warning", "refused"]
+
+
+@dataclasses.dataclass(frozen=True)
+class View:
+    """What people see of a result: tables, then lines, then alerts in bold.
+
+    Attributes:
+        headline: what it is, in one line.
+        lines: None are the headline alone; empty where a table says everything.
+        alerts: what must not be overlooked.
+        error: why the command ends with 1 though it has a result.
+    """
+
+    headline: str
+    tables: Iterable[Table] = ()
+    lines: Iterable[str] | None = None
+    alerts: Iterable[str] = ()
+    error: Me2eError | None = None
+
+
+class Result:
+    """The result of a workflow: its data, and by `shown` what is printed of them.
+
+    One of a single line gives its `headline` alone.
+
+    Class attributes:
+        keys: fields that JSON holds, all by default; those of ``*name`` stand flat.
+    """
+
+    keys: ClassVar[tuple[str, ...]] = ()
+
+    def view(self) -> View:
+        """Return what is printed; by default the headline alone."""
+        return View(self.headline)
+
+    @property
+    def headline(self) -> str:
+        """What it is, in one line."""
+        return self.view().headline
+
+    def __repr__(self) -> str:
+        """Show the class and the one line."""
+        return f"<{type(self).__name__}: {self.headline}>"
+
+    def tables(self) -> tuple[Table, ...]:
+        """Return the tables, which are printed first."""
+        return tuple(self.view().tables)
+
+    def lines(self) -> tuple[str, ...]:
+        """Return the lines below the tables."""
+        lines = self.view().lines
+        return (self.headline,) if lines is None else tuple(lines)
+
+    def alerts(self) -> tuple[str, ...]:
+        """Return what must not be overlooked: printed last, in bold."""
+        return tuple(self.view().alerts)
+
+    def check(self) -> None:
+        """Raise the error of a result that is refused, if there is one."""
+        if (error := self.view().error) is not None:
+            raise error
+
+    @property
+    def status(self) -> Status:
+        """What a program acts on: ``refused`` where the command's exit code is 1."""
+        if self.view().error is not None:
+            return "refused"
+        return "warning" if self.alerts() else "ok"
+
+    def to_json(self) -> object:
+        """Return everything, for `plain`: by default what the `keys` hold."""
+        content, own = dict[str, object](), _fields(self)
+        for key in self.keys or own:
+            name = key.removeprefix("*")
+            content |= {name: own[name]} if name == key else plain(own[name])
+        return content
+
+    def document(self) -> dict[str, object]:
+        """Return the ``--json`` document: version, status, the lines shown, everything.
+
+        Dataclasses and paths become objects and strings, numbers that are not finite
+        null.
+        """
+        content = plain(self.to_json())
+        if not isinstance(content, Mapping):
+            raise TypeError(f"{type(self).__name__}.to_json: not an object")
+        verdict = [*(self.lines() or (self.headline,)), *self.alerts()]
+        return {"schema": SCHEMA, "status": self.status, "verdict": verdict, **content}
+
+
+def _fields(value: Any) -> dict[str, object]:
+    return {each.name: getattr(value, each.name) for each in dataclasses.fields(value)}
+
+
+def plain(value: object) -> Any:
+    """Turn objects, by their own `to_json` or their fields, into what JSON can hold.
+
+    Paths become strings, NaN and infinities null.
+    """
+    if (own := getattr(value, "to_json", None)) is not None:
+        return plain(own())
+    if dataclasses.is_dataclass(value):
+        return plain(_fields(value))
+    if isinstance(value, Mapping):
+        return {key: plain(each) for key, each in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [plain(each) for each in value]
+    if isinstance(value, float):
+        return float(value) if math.isfinite(value) else None
+    return str(value) if isinstance(value, Path) else value
+
+
+Progress = Callable[[str, int, int, str], None]
+Warn = Callable[[str], None]
+
+
+@dataclasses.dataclass(frozen=True)
+class Listener:
+    """Functions that are called while a workflow runs; neither changes its result.
+
+    Attributes:
+        on_progress: gets the stage, things done, things in all, and words.
+        on_warning: gets one line per surprise.
+    """
+
+    on_progress: Progress = field(default_factory=lambda: _ignore, repr=False)
+    on_warning: Warn = field(default_factory=lambda: _ignore, repr=False)
+
+    def counting(self, stage: str, words: str = "") -> Callable[[int, int], None]:
+        """Return a function of things done, and in all, that reports a stage."""
+        return lambda done, total: self.on_progress(stage, done, total, words)
+
+
+def _ignore(*words: object) -> None:
+    """Say nothing."""
+
+
+SILENT = Listener()

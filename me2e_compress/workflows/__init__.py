@@ -1,6 +1,0 @@
-"""The work of each command as a silent, typed function.
-
-A workflow takes files first, then :mod:`~me2e_compress.workflows.options`, then
-a listener for progress; it returns a
-:class:`~me2e_compress.workflows.result.Result`.
-"""

@@ -1,0 +1,201 @@
+"""Every workflow is silent, and writes what its command writes."""
+
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+import me2e_compress as me2e
+from me2e_compress.base.atomic import IN_JSON
+from me2e_compress.commands.files import export_stack
+from me2e_compress.commands.result import Result
+from me2e_compress.manager import recipe
+from tests.support.command import Command
+
+Call = Callable[[], object]
+MAP = "map.toml"
+STOP = "VanillaNonSignalizedTurnEncounterStopsign"
+
+CASES: dict[str, tuple[str, Call]] = {
+    "compress": (
+        "compress dense.onnx -o out.onnx -r full --frames frames --map map.toml",
+        lambda: me2e.compress(
+            "dense.onnx",
+            "out.onnx",
+            recipe="full",
+            frames="frames",
+            options=me2e.CompressOptions(module_map=MAP),
+        ),
+    ),
+    "compress, int8 by options": (
+        "compress dense.onnx -o out.onnx --scheme prediction --target onnxruntime"
+        " --frames frames --map map.toml",
+        lambda: me2e.compress(
+            "dense.onnx",
+            "out.onnx",
+            frames="frames",
+            options=me2e.CompressOptions(
+                scheme="prediction", target="onnxruntime", module_map=MAP
+            ),
+        ),
+    ),
+    "compress, passes": (
+        "compress in.onnx -o out.onnx --passes fold-constants,fuse-basic",
+        lambda: me2e.compress(
+            "in.onnx", "out.onnx", recipe.parse("fold-constants,fuse-basic")
+        ),
+    ),
+    "calibrate": (
+        "calibrate dense.onnx frames -o r.json --map map.toml --method mse",
+        lambda: me2e.calibrate(
+            "dense.onnx",
+            "frames",
+            "r.json",
+            me2e.CalibrateOptions(method="mse", module_map=MAP),
+        ),
+    ),
+    "plan": (
+        "plan dense.onnx -o p.json --map map.toml --rules paper",
+        lambda: me2e.plan(
+            "dense.onnx",
+            "p.json",
+            options=me2e.PlanOptions(rules="paper", module_map=MAP),
+        ),
+    ),
+    "compare": (
+        "compare dense.onnx dense.onnx frames",
+        lambda: me2e.compare("dense.onnx", "dense.onnx", "frames"),
+    ),
+    "inspect": (
+        "inspect dense.onnx --map map.toml",
+        lambda: me2e.inspect("dense.onnx", me2e.InspectOptions(module_map=MAP)),
+    ),
+    "lint": (
+        "lint dense.onnx --target onnxruntime",
+        lambda: me2e.lint("dense.onnx", me2e.LintOptions(target="onnxruntime")),
+    ),
+    "sensitivity": (
+        "sensitivity dense.onnx frames -o s.toml --map map.toml --limit 1",
+        lambda: me2e.measure_sensitivity(
+            "dense.onnx",
+            "frames",
+            "s.toml",
+            me2e.SensitivityOptions(limit=1.0, module_map=MAP),
+        ),
+    ),
+    "search": (
+        "search dense.onnx frames -o s.toml --map map.toml --max-mb 0.001",
+        lambda: me2e.search(
+            "dense.onnx",
+            "frames",
+            "s.toml",
+            me2e.SearchOptions(max_mb=0.001, module_map=MAP),
+        ),
+    ),
+    "export": ("export highway -o hw.onnx", lambda: export_stack("highway", "hw.onnx")),
+    "record_frames": (
+        "frames highway -n 1 -o made --seed 3",
+        lambda: me2e.record_frames(
+            "highway", "made", me2e.FramesOptions(count=1, seed=3)
+        ),
+    ),
+    "evaluate": (
+        "evaluate blind -o results --routes ParkedObstacle_R2_0 --latency fps:4",
+        lambda: me2e.evaluate(
+            "blind",
+            "results",
+            me2e.EvaluateOptions(routes="ParkedObstacle_R2_0", latency="fps:4"),
+        ),
+    ),
+}
+
+
+@pytest.mark.usefixtures("weights")
+@pytest.mark.parametrize("name", CASES)
+def test_a_workflow_is_silent_and_writes_what_its_command_writes(
+    command: Command,
+    dense: Path,
+    tmp_path_factory: pytest.TempPathFactory,
+    monkeypatch: pytest.MonkeyPatch,
+    capfd: pytest.CaptureFixture[str],
+    name: str,
+) -> None:
+    line, call = CASES[name]
+    other = tmp_path_factory.mktemp("python") / "folder"
+    shutil.copytree(dense, other)
+    monkeypatch.chdir(dense)
+    assert command(*line.split()) == 0
+    capfd.readouterr()
+
+    monkeypatch.chdir(other)
+    result = call()
+
+    assert capfd.readouterr() == ("", "")
+    assert written(other) == written(dense)
+    if isinstance(result, Result):
+        assert "\n" not in result.headline
+        assert result.headline in repr(result)
+
+
+def test_a_profile_is_silent_and_its_trace_may_be_charged(
+    dense: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    found = me2e.profile(
+        dense / "dense.onnx",
+        dense / "frames",
+        dense / "trace.json",
+        me2e.ProfileOptions(samples=3),
+    )
+
+    assert capfd.readouterr() == ("", "")
+    written = json.loads((dense / "trace.json").read_text())
+    assert written == IN_JSON | found.trace.to_json()
+    assert len(found.trace.samples_us) == 3
+
+
+@pytest.mark.usefixtures("short")
+def test_results_that_are_there_are_scored_silently(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    asked = me2e.EvaluateOptions(routes="ParkedObstacle_R2_0")
+    driven = me2e.evaluate("blind", tmp_path / "results", asked)
+
+    found = me2e.score(tmp_path / "results")
+
+    assert capfd.readouterr() == ("", "")
+    assert found.scores == {str(tmp_path / "results"): driven.scores}
+
+
+def test_who_listens_hears_every_stage(dense: Path) -> None:
+    heard = list[str]()
+    listener = me2e.Listener(lambda stage, *_: heard.append(stage))
+
+    me2e.measure_sensitivity(
+        dense / "dense.onnx",
+        dense / "frames",
+        dense / "s.toml",
+        me2e.SensitivityOptions(module_map=dense / MAP),
+        listener,
+    )
+
+    assert list(dict.fromkeys(heard)) == ["calibrate", "modules"]
+
+
+def written(folder: Path) -> dict[str, object]:
+    """Read every file but logs and times; of a report all but the seconds."""
+    return {
+        str(path.relative_to(folder)): content(path)
+        for path in sorted(folder.rglob("*"))
+        if path.is_file() and path.suffix != ".log"
+    }
+
+
+def content(path: Path) -> object:
+    if not path.name.endswith(".report.json"):
+        return path.read_bytes()
+    record = json.loads(path.read_text(encoding="utf-8"))
+    for step in record["steps"]:
+        del step["seconds"]
+    return record
