@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import TypeAlias
 
 import numpy as np
-import numpy.typing as npt
 import onnx_ir as ir
 import onnx_ir.passes.common as common
 
@@ -27,11 +26,14 @@ from me2e_compress.calibration.statistics import (
     Statistics,
     check_finite,
     checksum,
+    exponents_of,
     first_bad_node,
     index_inputs,
     is_not_finite,
+    rebinned,
 )
 from me2e_compress.graph.nodes import makers_of, reads_of
+from me2e_compress.operators import OWN_DOMAIN
 from me2e_compress.runtime.frames import Array
 from me2e_compress.runtime.probing import (
     READINGS,
@@ -77,50 +79,25 @@ class Extremes:
         return nodes, [each.outputs[0] for each in flat]
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class Counts:
-    """A histogram of magnitudes.
+@dataclasses.dataclass(frozen=True)
+class ExtremesAndCounts:
+    """Extremes, and a histogram (:mod:`me2e_compress.operators.histogram`).
 
-    Attributes:
-        exponents: int64 [tensors]: the bins of a tensor divide [0, 2^exponent).
-        width: the number of bins.
+    The bins of one frame fit into those of another (`rebinned`).
     """
 
-    exponents: npt.NDArray[np.int64]
-    width: int = BINS
+    width: int = 3 + BINS
 
     def read(self, where: ir.Graph, value: ir.Value, at: int) -> Reading:
-        """Compute bin numbers, and count them as TF-IDF counts the words of a text.
-
-        TfidfVectorizer is the one standard operator that counts integers: exact,
-        available from opset 9 on, without a second array as large as the tensor.
-        Scaling by a power of two is exact: every element lies in its own bin.
-        """
-        bins_per_unit = np.ldexp(np.float32(BINS), -self.exponents[at])
-        factor = shared_constant(
-            where, np.asarray(bins_per_unit, np.float32), f"factor_{at}"
-        )
-        last = shared_constant(where, np.array(BINS - 1, np.float32), "last_bin")
+        """Build the extremes, and a node that counts in between."""
+        nodes, readings = Extremes().read(where, value, at)
         row = shared_constant(where, np.array([-1], np.int64), "row")
-        # Number the bins; the last one takes what lies beyond.
-        magnitude = ir.node("Abs", [value])
-        scaled = ir.node("Mul", [magnitude.outputs[0], factor])
-        capped = ir.node("Min", [scaled.outputs[0], last])
-        number = _cast(capped.outputs[0], ir.DataType.INT32)
-        words = ir.node("Reshape", [number.outputs[0], row])
-        bins = list(range(BINS))
-        # Count n-grams of length 1: the bin numbers.
-        count = ir.node(
-            "TfIdfVectorizer",
-            [words.outputs[0]],
-            {
-                "mode": "TF", "min_gram_length": 1, "max_gram_length": 1,
-                "max_skip_count": 0, "ngram_counts": [0], "ngram_indexes": bins,
-                "pool_int64s": bins,
-            },
-        )  # fmt: skip
-        nodes = [magnitude, scaled, capped, number, words, count]
-        return nodes, [count.outputs[0]]
+        flat = ir.node("Reshape", [value, row])
+        inputs = [flat.outputs[0], nodes[0].outputs[0], nodes[1].outputs[0]]
+        for each, dims in zip(inputs, ([None], [], []), strict=True):
+            each.dtype, each.shape = ir.DataType.FLOAT, ir.Shape(dims)
+        count = ir.node("Histogram", inputs, domain=OWN_DOMAIN)
+        return [*nodes, flat, count], [*readings, count.outputs[0]]
 
 
 def _cast(value: ir.Value, to: ir.DataType) -> ir.Node:
@@ -135,7 +112,7 @@ _STATE = "state/"
 
 @dataclasses.dataclass(frozen=True)
 class CalibrationState:
-    """Frames done in one pass, results so far, and the state for the next frame."""
+    """Frames done, results so far, and the state for the next frame."""
 
     done: int = 0
     results: Mapping[str, Array] = dataclasses.field(default_factory=dict)
@@ -239,9 +216,7 @@ class Calibrator:
     ) -> Statistics:
         """Run the model over the frames, its recurrent state fed forward.
 
-        A method that needs histograms takes a second pass, because the first one finds
-        their bins. ``progress`` is called with frames done and all frames, of both
-        passes.
+        ``progress`` is called with frames done and all frames.
 
         Raises:
             FramesError: there are no frames; one does not fit, or makes a tensor NaN or
@@ -271,11 +246,8 @@ class Calibrator:
                 f"{reason}; ranges that TensorRT measured are taken by `calibrate"
                 " --import CACHE`, and then by `compress --ranges`"
             )
-        # Extremes first: they decide the bins of the histograms.
-        job = _Job(self, model, empty, frames, progress, 2 if counting else 1)
-        job.extremes()
-        if counting:
-            job.counts()
+        job = _Job(self, model, empty, frames, progress, counting)
+        job.run()
         if self.checkpoint is not None:
             self.checkpoint.unlink(missing_ok=True)
         return job.seen
@@ -291,13 +263,13 @@ class _Job:
         blank: Statistics,
         frames: CalibrationSet,
         progress: Progress | None,
-        passes: int,
+        counting: bool,
     ) -> None:
         self.settings = settings
         self.model = model
         self.frames = frames
         self.progress = progress
-        self.total = passes * len(frames)
+        self.probe: Probe = ExtremesAndCounts() if counting else Extremes()
         # A checkpoint is valid only for the same calibration.
         key = {
             "model": blank.model,
@@ -307,7 +279,7 @@ class _Job:
             "list of inputs and outputs": [*blank.inputs, *blank.outputs],
             "optimization level": settings.optimize,
             "provider": settings.provider.name,
-            "kind of statistics": "counts" if passes == 2 else "extremes",
+            "kind of statistics": "counts" if counting else "extremes",
         }
         self.checkpoint = CalibrationCheckpoint(settings.checkpoint, key)
         self.begun = self.checkpoint.read()
@@ -315,63 +287,62 @@ class _Job:
         self.places = [name for name in index_inputs(model) if name not in known]
         # Continue from the checkpoint, if there is one.
         measured = self.begun.results.get("measured", blank.measured)
-        counts = self.begun.results.get("counts")
+        blank_counts = np.zeros((len(blank.tensors), BINS), np.int64)
+        counts = self.begun.results.get("counts", blank_counts if counting else None)
         ports = len(blank.inputs) + len(blank.outputs)
         checksums = self.begun.results.get("checksums", np.empty((0, ports)))
         self.seen = dataclasses.replace(
             blank,
             measured=np.asarray(measured, np.float32),
             checksums=np.asarray(checksums, np.int64),
-            counts=None if counts is None else np.array(counts, np.int64),
+            counts=None if counts is None else np.asarray(counts, np.int64),
             not_finite=str(self.begun.results.get("not_finite", "")),
         )
 
-    def extremes(self) -> None:
-        """Measure minimum, maximum and mean square of every tensor and frame."""
+    def run(self) -> None:
+        """Measure every tensor on the frames that are not done yet."""
         rows, sums = list(self.seen.measured), self.seen.checksums.tolist()
         ports = (*self.seen.inputs, *self.seen.outputs)
-        for readings, arrays, place in self._pass(Extremes(), 0, self.places):
+        for readings, arrays, place in self._frames():
+            # Refuse what has no range, and name the node that made it
             sums.append([checksum(arrays[name]) for name in ports])
-            cause = self.seen.not_finite
-            if not cause and (is_not_finite(readings).any() or NOT_FINITE in sums[-1]):
+            extremes, cause = readings[:, :3], self.seen.not_finite
+            if not cause and (is_not_finite(extremes).any() or NOT_FINITE in sums[-1]):
                 seen = {*self.seen.tensors, *self.places, *self.seen.outputs}
                 provider = self.settings.provider
                 cause = first_bad_node(self.model, arrays, seen, Extremes(), provider)
-            watched = readings[: len(self.seen.tensors)]
+            watched = extremes[: len(self.seen.tensors)]
             check_finite(watched, self.seen.tensors, place, cause)
             rows.append(watched)
-            self.seen = dataclasses.replace(
+            after = dataclasses.replace(
                 self.seen,
                 measured=np.stack(rows),
                 checksums=np.array(sums, np.int64),
                 not_finite=cause,
             )
+            # Bring both histograms to the bins of the larger reach
+            if self.seen.counts is not None:
+                frame = readings[: len(watched), 3:].astype(np.int64)
+                counts = rebinned(frame, after.exponents - exponents_of(watched))
+                counts += rebinned(
+                    self.seen.counts, after.exponents - self.seen.exponents
+                )
+                after = dataclasses.replace(after, counts=counts)
+            self.seen = after
 
-    def counts(self) -> None:
-        """Count the magnitudes of every tensor over all frames."""
-        blank = np.zeros((len(self.seen.tensors), BINS), np.int64)
-        total = blank if self.seen.counts is None else self.seen.counts
-        self.seen = dataclasses.replace(self.seen, counts=total)
-        probe = Counts(self.seen.exponents)
-        for readings, _, _ in self._pass(probe, len(self.frames)):
-            np.add(total, readings.astype(np.int64), out=total)
+    def _frames(self) -> Iterator[tuple[Floats, Mapping[str, Array], int]]:
+        """Run the frames that are left, and store the progress from time to time.
 
-    def _pass(
-        self, probe: Probe, before: int, others: Sequence[str] = ()
-    ) -> Iterator[tuple[Floats, Mapping[str, Array], int]]:
-        """Run the rest of a pass; ``before`` frames belong to earlier passes.
-
-        Yields the readings of each frame, float32 [tensors and ``others``, width of the
+        Yields the readings of each frame, float32 [tensors and places, width of the
         probe], its inputs and outputs, and its index.
         """
-        # Skip what an interrupted run has done.
-        begin = max(self.begun.done - before, 0)
+        begin = self.begun.done
         if begin >= len(self.frames):
             return
         session = probed_session(
             self.model,
-            (*self.seen.tensors, *others),
-            probe,
+            (*self.seen.tensors, *self.places),
+            self.probe,
             threads=self.settings.threads,
             optimize=self.settings.optimize,
             provider=self.settings.provider,
@@ -380,13 +351,12 @@ class _Job:
         floats = [name for name, port in session.outputs.items() if port.type in DTYPES]
         rest = (self.frames[index] for index in range(begin, len(self.frames)))
         runs = feed_forward(session, rest, floats, state)
-        # Store the progress from time to time.
-        for at, (inputs, values, after) in enumerate(runs, begin):
-            readings = values[READINGS].astype(np.float32).reshape(-1, probe.width)
-            yield readings, {**inputs, **values}, self.seen.frames[at]
-            done = before + at + 1
-            every = self.settings.every
-            if self.settings.checkpoint and (done % every == 0 or done == self.total):
+        for done, (inputs, values, after) in enumerate(runs, begin + 1):
+            readings = values[READINGS].astype(np.float32)
+            place = self.seen.frames[done - 1]
+            yield readings.reshape(-1, self.probe.width), {**inputs, **values}, place
+            last = done == len(self.frames)
+            if self.settings.checkpoint and (done % self.settings.every == 0 or last):
                 results: dict[str, Array] = {
                     "measured": self.seen.measured,
                     "checksums": self.seen.checksums,
@@ -396,7 +366,7 @@ class _Job:
                     results["counts"] = self.seen.counts
                 self.checkpoint.write(CalibrationState(done, results, after))
             if self.progress:
-                self.progress(done, self.total)
+                self.progress(done, len(self.frames))
 
 
 def _numeric_names(values: Iterable[ir.Value]) -> tuple[str, ...]:

@@ -54,7 +54,7 @@ class Observer(abc.ABC):
 
     Class attributes:
         name: its name in recipes and on the command line.
-        counts: whether it needs histograms, i.e. a second pass over the frames.
+        counts: whether it needs histograms.
     """
 
     name: ClassVar[str]

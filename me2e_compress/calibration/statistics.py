@@ -13,18 +13,11 @@ import onnx_ir as ir
 from me2e_compress.base.display import join_names, plural
 from me2e_compress.base.errors import FramesError
 from me2e_compress.graph.nodes import FLOATS, grid_of, reads_of
+from me2e_compress.operators.kernels.kernel import BINS, LEAST_EXPONENT
 from me2e_compress.runtime.frames import Array
 from me2e_compress.runtime.probing import READINGS, Probe, insert_probes
 from me2e_compress.runtime.providers import Provider
 from me2e_compress.runtime.session import Session
-
-BINS = 2048
-"""Bins of a histogram of magnitudes, from 0 to the next power of two: at least 1,024 of
-them in use, 8 for each of the 127 int8 steps. (TensorRT divides the range up to the
-largest magnitude into 2,048, onnxruntime's percentile each side of zero.)"""
-
-_LEAST_EXPONENT = -100
-"""Least exponent of a histogram: below, float32 cannot hold bins per unit."""
 
 ALL_ZERO, NOT_FINITE = 0, -1
 """Checksums of an array of zeros, and of one with NaN or infinity."""
@@ -105,8 +98,8 @@ class Statistics:
 
     @property
     def exponents(self) -> npt.NDArray[np.int64]:
-        """The least e for which 2^e exceeds the reach: int64 [tensors]."""
-        return np.maximum(np.frexp(self.reach)[1], _LEAST_EXPONENT).astype(np.int64)
+        """The least e for which 2^e exceeds all magnitudes: int64 [tensors]."""
+        return exponents_of(self.measured).max(axis=0, initial=LEAST_EXPONENT)
 
     def histograms(self) -> npt.NDArray[np.int64]:
         """Return the histograms; FramesError if none were collected."""
@@ -116,6 +109,30 @@ class Statistics:
                 " that needs them"
             )
         return self.counts
+
+
+def exponents_of(measured: Floats) -> npt.NDArray[np.int64]:
+    """Return the least e for which 2^e exceeds each reach: int64 [...] of [..., 3]."""
+    reach = np.abs(measured[..., :2]).max(axis=-1)
+    reach = np.where(is_empty(measured), np.float32(0), reach)
+    return np.maximum(np.frexp(reach)[1], LEAST_EXPONENT).astype(np.int64)
+
+
+def rebinned(
+    counts: npt.NDArray[np.int64], octaves: npt.NDArray[np.int64]
+) -> npt.NDArray[np.int64]:
+    """Return histograms over a range that is 2^octaves as wide, with as many bins.
+
+    Each bin is the sum of 2^octaves bins of ``counts``, int64 [tensors, BINS];
+    ``octaves`` is int64 [tensors], not negative.
+    """
+    merged = np.minimum(1 << np.minimum(octaves, 62), BINS)
+    wider = np.zeros_like(counts)
+    for width in np.unique(merged).tolist():
+        rows = merged == width
+        sums = counts[rows].reshape(-1, BINS // width, width).sum(axis=2)
+        wider[rows, : BINS // width] = sums
+    return wider
 
 
 def checksum(array: Array) -> int:

@@ -123,6 +123,7 @@ OPERATORS: Registry[Operator] = Registry(
             f"{_HERE}.deformable_convolution:DeformableConvolution"
         ),
         "winograd-convolution": f"{_HERE}.winograd_convolution:WinogradConvolution",
+        "histogram": f"{_HERE}.histogram:Histogram",
     },
 )
 

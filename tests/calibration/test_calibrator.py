@@ -200,7 +200,7 @@ def folder(tmp_path: Path) -> Path:
     return record(tmp_path / "frames", [image(seed) for seed in range(6)], (0, 4))
 
 
-@pytest.mark.parametrize("after", [1, 4, 6, 7, 11])
+@pytest.mark.parametrize("after", [1, 2, 3, 4, 5])
 def test_a_killed_calibration_goes_on_where_it_was(
     folder: Path, tmp_path: Path, after: int
 ) -> None:
@@ -210,7 +210,7 @@ def test_a_killed_calibration_goes_on_where_it_was(
     with pytest.raises(KeyboardInterrupt):
         calibrator.collect(model, FOUR, Killed(folder, after))
 
-    rest = Killed(folder, 12 - after + after % 2)
+    rest = Killed(folder, 6 - after + after % 2)
     seen = calibrator.collect(model, FOUR, rest)
 
     whole = Calibrator("mse", threads=1).collect(model, FOUR, CalibrationSet(folder))

@@ -133,6 +133,16 @@ def winograd(dialect: Dialect, random: Random) -> Drawn:
     ), {"pads": pads, "relu": int(random.integers(2))}
 
 
+def histogram(dialect: Dialect, random: Random) -> Drawn:
+    """Draw numbers with a reach at, below or above a power of two, or none at all."""
+    values = random.normal(size=random.integers(0, 400)) * 10 ** random.normal(0, 20)
+    if random.integers(2):
+        values = np.ldexp(1.0, random.integers(-130, 127, values.size))
+    values = np.append(values, 0).astype(np.float32)
+    low, high = (np.asarray(each) for each in (values.min(), values.max()))
+    return {"X": values, "low": low, "high": high}, {}
+
+
 DRAWS: dict[str, Callable[[Dialect, Random], Drawn]] = {
     "deformable-aggregation": aggregation,
     "rotate": rotate,
@@ -144,4 +154,5 @@ DRAWS: dict[str, Callable[[Dialect, Random], Drawn]] = {
     "multi-head-attention": attention,
     "deformable-convolution": convolution,
     "winograd-convolution": winograd,
+    "histogram": histogram,
 }

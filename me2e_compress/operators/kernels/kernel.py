@@ -48,6 +48,13 @@ _RAW = (
     *_DEFORMABLE[2:],
 )
 
+BINS = 2048
+"""Bins of a histogram of magnitudes, from 0 to the next power of two: at least 1,024 of
+them in use, 8 for each of the 127 int8 steps. (TensorRT divides the range up to the
+largest magnitude into 2,048, onnxruntime's percentile each side of zero.)"""
+LEAST_EXPONENT = -100
+"""Of that power: below, float32 cannot hold bins per unit."""
+
 ATTENTION = "MultiHeadAttention"
 WIDEST_HEAD = 256
 """Channels of a head at most, for attention."""
@@ -88,6 +95,12 @@ KERNELS = (
         "winograd_kernel",
         (FLOAT, FLOAT, FLOAT, INT64),
         _WINOGRAD,
+    ),
+    CompiledKernel(
+        "Histogram",
+        "histogram_kernel",
+        (FLOAT, FLOAT, FLOAT),
+        ("the inputs must be of rank 1, 0 and 0",),
     ),
 )
 """All compiled kernels."""
