@@ -135,7 +135,7 @@ def winograd(dialect: Dialect, random: Random) -> Drawn:
 
 def histogram(dialect: Dialect, random: Random) -> Drawn:
     """Draw numbers with a reach at, below or above a power of two, or none at all."""
-    values = random.normal(size=random.integers(0, 400)) * 10 ** random.normal(0, 20)
+    values = random.normal(size=random.integers(0, 400)) * 10 ** random.uniform(-35, 35)
     if random.integers(2):
         values = np.ldexp(1.0, random.integers(-130, 127, values.size))
     values = np.append(values, 0).astype(np.float32)
