@@ -17,6 +17,7 @@ from me2e_compress.graph.nodes import bodies_of, draws, reads_of
 from me2e_compress.manager import pieces
 from me2e_compress.manager.report import Verification
 from me2e_compress.manager.verification_inputs import (
+    NUDGES,
     TOLERANCES,
     Outputs,
     VerificationInputs,
@@ -27,8 +28,6 @@ from me2e_compress.manager.verification_inputs import (
 from me2e_compress.runtime.frames import Frames
 from me2e_compress.runtime.session import Session, replay, run_once
 
-NUDGES = 3
-"""How often inputs are nudged to see what rounding alone does to an output."""
 _BODY = "body"
 """Domain in which a body is run: no kernel is registered for it."""
 
@@ -73,6 +72,18 @@ def _verify_outputs(
     inputs: VerificationInputs,
 ) -> Verification:
     """Compare the outputs alone, by the steps of :func:`verify`."""
+    # Behind a quantizer outputs differ by whole steps: begin with the pieces there
+    steps = pieces.steps_after_changes(before, after)
+    begin = any(step.op_type == "QuantizeLinear" for step in steps)
+    result = Verification(
+        passes, inputs.kind, {}, {},
+        random=random_outputs(before), sizes=tuple(map(dict, inputs.sizes)),
+    )  # fmt: skip
+    proven, breach = None, False
+    if begin:
+        proven, breach = _verify_pieces(result, before, after, inputs, steps)
+        if proven is not None:
+            return proven
     # At the runtime's full level; a session is freed before the next one opens
     left = list(inputs.run(before))
     allowed = tolerances(left[0])
@@ -80,16 +91,14 @@ def _verify_outputs(
         gaps = relative_errors(left, inputs.run(after))
     except GraphError:
         gaps = dict.fromkeys(left[0], float("inf"))
-    result = Verification(
-        passes, inputs.kind, gaps, allowed,
-        random=random_outputs(before), sizes=tuple(map(dict, inputs.sizes)),
-    )  # fmt: skip
+    result = dataclasses.replace(result, errors=gaps, tolerances=allowed)
     if result.passed:
         return result
     # Piece by piece, then without what rounding alone moves as far
-    proven, breach = _verify_pieces(result, before, after, inputs)
-    if proven is not None:
-        return proven
+    if steps and not begin:
+        proven, breach = _verify_pieces(result, before, after, inputs, steps)
+        if proven is not None:
+            return proven
     apart = {name: gaps[name] for name in result.judged if gaps[name] > allowed[name]}
     unsteady = unsteady_outputs(before, left, inputs, apart)
     steady = dataclasses.replace(result, unsteady=unsteady)
@@ -139,7 +148,11 @@ def unsteady_outputs(
 
 
 def _verify_pieces(
-    result: Verification, before: ir.Model, after: ir.Model, inputs: VerificationInputs
+    result: Verification,
+    before: ir.Model,
+    after: ir.Model,
+    inputs: VerificationInputs,
+    steps: Sequence[pieces.Jump],
 ) -> tuple[Verification | None, bool]:
     """Compare the pieces between steps: return a proof, or None and whether one breaks.
 
@@ -147,27 +160,17 @@ def _verify_pieces(
     rounding moves the outputs after it. What rounding moves as far within its piece is
     unsteady; where every operand of a step is, nothing is proven.
     """
-    steps = pieces.steps_after_changes(before, after)
-    if not steps:
-        return None, False
     operands = list(pieces.operand_names(steps).values())
     try:
-        gaps, limits = pieces.piece_errors(before, after, steps, inputs)
-        limits = result.tolerances | limits
-        apart = [n for n in (*result.judged, *operands) if gaps[n] > limits[n]]
-        # Inputs and weights of the first graph, changed in their last places
-        wrong = apart
-        for seed in range(NUDGES if apart else 0):
-            nudged = pieces.nudged_weights(before, seed), inputs.nudged(seed)
-            trial, _ = pieces.piece_errors(before, nudged[0], steps, inputs, nudged[1])
-            wrong = [name for name in wrong if gaps[name] > trial[name]]
-            if not wrong:
-                break
+        measured = pieces.piece_errors(before, after, steps, inputs)
     except (FramesError, GraphError):
         return None, False
+    gaps, limits = measured.gaps, measured.limits
+    apart = [name for name in measured.apart if name not in result.random]
     steady = [name for name in operands if name not in apart]
+    wrong = bool({*measured.wrong} & {*apart})
     if wrong or not steady:
-        return None, bool(wrong)
+        return None, wrong
     worst, unsteady = max(steady, key=gaps.__getitem__), len(operands) - len(steady)
     remark = (
         "compared piece by piece, since behind a quantizer or a choice rounding"
@@ -179,8 +182,9 @@ def _verify_pieces(
     )
     proof = dataclasses.replace(
         result,
-        errors={name: gaps[name] for name in gaps if name not in operands},
-        unsteady=tuple(name for name in result.judged if name in apart),
+        errors={name: gap for name, gap in gaps.items() if name not in operands},
+        tolerances={n: limit for n, limit in limits.items() if n not in operands},
+        unsteady=tuple(name for name in apart if name not in operands),
         remarks=(remark,),
     )
     return proof, False

@@ -9,6 +9,7 @@ tolerances of outputs.
 """
 
 import dataclasses
+import functools
 from collections.abc import Mapping, Sequence
 from typing import TypeAlias
 
@@ -26,12 +27,15 @@ from me2e_compress.graph.nodes import (
 from me2e_compress.graph.provenance import is_same
 from me2e_compress.graph.rewrite import sweep
 from me2e_compress.manager.verification_inputs import (
-    TOLERANCES,
+    NUDGES,
+    Outputs,
     VerificationInputs,
     nudge,
     relative_error,
+    tensors_of,
+    tolerances,
 )
-from me2e_compress.runtime.frames import Array
+from me2e_compress.runtime.frames import Array, Frame
 from me2e_compress.runtime.session import Session
 
 STEPS = frozenset(
@@ -54,6 +58,7 @@ class Jump:
     ``operands`` are the places of those inputs that are not one constant in both.
     """
 
+    op_type: str
     outputs: tuple[str, ...]
     operands: tuple[int, ...]
 
@@ -71,46 +76,89 @@ def operand_names(steps: Sequence[Jump]) -> dict[str, str]:
     }
 
 
+@dataclasses.dataclass(frozen=True)
+class PieceErrors:
+    """How far two graphs are apart, over all frames, by output and by operand.
+
+    Attributes:
+        gaps: of the second graph.
+        limits: what is allowed, by dtype.
+        rounding: what the first graph gives for inputs and weights that were changed
+            in their last places; only where a gap was beyond its limit.
+    """
+
+    gaps: Errors
+    limits: Errors
+    rounding: Errors
+
+    @property
+    def apart(self) -> list[str]:
+        """What differs by more than its limit."""
+        return [name for name, gap in self.gaps.items() if gap > self.limits[name]]
+
+    @property
+    def wrong(self) -> list[str]:
+        """What differs by more than rounding moves it, too."""
+        return [n for n in self.apart if self.gaps[n] > self.rounding.get(n, 0.0)]
+
+
 def piece_errors(
-    before: ir.Model,
-    other: ir.Model,
-    steps: Sequence[Jump],
-    inputs: VerificationInputs,
-    others: VerificationInputs | None = None,
-) -> tuple[Errors, Errors]:
+    before: ir.Model, after: ir.Model, steps: Sequence[Jump], inputs: VerificationInputs
+) -> PieceErrors:
     """Run a graph, and another on what its steps gave; nodes run as they stand.
 
-    Recurrent state, too, is that of the first. ``others`` are inputs of the other
-    graph; None gives both the same. Returns the largest errors over all frames, and how
-    large those of operands may be, by their dtypes.
+    Recurrent state, too, is that of the first. Each frame runs once through each graph,
+    and up to `NUDGES` times through the first one nudged, if something is apart.
 
     Raises:
         GraphError: onnxruntime cannot run one.
     """
-    names = operand_names(steps)
-    errors, allowed = Errors(), Errors()
-    session = Session(
-        _substitute(other, steps),
-        optimize=False,
-        release=True,
-        provider=inputs.provider,
+    open_session = functools.partial(
+        Session, optimize=False, release=True, provider=inputs.provider
     )
+    first, second = (
+        open_session(model)
+        for model in (_expose(before, steps), _substitute(after, steps))
+    )
+    errors = PieceErrors({}, {}, {})
+    nudged: dict[int, tuple[Session, Sequence[Frame]]] = {}
     state: Mapping[str, Array] = {}
-    answers = inputs.run(_expose(before, steps), optimize=False)
-    for frame, left in zip((others or inputs).frames, answers, strict=True):
-        # A frame, and state and answers of the first graph
+    for place, frame in enumerate(inputs.frames):
+        # What the first graph makes of the frame
         if frame.starts_scene:
-            state = session.first_state(frame.arrays)
-        given = {name: left[name] for name in left if name in session.inputs}
-        right = session.run({**frame.arrays, **state, **given})
-        for name, value in right.items():
-            called = names.get(name, name)
-            error = relative_error(left[name], value)
-            errors[called] = max(errors.get(called, 0.0), error)
-            if name in names:
-                allowed[called] = TOLERANCES.get(value.dtype.name, 0.0)
-        state = {name: left[answer] for name, answer in session.recurrent.items()}
-    return errors, allowed
+            state = first.first_state(frame.arrays)
+        left = tensors_of(first.run({**frame.arrays, **state}))
+        fixed = {**state, **{k: v for k, v in left.items() if k in second.inputs}}
+        # What the second does, and what rounding alone does
+        right = second.run({**frame.arrays, **fixed})
+        _add_errors(errors.gaps, left, right, steps)
+        allowed = zip(_called(right, steps), tolerances(right).values(), strict=True)
+        errors.limits.update(allowed)
+        for seed in range(NUDGES):
+            if not errors.wrong:
+                break
+            if seed not in nudged:
+                moved = _substitute(nudged_weights(before, seed), steps)
+                nudged[seed] = open_session(moved), inputs.nudged(seed).frames
+            session, frames = nudged[seed]
+            right = session.run({**frames[place].arrays, **fixed})
+            _add_errors(errors.rounding, left, right, steps)
+        state = {name: left[answer] for name, answer in first.recurrent.items()}
+    return errors
+
+
+def _called(outputs: Outputs, steps: Sequence[Jump]) -> list[str]:
+    """Return what messages call each output of a graph with operands of steps."""
+    names = operand_names(steps)
+    return [names.get(name, name) for name in outputs]
+
+
+def _add_errors(
+    errors: Errors, left: Outputs, right: Outputs, steps: Sequence[Jump]
+) -> None:
+    """Raise errors to those of a frame: max|a-b|/max|a| of what ``right`` holds."""
+    for (name, value), called in zip(right.items(), _called(right, steps), strict=True):
+        errors[called] = max(errors.get(called, 0.0), relative_error(left[name], value))
 
 
 def nudged_weights(model: ir.Model, seed: int) -> ir.Model:
@@ -139,7 +187,7 @@ def steps_after_changes(before: ir.Model, after: ir.Model) -> tuple[Jump, ...]:
             if operands is not None:
                 if moved or _reads_differ(twin, node):
                     outputs = tuple(str(v.name) for v in node.outputs if v.name)
-                    steps.append(Jump(outputs, operands))
+                    steps.append(Jump(node.op_type, outputs, operands))
                 continue
         if moved or twin is None or not alike or _reads_differ(twin, node):
             changed.update(node.outputs)

@@ -28,6 +28,8 @@ other dtype must be equal."""
 
 NUDGE_ULPS = 4
 """Units in the last place by which inputs are nudged."""
+NUDGES = 3
+"""How often inputs are nudged to see what rounding alone does to an output."""
 SIZE_TRIALS = 2
 """Number of sizes at which a graph with open dimensions is run."""
 DISTINCT_SIZES = (2, 3, 5, 7, 11, 13)
@@ -108,11 +110,7 @@ class VerificationInputs:
         session = Session(
             model, optimize=optimize, release=True, provider=self.provider
         )
-        for outputs in replay(session, self.frames):
-            for name, value in outputs.items():
-                if not isinstance(value, np.ndarray):
-                    raise GraphError(f"output {name} is no tensor: not compared")
-            yield detached(outputs)
+        yield from map(tensors_of, replay(session, self.frames))
 
     def nudged(self, seed: int) -> "VerificationInputs":
         """Move every float of the inputs by a few units in its last place."""
@@ -124,6 +122,14 @@ class VerificationInputs:
             for frame in self.frames
         ]
         return dataclasses.replace(self, frames=frames)
+
+
+def tensors_of(outputs: Outputs) -> Outputs:
+    """Return copies of what a session gave; a GraphError for what is no tensor."""
+    for name, value in outputs.items():
+        if not isinstance(value, np.ndarray):
+            raise GraphError(f"output {name} is no tensor: not compared")
+    return detached(outputs)
 
 
 def resize_as(model: ir.Model, other: ir.Model) -> ir.Model:
