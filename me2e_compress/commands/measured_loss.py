@@ -199,7 +199,7 @@ def split_frames(
         return SplitFrames(recording, measured, PERHAPS_SHARED)
     if len(recording) == 1:
         return SplitFrames(calibration, measured, SHARED)
-    seen = spread(calibration, len(measured), run)
+    seen = spread(calibration, most, run)
     return SplitFrames(calibration, measured, KEPT_OUT, seen=seen)
 
 

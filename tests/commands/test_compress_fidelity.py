@@ -133,7 +133,7 @@ def test_the_report_holds_the_measurement_and_the_command(
     told = json.loads((cameras / "out.report.json").read_text())
     assert told["fidelity"]["on"] == "kept out of calibration"
     fidelity = told["fidelity"]["fidelity"]
-    assert (fidelity["frames"], fidelity["seen"]) == (3, 3)
+    assert (fidelity["frames"], fidelity["seen"]) == (3, 5)
     assert told["fidelity"]["guilty"] == ["quantize-int8"]
     assert told["fidelity"]["advice"] == ADVICE
     floor = {"sqnr_db": 20.0, "plan_m": 0.5}
