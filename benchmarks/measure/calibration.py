@@ -6,9 +6,9 @@
         --only max-min --limit-gb 6            a long calibration within 6 GB
 
 For each model, after the exact passes, over the same frames on the same threads: plain
-inference and our calibration, with onnxruntime's optimizations and without; our second
-pass of histograms; onnxruntime's MinMax and Entropy; ModelOpt (which places QDQ in the
-same call), where PYTHON has it. CPU seconds and peak memory count loading the model,
+inference and our calibration, with onnxruntime's optimizations and without, and with
+histograms; onnxruntime's MinMax and Entropy; ModelOpt (which places QDQ in the same
+call), where PYTHON has it. CPU seconds and peak memory count loading the model,
 not importing packages. A process that takes more than --limit-gb, or leaves the
 machine less than 2 GB, is stopped, and the row says so.
 Where both run the nodes as they stand and the model has no state, the ranges are held
