@@ -185,11 +185,20 @@ def first_bad_node(
     """
     made = [value for node in model.graph for value in node.outputs]
     floats = [str(value.name) for value in made if value.dtype in FLOATS]
-    probed = insert_probes(model, floats, probe)
-    session = Session(probed, optimize=False, provider=provider)
-    readings = session.run(inputs, [READINGS])[READINGS].astype(np.float32)
-    bad = is_not_finite(readings.reshape(len(floats), -1))
-    names = {name for name, each in zip(floats, bad, strict=True) if each}
+
+    def not_finite(tensors: Sequence[str]) -> set[str]:
+        probed = insert_probes(model, tensors, probe)
+        # Every tensor is freed as soon as it is read
+        session = Session(probed, optimize=False, frugal=True, provider=provider)
+        readings = session.run(inputs, [READINGS])[READINGS].astype(np.float32)
+        bad = is_not_finite(readings.reshape(len(tensors), -1))
+        return {name for name, each in zip(tensors, bad, strict=True) if each}
+
+    # Only where something read is not finite, look at every tensor
+    watched = [name for name in floats if name in read]
+    if not watched or not not_finite(watched):
+        return ""
+    names = not_finite(floats)
     ends = {*read} & names
     for node in reversed(model.graph):
         if any(value.name in ends for value in node.outputs):

@@ -1,20 +1,23 @@
 import dataclasses
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
+import onnx_ir as ir
 import pytest
 from onnxruntime.quantization import calibrate as peer
 
 from me2e_compress import graph
 from me2e_compress.base.errors import FramesError, GraphError, RecipeError
-from me2e_compress.calibration.calibrator import Calibrator
+from me2e_compress.calibration import statistics
+from me2e_compress.calibration.calibrator import Calibrator, Extremes
 from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.calibration.observers import OBSERVERS
 from me2e_compress.calibration.ranges import Ranges
 from me2e_compress.calibration.statistics import Statistics
 from me2e_compress.runtime.frames import Array, Frame
+from me2e_compress.runtime.probing import Probe
 from me2e_compress.runtime.providers import CPU, CpuProvider, Provider
 from me2e_compress.runtime.session import Session, replay
 from tests.support.frames import record
@@ -280,6 +283,23 @@ def test_a_file_that_is_no_checkpoint_is_refused(folder: Path, tmp_path: Path) -
         Calibrator(threads=1, checkpoint=path).collect(
             conv_attention(), FOUR, CalibrationSet(folder)
         )
+
+
+def test_where_all_that_is_read_is_finite_no_other_tensor_is_looked_at(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """To look at all of VAD-tiny's took 15 GB."""
+    asked, whole = list[int](), statistics.insert_probes
+
+    def counted(model: ir.Model, tensors: Sequence[str], probe: Probe) -> ir.Model:
+        asked.append(len(tensors))
+        return whole(model, tensors, probe)
+
+    monkeypatch.setattr(statistics, "insert_probes", counted)
+    model, probe = conv_attention(), Extremes()
+
+    assert not statistics.first_bad_node(model, image(0), {FOUR[1]}, probe, CPU)
+    assert asked == [1]
 
 
 # A tensor that has no element on some frames, as what is detected often has.
