@@ -297,8 +297,9 @@ def test_where_all_that_is_read_is_finite_no_other_tensor_is_looked_at(
 
     monkeypatch.setattr(statistics, "insert_probes", counted)
     model, probe = conv_attention(), Extremes()
+    inputs = {**image(0), **Session(model).first_state(image(0))}
 
-    assert not statistics.first_bad_node(model, image(0), {FOUR[1]}, probe, CPU)
+    assert not statistics.first_bad_node(model, inputs, {FOUR[1]}, probe, CPU)
     assert asked == [1]
 
 
