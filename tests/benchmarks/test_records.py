@@ -12,10 +12,8 @@ import pytest
 
 from benchmarks.measure.intervals import (
     KeptDrive,
-    coverage,
     intra_type_correlation,
     kept_drives,
-    told,
 )
 from benchmarks.measure.road import drives_of, means_of
 from benchmarks.paper.drives import KeptFacts
@@ -127,11 +125,6 @@ def test_every_interval_of_a_page_is_that_of_the_kept_drives() -> None:
     assert sorted(each for each in alone if each[1] not in ends) == []
 
 
-def test_an_interval_that_the_drives_do_not_give_is_seen() -> None:
-    assert (74.6, 70.6, 78.4) not in known()
-    assert {(74.6, 70.7, 78.4), (74.6, 68.8, 80.2)} < known()
-
-
 def test_the_usual_scatter_is_that_of_the_int8_forms() -> None:
     forms = ("feature-ext", "prediction", "full")
     float_ = paper("float.fps-10")
@@ -188,28 +181,3 @@ def test_the_correlation_by_hand() -> None:
     rows = [("a", 1.0), ("a", 3.0), ("b", 5.0), ("b", 7.0)]
 
     assert intra_type_correlation(rows) == pytest.approx(7 / 9)
-
-
-@pytest.mark.parametrize(
-    ("routes", "measured"),
-    [
-        ("Merge_0 Merge_1 Exit_0 Exit_1", True),
-        ("Merge_R2_0 Exit_R2_0", False),  # one of each
-        ("Merge_0 Merge_1 Exit_0", False),  # one of a type
-        ("Merge_0 Merge_1", False),
-    ],
-)
-def test_a_correlation_that_is_not_measured_is_left_out(
-    routes: str, measured: bool
-) -> None:
-    scores = {route: (10.0 * at, 0.0) for at, route in enumerate(routes.split())}
-    drive = KeptDrive(scores)
-
-    assert (drive.correlation is not None) is measured
-    assert ("correlation" in told(drive)) is measured
-    assert "nan" not in told(drive)
-    assert "types anew" not in told(drive)  # of two types
-
-
-def test_a_few_sets_are_counted() -> None:
-    assert all(0.0 <= share <= 1.0 for share in coverage(0.3, 3, seed=1).values())

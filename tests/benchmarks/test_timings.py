@@ -1,28 +1,22 @@
 """What is timed answers right; what is missing is said, and what is done is kept."""
 
 import argparse
-import json
 import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import onnxruntime as ort
 import pytest
 import torch
 
 from benchmarks.measure.energy import COUNTER, FRAMES_MS, conditions, held
-from benchmarks.measure.gpu import ROWS, Bench, provider_or_reason
-from benchmarks.measure.int8_shapes import FORMS as INT8_FORMS
-from benchmarks.measure.int8_shapes import Convolution, product, session
+from benchmarks.measure.gpu import ROWS, Bench
 from benchmarks.subjects.original_patterns import FORMS, restored
 from benchmarks.subjects.runtime_files import REFERENCE
 from benchmarks.subjects.subject import Subject
-from benchmarks.tools.gpu_table import Found
 from benchmarks.tools.gpu_table import table as gpu_table
 from me2e_compress.runtime.energy.energy_counter import EnergySchedule
-from me2e_compress.runtime.providers import CPU, CpuProvider
+from me2e_compress.runtime.providers import CPU
 from models.tests.vad.sizes import SIZES
 from models.vad.stack import VadTiny
 from tests.support.frames import record
@@ -65,33 +59,6 @@ def test_a_row_is_measured_once(
     assert [each.strip() for each in cells[-4:-1]] == ["∞", "∞", "-"]
 
 
-def test_a_provider_that_is_missing_is_a_row_that_says_what_to_install(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setattr(ort, "get_available_providers", lambda: [CpuProvider.native])
-
-    reason = provider_or_reason("tensorrt")
-
-    assert isinstance(reason, str)
-    shown = gpu_table([Found("highway", "tensorrt", "every file", reason)])
-    assert "pip install onnxruntime-gpu, and TensorRT 10" in shown
-
-
-@pytest.mark.slow
-def test_the_driver_on_the_cpu(tmp_path: Path) -> None:
-    words = "--providers cpu --subjects highway --frames 2 --runs 5 --warm-up 1"
-    command = [sys.executable, "-m", "benchmarks.measure.gpu", str(tmp_path)]
-
-    subprocess.run(
-        [*command, "--no-energy", *words.split()], check=True, capture_output=True
-    )
-
-    rows = json.loads((tmp_path / "results.json").read_text())["rows"]
-    names = [name for name, row in ROWS.items() if not row.on]
-    assert [(each["name"], each["reason"]) for each in rows] == [(n, "") for n in names]
-    assert "## highway" in (tmp_path / "table.md").read_text()
-
-
 def test_intervals_of_energy_hold_the_truth() -> None:
     """Of two thousand measurements on simulated counters, but for frames of 5 ms."""
     frames = [frame_ms for frame_ms in FRAMES_MS if frame_ms > 5]
@@ -105,20 +72,6 @@ def test_intervals_of_energy_hold_the_truth() -> None:
     assert 0.93 <= np.mean([each.mean for each in found]) <= 0.98
     assert min(each.taken for each in found) >= 0.87  # 84 of 95 %: 3 deviations
     assert np.median([each.width for each in found]) <= 0.1
-
-
-def test_layers_run_in_every_form_with_their_own_macs() -> None:
-    layer = Convolution("strided", 2, 6, 4, 8, 16, kernel=3, stride=2)
-    pixels = np.ones((2, 6, 4, 8), np.uint8)
-
-    found: Any = session(layer.text(), (16, 8, 3, 3), 0).run(None, {"x": pixels})[0]
-
-    assert found.shape == (2, 3, 2, 16)
-    assert layer.macs == found.size * 8 * 9
-    for form in INT8_FORMS:
-        rows = np.ones((5, 8), np.uint8)
-        answer: Any = product(form, 5, (8, 16)).run(None, {"x": rows})[0]
-        assert answer.shape == (5, 16)
 
 
 def test_the_forms_of_the_original_compute_what_those_of_models_do() -> None:

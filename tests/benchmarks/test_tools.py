@@ -1,9 +1,7 @@
 """Tools of the project: mutations of the code, files entered, files written."""
 
-import hashlib
 import importlib
 import json
-import subprocess
 import sys
 from pathlib import Path
 
@@ -12,42 +10,10 @@ import pytest
 from benchmarks.subjects import seven_nodes
 from benchmarks.tools import replay, written_files
 from benchmarks.tools.files_entered import Entered
-from benchmarks.tools.masks import MASKS, Mask, masked, masked_name
-from benchmarks.tools.mutate import Fate, main, run, table
-from benchmarks.tools.mutations import mutations
+from benchmarks.tools.masks import masked
+from benchmarks.tools.mutate import main
 from benchmarks.tools.written_files import differences, manifest
 from tests.support.command import Cli
-
-
-@pytest.mark.parametrize(
-    ("source", "changed"),
-    [
-        ("a = b < c", ["a = (b <= c)"]),
-        ("a = b is None", ["a = (b is not None)"]),
-        ("a = b and c and d", ["a = (b or c or d)"]),
-        ("a = b + c * d", ["a = (b - c * d)", "a = b + (c / d)"]),
-        ("a = 'text' + b", []),
-        ("a = f'{b + 1}'", []),
-        ("a: Literal[1] = True", ["a: Literal[1] = (False)"]),
-        ("a = 2.5, None, ''", ["a = (6.0), None, ''"]),
-        ("if TYPE_CHECKING:\n    a = 1", []),
-        ("if a == b:\n    c()", ["if (a != b):\n    c()", "if a == b:\n    pass"]),
-        ("a = b if c else d", ["a = b if (not (c)) else d"]),
-        ("a = [b for b in c if b]", ["a = [b for b in c if (not (b))]"]),
-        ("assert a > 1", []),
-        ("def f():\n    '''1 < 2'''\n    return a, b, 'µ'",
-         ["def f():\n    '''1 < 2'''\n    return (b, a, 'µ')"]),
-        ("def f():\n    return a, a", []),
-        ("a.b = c\nd = e\ndel a[f]", ["pass\nd = e\ndel a[f]", "a.b = c\nd = e\npass"]),
-        ("a -= b", ["pass"]),
-        ("'µ' if a(\n) else 1; b = 1",
-         ["'µ' if (not (a())\n) else 1; b = 1", "'µ' if a(\n) else (2); b = 1",
-          "'µ' if a(\n) else 1; b = (2)"]),
-    ],
-)  # fmt: skip
-def test_every_single_change(source: str, changed: list[str]) -> None:
-    raw = source.encode()
-    assert [m.applied(raw).decode() for m in mutations(Path("a.py"), raw)] == changed
 
 
 @pytest.fixture
@@ -83,31 +49,6 @@ def test_what_survives_is_told(
         "2 changes: killed 1, survived 1, timed out 0; 50 % killed",
     ]
     assert toy.read_bytes() == before
-
-
-def test_tests_that_fail_anyway_or_are_not_there_prove_nothing(
-    toy: Path, tmp_path: Path
-) -> None:
-    toy.write_text("def positive(x):\n    return x\n")
-    with pytest.raises(SystemExit, match="tests/room: fails without any change"):
-        main(WORDS, tmp_path)
-    (tmp_path / "tests/room/test_sign.py").unlink()
-    with pytest.raises(SystemExit, match="tests/room: no tests"):
-        main(WORDS, tmp_path)
-
-
-def test_what_takes_too_long_is_ended(tmp_path: Path) -> None:
-    with pytest.raises(subprocess.TimeoutExpired):
-        run((sys.executable, "-c", "while True: pass"), tmp_path, 0.2, {})
-
-
-def test_the_table_ends_with_the_share() -> None:
-    (change,) = mutations(Path("a.py"), b"a = 1")
-
-    assert list(table([(change, Fate.KILLED)] * 3 + [(change, Fate.TIMED_OUT)])) == [
-        "timed out  a.py:1: 1  ->  2",
-        "4 changes: killed 3, survived 0, timed out 1; 75 % killed",
-    ]
 
 
 TRIP = {
@@ -244,34 +185,6 @@ def test_clock_versions_machine_and_paths_are_hidden_and_all_else_shows(
     tmp_path: Path, same: bool, file: str, one: str, other: str
 ) -> None:
     assert (seen(tmp_path, file, one) == seen(tmp_path, file, other)) is same
-
-
-@pytest.mark.parametrize("mask", MASKS, ids=lambda mask: f"{mask.name} {mask.files}")
-def test_a_mask_has_an_example(mask: Mask) -> None:
-    assert any(mask.hide(file, one) != one for file, one, _ in VARY)
-
-
-def route(folder: Path, version: str, fingerprint: str | None = None) -> bytes:
-    """Write an evaluation and a route of it, sealed unless a fingerprint is given."""
-    made_by = {"version": version, "policy": "expert"}
-    seal = hashlib.sha256(json.dumps(made_by, sort_keys=True).encode()).hexdigest()
-    seen(folder, "expert/evaluation.json", json.dumps(made_by))
-    text = json.dumps({"fingerprint": fingerprint or seal, "episode": {}})
-    return seen(folder, "expert/routes/A_0.json", text)
-
-
-def test_the_seal_of_a_route_follows_the_version_and_a_wrong_one_shows(
-    tmp_path: Path,
-) -> None:
-    right = route(tmp_path, "0.1.0")
-    assert right == route(tmp_path, "0.2.0")
-    assert right != route(tmp_path, "0.1.0", "0" * 64)
-
-
-def test_the_key_of_a_studys_model_is_hidden_in_its_name_alone() -> None:
-    assert masked_name(KEPT_MODEL) == "out/models/full.<key>.report.json"
-    other = "out/results/full.0123456789abcdef.json"
-    assert masked_name(other) == other
 
 
 class Played(replay.Tree):

@@ -3,7 +3,6 @@
 import hashlib
 import json
 import re
-import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,9 +10,8 @@ import numpy as np
 import pytest
 
 from benchmarks.paper import weigh
-from benchmarks.paper.__main__ import NOTHING, PAGE, main
-from benchmarks.paper.accident import FILE as ACCIDENT
-from benchmarks.paper.accident import Accident, plans_before
+from benchmarks.paper.__main__ import NOTHING, PAGE
+from benchmarks.paper.accident import plans_before
 from benchmarks.paper.evidence import FEWEST_RUNS
 from benchmarks.paper.records import RECORDS, add_facts, read_paper
 from me2e_compress.base.errors import StudyError
@@ -130,25 +128,3 @@ def test_a_study_that_was_driven_is_weighed_and_its_accident_kept(
     times = [each.time_us for each in found.accident.moments]
     assert times == list(range(times[0], times[-1] + 1, 500_000))
     assert plans_before(found.accident).axes[0].lines
-
-
-def test_what_is_no_record_is_named(tmp_path: Path) -> None:
-    (tmp_path / "cut.json").write_text("{}")
-    with pytest.raises(StudyError, match="not an accident"):
-        Accident.load(tmp_path / "cut.json")
-    with pytest.raises(SystemExit, match=r"^benchmarks\.paper: .*: holds no records"):
-        main([str(tmp_path), "-o", str(tmp_path / "page.html")])
-
-
-def test_a_page_is_drawn_of_what_is_kept(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Figures of few drives, and the accident that is kept of the whole study."""
-    study = load_study(PAGE.study, "5")
-    write_records(study, tmp_path)
-    shutil.copyfile(PAGE.kept / ACCIDENT, tmp_path / ACCIDENT)
-    monkeypatch.setattr("benchmarks.paper.__main__.PAGE", replace(PAGE, kept=tmp_path))
-
-    main(["-o", str(tmp_path / "page.html")])
-
-    assert (tmp_path / "page.html").read_text().count("<svg") == 4

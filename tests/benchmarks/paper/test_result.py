@@ -2,17 +2,13 @@
 
 import re
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 
 from benchmarks.paper.__main__ import PAGE
-from benchmarks.paper.drives import Int8Counts, ModelFacts
 from benchmarks.paper.findings import Finding, Verdict
 from benchmarks.paper.records import read_paper
 from benchmarks.paper.result import PaperResult, paper_page
-from benchmarks.paper.weigh import weighed
-from me2e_compress.base.errors import StudyError
 from me2e_compress.metrics.measure import Measure
 from me2e_compress.study import load_study
 from me2e_compress.study.drive_record import DriveRecord
@@ -123,35 +119,6 @@ def test_no_verdict_hangs_on_a_step_that_noise_crosses(result: PaperResult) -> N
     assert clear.verdict is YES
     assert near.verdict is NOT_SHOWN
     assert "a step of equation 4 is at 400" in near.found.notes[0]
-
-
-def test_measured_joules_are_scored_and_multiplied(result: PaperResult) -> None:
-    facts = tuple(replace(each, joules=(2.0, 1.9, 2.1)) for each in result.facts)
-    tables = {
-        each.title.split(":")[0]: each for each in replace(result, facts=facts).tables()
-    }
-
-    five, six = tables["Table 5"], tables["Table 6"]
-
-    assert five.rows[0][five.columns.index("J/frame")].text == "2"
-    assert five.rows[0][five.columns.index("EER_AV")].detail
-    assert six.rows[1][six.columns.index("J/frame x FPS")].text == "20"
-    assert six.rows[1][six.columns.index("W")].reason
-
-
-def test_int8_of_vad_is_counted_beside_the_papers(
-    result: PaperResult, tmp_path: Path
-) -> None:
-    counts = Int8Counts(162, 180, 164)
-    vad = ModelFacts("vad-tiny full", size_bytes=59_612_069, int8=counts)
-    tables = replace(result, facts=(*result.facts, vad)).tables()
-    (four,) = (each for each in tables if each.title.startswith("Table 4"))
-    rows = {row[0].text: [cell.text for cell in row[1:]] for row in four.rows}
-
-    ours, given = ["162", "180", "164", "59.61"], ["VAD", "194", "155", "77", "83.32"]
-    assert rows["vad-tiny full"] == [*ours, *given]
-    with pytest.raises(StudyError, match=r"none of exact, prediction, .* as \.onnx$"):
-        weighed(tmp_path)
 
 
 def test_a_preview_is_named_so_everywhere(result: PaperResult) -> None:
