@@ -346,21 +346,6 @@ def test_histogram_methods_say_that_they_lack_histograms() -> None:
         Percentile().ranges(extremes((0, 1)))
 
 
-@pytest.mark.parametrize(
-    ("text", "canonical"),
-    [
-        ("max-min", "max-min"),
-        ("percentile", "percentile:99.99"),
-        ("percentile:99.9", "percentile:99.9"),
-        ("mse", "mse"),
-    ],
-)
-def test_methods_are_read_from_text(text: str, canonical: str) -> None:
-    method = OBSERVERS.parse(text)
-    assert OBSERVERS.text(method, defaults=True) == canonical
-    assert OBSERVERS.parse(canonical) == method
-
-
 @dataclass(frozen=True)
 class RootMeanSquare(Observer):
     """So many root mean squares to each side."""
