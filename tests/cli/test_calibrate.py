@@ -35,21 +35,6 @@ def write_cache(folder: Path) -> str:
     return (folder / "c").read_text()
 
 
-def test_another_tools_cache_comes_in(cli: Cli, folder: Path) -> None:
-    cli.done(f"{RANGES} -o r.json")
-    write_cache(folder)
-
-    cli.done(f"calibrate dense.onnx --import c {MAP} -o back.json")
-    ours = json.loads((folder / "r.json").read_text())
-    back = json.loads((folder / "back.json").read_text())
-    assert back["method"] == "imported"
-    for name, (low, high) in ours["tensors"].items():
-        reach = max(-low, high)
-        assert back["tensors"][name] == pytest.approx((-reach, reach))
-    for line in ("sensitivity", "search --max-mb 1"):
-        cli.done(f"{line} dense.onnx frames --ranges back.json {MAP} -o r.toml")
-
-
 def test_a_cache_of_tensorrt_10_becomes_an_explicit_graph(
     cli: Cli, tmp_path: Path
 ) -> None:
@@ -127,19 +112,3 @@ def write_net(folder: Path) -> None:
     graph.save(conv_attention(), folder / "m.onnx")
     record(folder / "frames", [image(seed) for seed in range(2)], (0,))
     (folder / "map.toml").write_text(MAP_TEXT)
-
-
-def test_a_graph_that_is_lowered_takes_saved_ranges(cli: Cli, tmp_path: Path) -> None:
-    write_net(tmp_path)
-    (tmp_path / "lower.toml").write_text('[[pass]]\nname = "lower-int8"\n')
-    int8 = f"compress m.onnx --scheme full --target tensorrt --frames frames {MAP}"
-    cli.done(f"{int8} -o int8.onnx")
-
-    lower = f"compress int8.onnx -r lower.toml {MAP} --verify-frames 0"
-    cli.done(f"calibrate int8.onnx frames -r lower.toml {MAP} -o r.json")
-    cli.done(f"{lower} --ranges r.json -o a.onnx")
-    cli.done(f"{lower} --frames frames -o b.onnx")
-
-    one, other = (graph.load(tmp_path / f"{name}.onnx") for name in "ab")
-    assert graph.digest(one) == graph.digest(other)
-    assert "--rules is for int8" in cli.refused(f"{lower} --rules paper -o c.onnx")

@@ -18,7 +18,6 @@ from tests.docs.pages import ROOT
 from tests.support.command import Cli, strict
 from tests.support.installed import install
 from tests.support.nets import parsed, save_text
-from tests.targets.onnxruntime.lowered import MATMUL_RELU
 
 NAMES = sorted(COMMANDS)
 TWIST = (
@@ -84,12 +83,6 @@ def test_a_broken_entry_is_named_and_the_rest_is_shown(
     assert "onnxruntime" in text
 
 
-@pytest.mark.parametrize("target", ["tensorrt", "onnxruntime"])
-def test_a_clean_graph_passes_the_lint(cli: Cli, dense: Path, target: str) -> None:
-    said = cli.done(f"lint dense.onnx --target {target}").out
-    assert f"for {target}: 0 errors, 0 warnings" in said
-
-
 def test_what_would_be_refused_is_listed_and_fails(cli: Cli, tmp_path: Path) -> None:
     graph.save(parsed(TWIST), tmp_path / "twist.onnx")
 
@@ -128,13 +121,6 @@ def test_a_version_refuses_what_came_later(
 
     assert said in done.out
     assert done.code == ("1 error" in said)
-
-
-def test_int8_that_onnxruntime_runs_in_float_is_named(cli: Cli, tmp_path: Path) -> None:
-    graph.save(parsed(MATMUL_RELU), tmp_path / "m.onnx")
-
-    (found,) = cli.document("lint m.onnx --target onnxruntime")["findings"]
-    assert (found["rule"], found["node"]) == ("float-kernel", "/head/fc")
 
 
 def test_trt_check_says_what_was_asked_and_of_whom(cli: Cli, dense: Path) -> None:

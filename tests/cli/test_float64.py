@@ -34,17 +34,6 @@ def double(tmp_path: Path) -> None:
     write_frames(tmp_path / "frames", x=x, g=g)
 
 
-@pytest.mark.parametrize(
-    "line",
-    [
-        "compare double.onnx double.onnx frames",
-        "profile double.onnx frames -o t.json --samples 2",
-    ],
-)
-def test_what_runs_it_says_why_it_cannot(cli: Cli, line: str) -> None:
-    assert cli.refused(line).endswith(NO_KERNEL)
-
-
 def test_its_float32_form_is_what_is_measured_and_compared_and_the_verdict_says_so(
     cli: Cli, tmp_path: Path
 ) -> None:

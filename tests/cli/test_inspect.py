@@ -22,13 +22,6 @@ def test_nodes_are_counted_by_module(cli: Cli, files: Path) -> None:
     assert "3 by scope" in cli.done(IN).out
 
 
-def test_the_checkpoint_is_named(cli: Cli, files: Path) -> None:
-    model = graph.load(files / "in.onnx")
-    model.metadata_props["me2e.weights"] = "vad.pth, epoch 60"
-    graph.save(model, files / "in.onnx")
-    assert "weights: vad.pth, epoch 60" in cli.done(IN).out
-
-
 @pytest.mark.parametrize(
     ("metadata", "said"),
     [

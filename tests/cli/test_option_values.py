@@ -19,6 +19,7 @@ F = "dense.onnx frames --map map.toml"
         f"sensitivity {F} -o out --limit",
         "profile dense.onnx frames -o out --budget-ms",
         "score frames --budget-ms",
+        "compare dense.onnx dense.onnx frames --alive",
     ],
 )
 def test_a_number_that_is_none(cli: Cli, dense: Path, line: str, value: str) -> None:

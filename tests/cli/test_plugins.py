@@ -31,16 +31,6 @@ def plugins(tmp_path: Path) -> Path:
 
 
 @pytest.mark.usefixtures("plugins")
-@pytest.mark.parametrize("name", ["inspect", "plan", "lint"])
-def test_plugins_without_shapes_are_told_of_and_with_them_are_not(
-    cli: Cli, name: str
-) -> None:
-    assert "value_info" in "".join(cli.done(f"{name} bare.onnx").out.split())
-    if name != "lint":
-        assert "value_info" not in "".join(cli.done(f"{name} shaped.onnx").out.split())
-
-
-@pytest.mark.usefixtures("plugins")
 def test_plugins_run_where_nobody_has_their_library(cli: Cli) -> None:
     said = cli.done(
         "compress bare.onnx -r exact -o bare-small.onnx --verify-frames 0"

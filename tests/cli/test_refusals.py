@@ -102,6 +102,7 @@ SEARCH = {
 OTHERS = {
     "export vad-huge -o out.onnx": "vad-huge",
     "compare dense.onnx path.onnx frames": "no tensor in common",
+    "compare dense.onnx dense.onnx frames --float in.onnx": "--float is for --outputs",
     "compare dense.onnx frames --outputs none": "none: no such folder",
     "compare dense.onnx frames --outputs frames": "the dump is of another graph",
     "frames vad-huge -o out": "vad-huge: no such file; models that ship",
