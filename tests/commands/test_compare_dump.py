@@ -100,14 +100,6 @@ def test_a_plan_that_rests_is_dead_though_all_else_is_right(
     assert command("compare", *words, "--alive", "0") == 0
 
 
-def test_a_float_source_without_a_dump_is_refused(
-    command: Command, files: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    model, recorded = str(files / "m.onnx"), str(files / "frames")
-    assert command("compare", model, model, recorded, "--float", model) == 1
-    assert "--float is for --outputs" in capsys.readouterr().err
-
-
 def test_quantization_is_what_the_graph_lost_to_its_source(tmp_path: Path) -> None:
     ir.save(parsed(QUANTIZED), tmp_path / "small.onnx")
     ir.save(parsed(FLOAT), tmp_path / "source.onnx")

@@ -8,15 +8,12 @@ from pathlib import Path
 import pytest
 
 import me2e_compress as me2e
-from me2e_compress.base.atomic import IN_JSON
-from me2e_compress.commands.files import export_stack
 from me2e_compress.commands.result import Result
 from me2e_compress.manager import recipe
 from tests.support.command import Command
 
 Call = Callable[[], object]
 MAP = "map.toml"
-STOP = "VanillaNonSignalizedTurnEncounterStopsign"
 
 CASES: dict[str, tuple[str, Call]] = {
     "compress": (
@@ -27,18 +24,6 @@ CASES: dict[str, tuple[str, Call]] = {
             recipe="full",
             frames="frames",
             options=me2e.CompressOptions(module_map=MAP),
-        ),
-    ),
-    "compress, int8 by options": (
-        "compress dense.onnx -o out.onnx --scheme prediction --target onnxruntime"
-        " --frames frames --map map.toml",
-        lambda: me2e.compress(
-            "dense.onnx",
-            "out.onnx",
-            frames="frames",
-            options=me2e.CompressOptions(
-                scheme="prediction", target="onnxruntime", module_map=MAP
-            ),
         ),
     ),
     "compress, passes": (
@@ -64,18 +49,6 @@ CASES: dict[str, tuple[str, Call]] = {
             options=me2e.PlanOptions(rules="paper", module_map=MAP),
         ),
     ),
-    "compare": (
-        "compare dense.onnx dense.onnx frames",
-        lambda: me2e.compare("dense.onnx", "dense.onnx", "frames"),
-    ),
-    "inspect": (
-        "inspect dense.onnx --map map.toml",
-        lambda: me2e.inspect("dense.onnx", me2e.InspectOptions(module_map=MAP)),
-    ),
-    "lint": (
-        "lint dense.onnx --target onnxruntime",
-        lambda: me2e.lint("dense.onnx", me2e.LintOptions(target="onnxruntime")),
-    ),
     "sensitivity": (
         "sensitivity dense.onnx frames -o s.toml --map map.toml --limit 1",
         lambda: me2e.measure_sensitivity(
@@ -85,16 +58,6 @@ CASES: dict[str, tuple[str, Call]] = {
             me2e.SensitivityOptions(limit=1.0, module_map=MAP),
         ),
     ),
-    "search": (
-        "search dense.onnx frames -o s.toml --map map.toml --max-mb 0.001",
-        lambda: me2e.search(
-            "dense.onnx",
-            "frames",
-            "s.toml",
-            me2e.SearchOptions(max_mb=0.001, module_map=MAP),
-        ),
-    ),
-    "export": ("export highway -o hw.onnx", lambda: export_stack("highway", "hw.onnx")),
     "record_frames": (
         "frames highway -n 1 -o made --seed 3",
         lambda: me2e.record_frames(
@@ -137,35 +100,6 @@ def test_a_workflow_is_silent_and_writes_what_its_command_writes(
     if isinstance(result, Result):
         assert "\n" not in result.headline
         assert result.headline in repr(result)
-
-
-def test_a_profile_is_silent_and_its_trace_may_be_charged(
-    dense: Path, capfd: pytest.CaptureFixture[str]
-) -> None:
-    found = me2e.profile(
-        dense / "dense.onnx",
-        dense / "frames",
-        dense / "trace.json",
-        me2e.ProfileOptions(samples=3),
-    )
-
-    assert capfd.readouterr() == ("", "")
-    written = json.loads((dense / "trace.json").read_text())
-    assert written == IN_JSON | found.trace.to_json()
-    assert len(found.trace.samples_us) == 3
-
-
-@pytest.mark.usefixtures("short")
-def test_results_that_are_there_are_scored_silently(
-    tmp_path: Path, capfd: pytest.CaptureFixture[str]
-) -> None:
-    asked = me2e.EvaluateOptions(routes="ParkedObstacle_R2_0")
-    driven = me2e.evaluate("blind", tmp_path / "results", asked)
-
-    found = me2e.score(tmp_path / "results")
-
-    assert capfd.readouterr() == ("", "")
-    assert found.scores == {str(tmp_path / "results"): driven.scores}
 
 
 def test_who_listens_hears_every_stage(dense: Path) -> None:
