@@ -1,5 +1,4 @@
 import itertools
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,7 +11,6 @@ from me2e_compress.runtime.frames import Frame
 from me2e_compress.runtime.session import replay
 from me2e_compress.simulator.camera_rig import CameraRig
 from me2e_compress.simulator.routes import Route
-from tests.evaluators.highway.drivers import straight_on
 from tests.support.stand_in import write_model
 
 SIZE = (16, 24)
@@ -84,14 +82,6 @@ def test_the_can_bus_counts_since_the_last_frame(seen: list[Frame]) -> None:
             turned = np.radians(now[17])
             apart = (now[16] - before[16] - turned + np.pi) % (2 * np.pi) - np.pi
             assert apart == pytest.approx(0.0, abs=1e-4)
-
-
-def test_a_model_without_images_gets_none(driver: OnnxPolicy, tmp_path: Path) -> None:
-    model = straight_on(tmp_path / "m.onnx", inputs="float[1, 18] can_bus")
-
-    [frame] = driven_frames(OnnxPolicy.open(model), driver, 1, seed=0)
-    [(name, array)] = frame.arrays.items()
-    assert (name, array.shape) == ("can_bus", (1, 18))
 
 
 def test_a_scene_is_the_same_whatever_was_made_before(

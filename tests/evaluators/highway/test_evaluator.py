@@ -1,4 +1,3 @@
-import json
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -6,7 +5,6 @@ from typing import Any
 
 import pytest
 
-from me2e_compress.base.atomic import is_marked
 from me2e_compress.base.errors import EvaluationError
 from me2e_compress.commands.result import Listener
 from me2e_compress.driving.latency import FixedLatency, MeasuredLatency
@@ -48,19 +46,6 @@ def test_the_bytes_do_not_depend_on_the_number_of_workers(tmp_path: Path) -> Non
     assert [episode.route for episode in one] == ["parked", "exit"]
     assert contents(tmp_path / "1") == contents(tmp_path / "2")
     assert len(contents(tmp_path / "1")) == len(routes) + 1
-
-
-def test_wall_clock_times_lie_beside_the_folder(tmp_path: Path) -> None:
-    driven(tmp_path / "results", (PARKED,))
-
-    assert is_marked(tmp_path / "results.log")
-    [line] = (tmp_path / "results.log").read_text().splitlines()
-
-    cost = json.loads(line)
-    assert cost["route"] == "parked"
-    assert cost["seconds"] > 0.0
-    assert cost["memory_mb"] > 50.0
-    assert b"seconds" not in contents(tmp_path / "results")["routes/parked.json"]
 
 
 def test_finished_routes_are_not_driven_again(results: Path) -> None:
