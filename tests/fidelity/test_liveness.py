@@ -2,19 +2,15 @@
 
 import dataclasses
 import json
-from pathlib import Path
 
 import numpy as np
 import onnx_ir as ir
 import pytest
 
-from me2e_compress import graph
 from me2e_compress.fidelity.compare import compare
 from me2e_compress.fidelity.liveness import Liveness, LivenessTally, OutputTally
 from me2e_compress.runtime.frames import Array, Frame
 from me2e_compress.runtime.session import Session
-from tests.support.command import Command
-from tests.support.frames import record
 from tests.support.nets import parsed
 
 DRIVER = """
@@ -150,37 +146,3 @@ def test_one_frame_is_not_measured_and_that_is_said() -> None:
     assert list(found.lines()) == [
         "liveness: not measured (one frame alone: nothing moves)"
     ]
-
-
-@pytest.fixture
-def files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A graph, one of which the plan is constant, and frames; the current folder."""
-    graph.save(driver(), tmp_path / "a.onnx")
-    graph.save(driver(SCALE="5e6"), tmp_path / "b.onnx")
-    record(tmp_path / "frames", [each.arrays for each in drive()])
-    monkeypatch.chdir(tmp_path)
-    return tmp_path
-
-
-@pytest.mark.parametrize(("more", "code"), [((), 1), (("--alive", "0"), 0)])
-def test_compare_exits_with_1_if_an_output_is_dead(
-    more: tuple[str, ...],
-    code: int,
-    command: Command,
-    files: Path,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    assert command("compare", "a.onnx", "b.onnx", "frames", *more) == code
-
-    said = capsys.readouterr()
-    assert ("b.onnx: plan is constant" in said.err) == bool(code)
-    assert ("Liveness" in said.out) == bool(code)
-
-
-@pytest.mark.parametrize("share", ["-0.1", "1.5", "nan", "inf"])
-def test_a_share_beyond_0_to_1_is_refused(
-    share: str, command: Command, files: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert command("compare", "a.onnx", "a.onnx", "frames", "--alive", share) == 1
-
-    assert f"--alive is {share}: it must be a finite" in capsys.readouterr().err
