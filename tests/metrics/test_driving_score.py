@@ -90,32 +90,11 @@ def test_a_broken_sign_is_not_mastered_nor_any_without_a_junction() -> None:
 
 
 RAN_STOP = infraction(InfractionKind.STOP)
-SLOW = infraction(InfractionKind.MIN_SPEED, percent=50.0)
 
 
 def given(episode: Episode, status: str, composed: float) -> Episode:
     scores = Given(status, episode.completion_percent, 1.0, composed)
     return dataclasses.replace(episode, given=scores)
-
-
-STUCK = drive(route="c", completion=30.0, ending=Ending.BLOCKED)
-ROUTES = (
-    given(drive(SLOW, route="a"), "Completed", 100.0),
-    given(drive(CRASH, route="b"), "Completed", 59.9),
-    given(STUCK, "Failed - Agent got blocked", 30.0),
-)
-
-
-def test_both_quotients_of_what_was_given_and_computed() -> None:
-    result = leaderboard_scores(ROUTES)
-
-    for quotients, total in (
-        (result.given["driving_score"], 189.9),
-        (result.computed["driving_score"], 190.0),
-        (result.computed["success_rate"], 100.0),
-    ):
-        assert quotients.set == pytest.approx(total / 220)
-        assert quotients.driven == pytest.approx(total / 3)
 
 
 def test_no_record_has_no_score_and_another_status_is_no_success() -> None:

@@ -76,16 +76,6 @@ def test_json_has_value_low_high_and_n_for_each_score_and_says_a_partial_set() -
     assert not score(SET, expected=5).partial
 
 
-def test_the_order_of_the_routes_changes_no_mean_and_without_any_there_is_none() -> (
-    None
-):
-    forward, backward = score(SET), score(SET[::-1])
-
-    assert score([]).driving_score.measure == Measure(None, "%", "no route was driven")
-    assert forward.driving_score.value == backward.driving_score.value
-    assert forward.success_rate.value == backward.success_rate.value
-
-
 @pytest.mark.parametrize(
     ("value", "reason"), [(None, ""), (1.0, "why"), (math.nan, "")]
 )
