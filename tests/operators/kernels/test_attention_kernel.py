@@ -115,14 +115,6 @@ def test_a_query_that_is_no_number_is_none_afterwards() -> None:
     assert np.isfinite(np.delete(result, 7, axis=1)).all()
 
 
-def test_two_threads_answer_what_one_does() -> None:
-    arrays = drawn(2, 500, 90, 64)
-
-    one, two = (ran(arrays, 4, threads=count) for count in (1, 2))
-
-    assert np.array_equal(one, two)
-
-
 def test_sizes_that_differ_are_a_sentence() -> None:
     arrays = drawn(1, 5, 6, 8)
     model = graph_of(OPERATOR.own, arrays, opset=17)
