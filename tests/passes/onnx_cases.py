@@ -1,6 +1,5 @@
 """ONNX's own single-operator models, brought into a form that onnxruntime runs."""
 
-import ctypes
 import dataclasses
 import warnings
 from collections.abc import Iterator, Sequence
@@ -13,9 +12,6 @@ import onnxruntime
 NEWEST_IR = 13
 NEWEST_OPSET = 26
 """The newest that onnxruntime reads; the suite's own are newer."""
-
-AXES_ARE_INPUT = 13
-"""The opset from which Unsqueeze takes its axes as an input."""
 
 ROUNDINGS = 8
 """How far passes may move an output, in units of the last place of its largest number:
@@ -91,39 +87,6 @@ def _plain(value: Any) -> Any:
     return np.asarray(value) if isinstance(value, np.generic) else value
 
 
-def follow(case: Case) -> Case:
-    """Let an Unsqueeze read each output: what makes it can then be taken out."""
-    opset = next((one for one in case.model.opset_import if one.domain == ""), None)
-    if opset is None:
-        return case
-    model, outputs = onnx.ModelProto(), []
-    model.CopyFrom(case.model)
-    del model.graph.output[:]
-    for port, value in zip(case.model.graph.output, case.outputs, strict=True):
-        if not port.type.HasField("tensor_type") or _is_foreign(port.type):
-            model.graph.output.append(port)
-            outputs.append(value)
-        else:
-            outputs.append(np.expand_dims(np.asarray(value), 0))
-            _follow(model.graph, opset.version, port, outputs[-1].shape)
-    return dataclasses.replace(case, model=model, outputs=outputs)
-
-
-def _follow(
-    graph: onnx.GraphProto, opset: int, port: onnx.ValueInfoProto, shape: Sequence[int]
-) -> None:
-    name, axis = f"{port.name}_followed", f"{port.name}_axis"
-    if opset < AXES_ARE_INPUT:
-        node = onnx.helper.make_node("Unsqueeze", [port.name], [name], axes=[0])
-    else:
-        node = onnx.helper.make_node("Unsqueeze", [port.name, axis], [name])
-        graph.initializer.append(onnx.numpy_helper.from_array(np.array([0]), axis))
-    graph.node.append(node)
-    graph.value_info.append(port)
-    kind = port.type.tensor_type.elem_type
-    graph.output.append(onnx.helper.make_tensor_value_info(name, kind, shape))
-
-
 def bake(case: Case) -> Case:
     """Make constants of the inputs: initializers, and nodes that make lists of them."""
     model = onnx.ModelProto()
@@ -159,7 +122,7 @@ def _bake(graph: onnx.GraphProto, name: str, kind: onnx.TypeProto, value: Any) -
 
 
 def run(case: Case) -> list[Any]:
-    """Run a model in onnxruntime; inputs and outputs may be of any element type."""
+    """Run a model in onnxruntime."""
     model = case.model
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = 1
@@ -169,58 +132,28 @@ def run(case: Case) -> list[Any]:
     )
     quiet = onnxruntime.RunOptions()
     quiet.log_severity_level = 4
+    # BatchNormalization that trains writes into what it is fed
     feeds = {
-        port.name: _feed(value)
+        port.name: value.copy() if isinstance(value, np.ndarray) else value
         for port, value in zip(model.graph.input, case.inputs, strict=True)
         if value is not None
     }
-    if not any(_is_foreign(port.type) for port in model.graph.output):
-        return list(session.run(None, feeds, quiet))
-    owned = {
-        name: onnxruntime.OrtValue.ortvalue_from_numpy(value)
-        if isinstance(value, np.ndarray)
-        else value
-        for name, value in feeds.items()
-    }
-    return [_read(value) for value in session.run_with_ort_values(None, owned, quiet)]
+    return list(session.run(None, feeds, quiet))
 
 
-def _is_foreign(kind: onnx.TypeProto) -> bool:
-    """Say whether numpy has these elements from elsewhere: bfloat16, float8, int4."""
-    element = kind.tensor_type.elem_type
-    return bool(element) and not _is_numpys(
-        onnx.helper.tensor_dtype_to_np_dtype(element)
+def has_numpys_types(case: Case) -> bool:
+    """Whether numpy itself has all elements: not bfloat16, float8 or int4."""
+    ports = (*case.model.graph.input, *case.model.graph.output)
+    elements = [port.type.tensor_type.elem_type for port in ports]
+    return all(
+        _is_numpys(onnx.helper.tensor_dtype_to_np_dtype(each))
+        for each in elements
+        if each
     )
 
 
 def _is_numpys(dtype: np.dtype[Any]) -> bool:
     return dtype.isbuiltin == 1 or dtype.kind == "U"
-
-
-def _feed(value: Any) -> Any:
-    """Copy an array, bit by bit where numpy has its elements from elsewhere."""
-    if not isinstance(value, np.ndarray):
-        return value
-    if _is_numpys(value.dtype):
-        # BatchNormalization that trains writes into what it is fed.
-        return value.copy()
-    proto = onnx.numpy_helper.from_array(value)
-    owned = onnxruntime.OrtValue.ortvalue_from_shape_and_type(
-        list(proto.dims), proto.data_type
-    )
-    assert owned.tensor_size_in_bytes() == len(proto.raw_data)
-    ctypes.memmove(owned.data_ptr(), proto.raw_data, len(proto.raw_data))
-    return owned
-
-
-def _read(value: onnxruntime.OrtValue) -> Any:
-    return onnx.numpy_helper.to_array(
-        onnx.TensorProto(
-            data_type=value.element_type(),
-            dims=value.shape(),
-            raw_data=ctypes.string_at(value.data_ptr(), value.tensor_size_in_bytes()),
-        )
-    )
 
 
 def differs(case: Case, result: Sequence[Any]) -> str | None:
@@ -253,7 +186,7 @@ def _pairs(result: Sequence[Any], wanted: Sequence[Any]) -> Iterator[tuple[Any, 
 
 def _rounding(array: Any) -> float:
     """A few roundings of the largest number; nothing where numbers are not rounded."""
-    if array.dtype.kind != "f" or not _is_numpys(array.dtype):
+    if array.dtype.kind != "f":
         return 0.0
     largest = np.abs(array[np.isfinite(array)]).max(initial=0)
     return float(ROUNDINGS * np.finfo(array.dtype).eps * largest)
@@ -265,7 +198,5 @@ def _unlike(left: Any, right: Any, rtol: float, atol: float) -> str | None:
         return None if same else "other strings"
     if left.shape != right.shape or left.dtype != right.dtype:
         return f"{left.dtype}{left.shape} instead of {right.dtype}{right.shape}"
-    if not _is_numpys(left.dtype):
-        left, right = left.astype(np.float64), right.astype(np.float64)
     close = np.allclose(left, right, rtol, atol, equal_nan=True)
     return None if close else f"{left.reshape(-1)[:4]} not {right.reshape(-1)[:4]}"

@@ -12,7 +12,7 @@ from me2e_compress.passes import Context
 from me2e_compress.passes.convert_float16 import ConvertFloat16
 from me2e_compress.passes.convert_float32 import ConvertFloat32
 from me2e_compress.testing import check_pass
-from tests.passes.small import apply, bare, ops, read, types_of
+from tests.passes.small import apply, ops, read, types_of
 from tests.support.nets import MODULES, conv_attention
 
 HEAD = '<ir_version: 9, opset_import: ["" : 17, "own" : 1]>\n'
@@ -115,14 +115,3 @@ def test_back_to_float32() -> None:
         FLOAT, ir.DataType.INT64
     }  # fmt: skip
     assert ConvertFloat32().run(back, Context(MODULES)).changes == 0
-
-
-def test_casts_to_other_types_stay_what_they_are() -> None:
-    text = (
-        "h (float16[4] x) => (int32[4] y, float16[4] z)"
-        " { y = Cast<to=6>(x)\n a = Cast<to=1>(x)\n z = Cast<to=10>(a) }"
-    )
-    back = check_pass(ConvertFloat32(), bare(HEAD + text, {})).model
-    kinds = [value.dtype for value in back.graph.outputs]
-
-    assert kinds == [ir.DataType.INT32, HALF]

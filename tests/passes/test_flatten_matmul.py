@@ -12,9 +12,6 @@ from me2e_compress.graph import static_shape
 from me2e_compress.passes import flatten_matmul
 from me2e_compress.passes.flatten_matmul import FlattenMatmul
 from me2e_compress.passes.work import small_products
-from me2e_compress.quantization.decision import FLOAT
-from me2e_compress.quantization.plan import make_plan
-from me2e_compress.quantization.scheme import QuantScheme
 from tests.passes.hoisted import graph_of
 from tests.passes.small import apply, compute, ops, read
 
@@ -176,18 +173,3 @@ def test_a_wide_matrix_must_save_more_starts_than_it_moves_bytes() -> None:
     a = (1, 1000, 1000)
     assert apply(FlattenMatmul(), read(product(a, (9000, 1000, 1)))).changes == 0
     assert apply(FlattenMatmul(), read(product(a, (12000, 1000, 1)))).changes == 1
-
-
-@pytest.mark.parametrize("constant", [False, True])
-def test_projections_stay_in_float(constant: bool) -> None:
-    """The geometry of a camera is none of int8's business, whatever stands where."""
-    points = "" if constant else ", float[1,4,1000,4,1] points"
-    text = graph_of(
-        f"(float[6,1,1,4,4] lidar2img{points}) => (float[6,4,1000,4,1] y)",
-        "y = MatMul(lidar2img, points)",
-    )
-    weights = {"points": RANDOM.normal(size=POINTS).astype(np.float32)}
-    model = read(text, **(weights if constant else {}))
-    apply(FlattenMatmul(), model)
-    plan = make_plan(model, QuantScheme("modules", ("all",)))
-    assert {decision.dtype for decision in plan.decisions} == {FLOAT}

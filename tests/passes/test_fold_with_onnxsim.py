@@ -60,18 +60,6 @@ def test_names_pasts_and_metadata_come_back(folded: ir.Model) -> None:
     assert graph.digest(again.model) == graph.digest(folded)
 
 
-def test_weights_that_stay_are_shared_with_the_model() -> None:
-    kept = ir.from_onnx_text(
-        '<ir_version: 8, opset_import: ["": 17]>'
-        "g (float[2] x) => (float[2] y) <float[2] w = {1.0, 2.0}> {"
-        " t = Exp (w)  z = Mul (x, t)  y = Add (z, w) }"
-    )
-    result = FoldWithOnnxsim().run(kept, NO_MODULES).model
-    assert [node.op_type for node in result.graph] == ["Mul", "Add"]
-    weight = kept.graph.initializers["w"]
-    assert result.graph.initializers["w"].const_value is weight.const_value
-
-
 def stand_in(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, code: str) -> None:
     script = tmp_path / "stand_in.py"
     script.write_text(code)

@@ -11,7 +11,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from me2e_compress.graph import digest, infer_shapes, opset_of, provenance, static_shape
-from me2e_compress.manager import PassManager, recipe
 from me2e_compress.operators import expand
 from me2e_compress.operators.deformable_attention import DeformableAttention
 from me2e_compress.passes.base import PassResult
@@ -288,16 +287,6 @@ def test_pieces_that_are_alike_are_proven_once(monkeypatch: pytest.MonkeyPatch) 
     monkeypatch.setattr(numeric_check, "run_piece", counted)
     assert FuseOperators().run(inferred(read(TWICE)), NO_MODULES).changes == 2
     assert len(runs) == 2
-
-
-def test_the_way_to_a_plugin_of_tensorrt_is_checked() -> None:
-    passes = recipe.parse("fuse-operators,translate-plugins{dialect=tensorrt}")
-    model = decomposed(Sizes(n=3), merge="ReduceSum", masked=True)
-    report = PassManager(passes).run(model, NO_MODULES)
-    (result,) = report.verifications
-    assert result.passes == ("fuse-operators", "translate-plugins")
-    assert result.errors["y"] < 1e-4
-    assert "MultiscaleDeformableAttnPlugin_TRT" in ops(report.model)
 
 
 def test_a_proof_is_no_zero_against_a_zero() -> None:

@@ -95,23 +95,6 @@ def test_notes_say_what_was_decided_by_which_rule(
     )
 
 
-@pytest.mark.parametrize(
-    ("options", "changes"),
-    [
-        ({"scheme": "feature-ext"}, 1),
-        ({"scheme": "prediction"}, 3),
-        ({"modules": ("backbone",)}, 1),
-        ({"modules": ("backbone", "head")}, 4),
-    ],
-)
-def test_schemes_and_modules(
-    context: Context, options: dict[str, object], changes: int
-) -> None:
-    chosen = QuantizeInt8(rules="paper", target="tensorrt", **options)  # type: ignore[arg-type]
-
-    assert chosen.run(conv_attention(), context).changes == changes
-
-
 def test_unfit_frames_and_graphs_are_refused(context: Context, tmp_path: Path) -> None:
     bare, model = Context(MODULES), conv_attention()
     with pytest.raises(FramesError, match=r"needs recorded frames .* never made up"):
@@ -213,16 +196,6 @@ def partly(packed: str, form: str, end: str) -> ir.Model:
     return model
 
 
-def test_overrides_are_read_from_a_file(context: Context, tmp_path: Path) -> None:
-    path = tmp_path / "overrides.toml"
-    path.write_text('[[override]]\nmodule = "head"\ndtype = "float"\n')
-
-    chosen = QuantizeInt8(rules="paper", overrides=path)
-
-    notes = chosen.run(conv_attention(), context).notes
-    assert "1 of 10 nodes int8; layer 1, override 3" in notes[0]
-
-
 @pytest.mark.parametrize(
     ("options", "error", "message"),
     [
@@ -271,14 +244,6 @@ def test_the_rules_choose_the_method_unless_it_is_asked_for(
     assert QuantizeInt8(**options).method_of_ranges == method  # type: ignore[arg-type]
 
 
-def test_stale_ranges_are_refused(frames: CalibrationSet, tmp_path: Path) -> None:
-    path = tmp_path / "r.json"
-    Calibrator().run(conv_attention(seed=1), TENSORS, frames).save(path)
-
-    with pytest.raises(FramesError, match=r"r\.json: stale: of graph"):
-        QuantizeInt8(rules="paper", ranges=path).run(conv_attention(), Context(MODULES))
-
-
 def test_layers_that_the_target_keeps_in_float_do_not_count(context: Context) -> None:
     paper = QuantizeInt8(rules="paper", target="onnxruntime")
     result = paper.run(conv_attention(), context)
@@ -290,22 +255,6 @@ def test_layers_that_the_target_keeps_in_float_do_not_count(context: Context) ->
     plan = plan_of(result.model)
     assert plan is not None
     assert (len(plan.chosen), len(plan.placed)) == (4, 2)
-
-
-def test_where_the_target_takes_nothing_nothing_is_int8(context: Context) -> None:
-    text = """
-    up (float[1,3,8,8] image, float[3,8,2,2] w) => (float[1,8,16,16] y) {
-        ["/backbone/Up"] y = ConvTranspose<strides=[2,2]>(image, w)
-    }
-    """
-    model = net(text, {"w": np.ones((3, 8, 2, 2))})
-    options = QuantizeInt8(rules="paper", scheme="feature-ext", target="onnxruntime")
-
-    result = options.run(model, context)
-
-    assert result.changes == 0
-    assert result.notes[0] == "nothing to quantize"
-    assert "1 of them stay float on their target" in result.notes[1]
 
 
 def half(opset: int, context: Context) -> ir.Model:
@@ -356,20 +305,6 @@ def test_refusals_name_the_remedy(target: str, reason: str, context: Context) ->
     assert "put convert-float32 before quantize-int8" in str(raised.value)
     wide = check_pass(ConvertFloat32(), half(17, context), context).model
     assert check_pass(step, wide, context).changes > 0
-
-
-def test_a_graph_for_tensorrt_is_lowered(
-    context: Context, frames: CalibrationSet
-) -> None:
-    model = conv_attention()
-    placed = PAPER.run(model.clone(), context).model
-
-    result = LowerInt8().run(placed, context)
-
-    assert result.changes == len(int8_layers(result.model)) == 2
-    assert "2 layers in int8 for onnxruntime" in result.notes
-    found = compare(Session(model), Session(result.model), frames)
-    assert all(20 < each.sqnr_db < 60 for each in found.outputs)
 
 
 def test_saved_ranges_lower_to_the_same_graph_without_frames(
