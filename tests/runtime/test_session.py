@@ -9,7 +9,7 @@ from me2e_compress import graph
 from me2e_compress.base.errors import FramesError, GraphError
 from me2e_compress.graph.nodes import constant_values
 from me2e_compress.runtime.frames import Array, Frame
-from me2e_compress.runtime.runnable import why_endless, why_unsupported
+from me2e_compress.runtime.runnable import why_endless
 from me2e_compress.runtime.session import Session, feed_forward, replay
 from me2e_compress.targets.weights import evaluate_constants
 from tests.support.nets import parsed
@@ -18,13 +18,6 @@ COUNTER = """
 counter (float[1,2] x, float[1,2] memory) => (float[1,2] y, float[1,2] memory_out) {
     memory_out = Add(x, memory)
     y = Identity(memory_out)
-}
-"""
-
-PLUGIN = """
-<ir_version: 9, opset_import: ["" : 17, "vendor" : 1]>
-plugin (float[4] x) => (float[4] y) {
-    [turn] y = vendor.Rotate(x)
 }
 """
 
@@ -91,18 +84,6 @@ def test_state_of_open_shape_needs_a_first_value() -> None:
 
     with pytest.raises(GraphError, match=r"memory .*nothing gives n a size: .*n=1"):
         list(replay(Session(model), [ones(0, True)]))
-
-
-def test_an_unknown_operator_is_named(counter: ir.Model) -> None:
-    plugin = parsed(PLUGIN)
-
-    assert why_unsupported(counter) is None
-    assert (
-        why_unsupported(plugin)
-        == "onnxruntime has no operator vendor::Rotate (node 'turn')"
-    )
-    with pytest.raises(GraphError, match="vendor::Rotate"):
-        Session(plugin)
 
 
 def test_an_output_that_numpy_cannot_hold_is_an_error_of_the_graph() -> None:
