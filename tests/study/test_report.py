@@ -288,17 +288,6 @@ def test_one_variant_is_not_compared(result: StudyResult) -> None:
     assert "Difference" not in "".join(table.title for table in alone.tables())
 
 
-def test_markdown() -> None:
-    first = (Cell("a|b"), Cell("1.0", "0.5 to 1.5"))
-    rows = (first, (Cell("c"), Cell(MISSING, reason="no")))
-    table = Table("Costs", ("variant", "DS"), rows, "Note.")
-
-    assert table.markdown() == (
-        "**Costs**\n\n| variant | DS |\n|---|---:|\n"
-        f"| a\\|b | 1.0 (0.5 to 1.5) |\n| c | {MISSING} |\n\nNote.\n"
-    )
-
-
 # Markup is text in every page and drawing of a report.
 
 

@@ -7,7 +7,6 @@ import time
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -17,7 +16,6 @@ from me2e_compress.manager import recipe
 from me2e_compress.metrics.route_summary import RouteSummary
 from me2e_compress.metrics.scores import score
 from me2e_compress.study import (
-    Listener,
     StudyResult,
     Timing,
     Variant,
@@ -54,12 +52,6 @@ pytestmark = pytest.mark.xdist_group("study")
 
 ONE = {"variants": (BLIND,), "baseline": "blind", "conditions": (IDEAL,)}
 GONE = Variant("slow", "gone.onnx")
-
-
-def without_latency(record: dict[str, Any]) -> dict[str, Any]:
-    for table in (record, *record["schemes"]):
-        del table["latency"]
-    return record
 
 
 def test_the_scores_are_those_of_the_results(result: StudyResult, folder: Path) -> None:
@@ -110,18 +102,6 @@ def test_a_model_has_size_latency_and_fidelity_and_a_driver_has_none(
     assert plans[3].plan_mean.value == pytest.approx(sum(range(2, 14, 2)) / 6)
     assert plans[3].plan_max.value == pytest.approx(12.0)
     assert plans[3].frames == 2
-
-
-@pytest.mark.usefixtures("short")
-def test_the_same_seed_gives_the_same_bytes(make: Make, tmp_path: Path) -> None:
-    _, slow, again, _ = make().variants
-    asked = make(variants=(slow, again, BLIND), conditions=(SLOW,))
-
-    one, two = (
-        json.dumps(without_latency(run_study(asked, tmp_path / way, Here()).to_json()))
-        for way in "ab"
-    )
-    assert one == two
 
 
 @pytest.mark.usefixtures("short")
@@ -209,19 +189,6 @@ def test_a_study_that_was_killed_goes_on(tmp_path: Path) -> None:
     assert len(done) + len(engine.driven) == 6
     assert not done & driven
     assert resumed == run_study(load_study(toml), whole, Here())
-
-
-@pytest.mark.usefixtures("short")
-def test_who_listens_hears_every_stage(make: Make, tmp_path: Path) -> None:
-    stages = list[str]()
-    asked = make(variants=make().variants[1:3], conditions=(IDEAL,))
-
-    listener = Listener(lambda stage, *_: stages.append(stage))
-    run_study(asked, tmp_path, Here(), listener)
-
-    drives = ["slow, ideal", "again, ideal"]
-    assert list(dict.fromkeys(stages)) == ["latency", "fidelity of again", *drives]
-    assert stages.count("slow, ideal") == len(ROUTES) + 1
 
 
 @pytest.mark.usefixtures("short", "weights")
