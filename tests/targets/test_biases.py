@@ -181,34 +181,6 @@ def test_integers_of_a_larger_scale_are_off_by_half_a_step(
     assert (np.abs(before - after) <= fresh.astype(np.float64) * (0.5 + 1e-6)).all()
 
 
-@pytest.mark.parametrize("faint", [1e-3, 3e-5, 1e-9])
-def test_a_float16_graph_has_no_scale_of_zero(faint: float) -> None:
-    model = dead(1, faint)
-    for value in (*model.graph.inputs, *model.graph.initializers.values()):
-        if value.const_value is not None:
-            half = value.const_value.numpy().astype(np.float16)
-            value.const_value = ir.tensor(half, name=value.name)
-        value.type = ir.TensorType(ir.DataType.FLOAT16)
-    for node in model.graph:
-        node.outputs[0].type = ir.TensorType(ir.DataType.FLOAT16)
-
-    made = in_int8(model)
-
-    for name, axis in AXES.items():
-        weight, scales, integers = (
-            np.asarray(graph.array_of(each.graph.initializers[label]), np.float64)
-            for each, label in (
-                (model, name), (made, f"{name}_scale"), (made, f"{name}_int8"),
-            )
-        )  # fmt: skip
-        assert made.graph.initializers[f"{name}_scale"].dtype == ir.DataType.FLOAT16
-        assert (scales > 0).all()
-        steps = np.moveaxis(weight, axis, -1) / scales
-        off = np.abs(steps - np.moveaxis(integers, axis, -1))
-        assert off.max() <= 1 + 127 * 2.0**-11  # balanced: by less than a step
-    assert max(counts(made)) <= BIAS_MAX * (1 + 1e-2)
-
-
 # Rounding weights: each to its nearest step, or so that their errors cancel.
 
 
@@ -304,15 +276,6 @@ def test_convolutions_and_products_behind_a_relu_are_balanced() -> None:
         for name in ("c", "p", "n")
     }
     assert changed == {"c": True, "p": True, "n": False}
-
-
-@pytest.mark.parametrize("rules", ["paper", "safe{balance=false}"])
-def test_the_paper_rounds_to_nearest(rules: str) -> None:
-    model = made()
-    plan, found = stored(model, rules)
-    assert not plan.balanced
-    assert "c" in found
-    assert all((found[n].integers == nearest(model, n)).all() for n in found)
 
 
 @pytest.mark.parametrize("target", ["tensorrt", "onnxruntime"])

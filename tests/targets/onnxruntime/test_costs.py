@@ -232,14 +232,6 @@ def test_the_kernel_for_uint8_samples_it(make: Callable[[], ir.Model]) -> None:
     assert found["DequantizeLinear"] == 0
 
 
-@compiled
-def test_maps_of_convolutions_are_joined_and_sampled_without_becoming_float() -> None:
-    found = Counter(node.op_type for node in optimize(quantized(aggregation())).graph)
-
-    assert found["QLinearConcat"] == 1
-    assert found["QuantizeLinear"] == 1  # of the image
-
-
 @pytest.mark.parametrize("make", [attention, aggregation])
 def test_positions_and_weights_stay_float(make: Callable[[], ir.Model]) -> None:
     model = make()

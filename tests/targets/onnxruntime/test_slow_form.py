@@ -6,14 +6,7 @@ from pathlib import Path
 import numpy as np
 import onnx_ir as ir
 import pytest
-from onnxruntime.quantization import (
-    CalibrationDataReader,
-    QuantFormat,
-    QuantType,
-    quantize_static,
-)
 
-from me2e_compress import graph
 from me2e_compress.runtime.providers import (
     CpuProvider,
     CudaProvider,
@@ -21,7 +14,7 @@ from me2e_compress.runtime.providers import (
     TensorRtRtxProvider,
 )
 from me2e_compress.targets.onnxruntime import OnnxRuntime, slow_here
-from tests.support.nets import conv_attention, drawn, parsed, placed, save_text
+from tests.support.nets import conv_attention, drawn, parsed, placed
 from tests.targets.onnxruntime.lowered import (
     MATMUL_RELU,
     calibrated,
@@ -174,16 +167,6 @@ def test_int8_without_a_zero_point_is_not_looked_at(kind: int, is_slow: bool) ->
     assert (slow_here(model) is not None, "float-kernel" in runs) == (is_slow, is_slow)
 
 
-def test_a_layer_whose_float_output_is_asked_for_is_slow() -> None:
-    model = quantized("Conv", "a pair", ("uint8", 0))
-    conv = next(node for node in model.graph if node.op_type == "Conv")
-    assert slow_here(model) is None
-
-    model.graph.outputs.append(conv.outputs[0])
-
-    assert slow_here(model) is not None
-
-
 def test_a_weight_alone_is_not_slow() -> None:
     """Its activation is float: such products have a kernel (MatMulNBits)."""
     model = ir.from_onnx_text(
@@ -287,45 +270,6 @@ def test_what_is_placed_for_the_cpu_is_not_slow_there(
 
     assert slow_here(model) is None
     assert (slow_here(placed(model, target)) is not None) == is_slow
-
-
-class Drawn(CalibrationDataReader):  # type: ignore[misc]
-    """Normal numbers for the input ``x``, drawn anew."""
-
-    def __init__(self) -> None:
-        draws = np.random.default_rng()
-        shape = (1, 8, 4, 4)
-        self._left = [{"x": draws.normal(size=shape).astype(np.float32)}] * 2
-
-    def get_next(self) -> dict[str, np.ndarray]:
-        # an empty mapping ends the data, and keeps to the base class's type
-        return self._left.pop() if self._left else {}
-
-
-@pytest.mark.parametrize(
-    ("kind", "options"),
-    [
-        (QuantType.QUInt8, {}),
-        (QuantType.QInt8, {}),
-        (QuantType.QInt8, {"ActivationSymmetric": True}),
-    ],
-)
-def test_what_onnxruntimes_own_quantizer_writes_is_not_slow(
-    kind: QuantType, options: dict[str, bool], tmp_path: Path
-) -> None:
-    """It puts a pair behind every layer; sessions make its int8 uint8 by themselves."""
-    text = "m (float[1,8,4,4] x) => (float[1,8,4,4] y)"
-    text += f" <float[8,8,1,1] v = {{{FLOATS}}}>"
-    source = save_text(
-        tmp_path / "f.onnx", text + "{ c = Conv(x, v) r = Relu(c) y = Conv(r, v) }"
-    )
-    target = tmp_path / "q.onnx"
-    quantize_static(
-        source, target, Drawn(), quant_format=QuantFormat.QDQ, per_channel=True,
-        activation_type=kind, weight_type=QuantType.QInt8, extra_options=options,
-    )  # fmt: skip
-
-    assert slow_here(graph.load(target)) is None
 
 
 # What the plan makes int8 runs int8: each form, opened, and read back.

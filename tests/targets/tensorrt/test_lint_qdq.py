@@ -14,7 +14,7 @@ from me2e_compress.graph import rewrite
 from me2e_compress.targets import LintFinding
 from me2e_compress.targets.tensorrt import TensorRT
 from tests.passes.small import read
-from tests.support.nets import conv_attention, net, parsed, placed
+from tests.support.nets import conv_attention, parsed, placed
 
 RUNTIME = TensorRT(version="10.7")
 
@@ -220,23 +220,6 @@ def test_a_rounded_projection_is_a_residual_branch() -> None:
       d = DequantizeLinear(q, s, z) y = Add(c, d) }"""
 
     assert "residual-branch" not in [each[1] for each in found(text)]
-
-
-def test_graphs_of_other_quantizers_are_judged_the_same() -> None:
-    """A pair on every input and on a weight that stays float, as AddQDQPairToWeight."""
-    text = """
-    m (float[4,16] x, float[16,16] w) => (float[4,16] y)
-    <float s = {0.5}, int8 z = {0}> {
-        a = QuantizeLinear(x, s, z)
-        b = DequantizeLinear(a, s, z)
-        c = QuantizeLinear(w, s, z)
-        d = DequantizeLinear(c, s, z)
-        y = MatMul(b, d)
-    }
-    """
-    model = net(text, {"w": np.ones((16, 16))})
-
-    assert [each.rule for each in RUNTIME.lint(model)] == ["float-weight"]
 
 
 # FP8 pairs and int4 weights by block: TensorRT takes both.

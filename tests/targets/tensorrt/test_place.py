@@ -195,42 +195,6 @@ def test_one_matrix_has_scales_by_column_and_a_batch_of_them_one_scale() -> None
     }
 
 
-def test_products_by_batches_run_with_all_of_onnxruntimes_fusions() -> None:
-    generator = np.random.default_rng(6)
-    fed = {
-        "x": generator.standard_normal((3, 4, 32)).astype(np.float32),
-        "t": generator.standard_normal((2, 32)).astype(np.float32),
-    }
-
-    got, want = run_once(placed(batched()), fed), run_once(batched(), fed)
-
-    for name, exact in want.items():
-        assert got[name].shape == exact.shape
-        off = got[name].astype(np.float64) - exact.astype(np.float64)
-        assert np.abs(off).max() < 0.6
-
-
-TIED = """
-tied (float[8,8] x, float[8,8] w) => (float[8,8] y) {
-    x_scale = Gemm(x, w)
-    x_DequantizeLinear = Relu(x_scale)
-    int8_zero = Gemm<transB=1>(x_DequantizeLinear, w)
-    y = Relu(int8_zero)
-}
-"""
-
-
-def test_what_is_new_is_called_like_nothing_that_is_there() -> None:
-    x = np.random.default_rng(8).standard_normal((8, 8)).astype(np.float32)
-    model = drawn(TIED, {"w": (8, 8)}, 7)
-
-    result = placed(model, reach=12)
-
-    onnx.checker.check_model(ir.to_proto(result), full_check=True)
-    got, want = run_once(result, {"x": x})["y"], run_once(model, {"x": x})["y"]
-    assert np.abs(got.astype(np.float64) - want.astype(np.float64)).max() < 2
-
-
 # Plugins that take int8 features, and their scale as one more input.
 
 
