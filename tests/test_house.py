@@ -14,7 +14,6 @@ from benchmarks.tools.house import (
     committed_before,
     entered,
     measure,
-    write_lower,
 )
 
 ROOT = Path(__file__).parents[1]
@@ -89,22 +88,3 @@ def test_a_call_enters_no_more_files_and_functions_than_it_may(call: str) -> Non
     counted = entered(call)
     assert 0 < counted[0] <= files
     assert 0 < counted[1] <= functions
-
-
-def test_lower_counts_are_noted_and_higher_or_unknown_ones_are_not(
-    tmp_path: Path, house: House
-) -> None:
-    path = tmp_path / "house.toml"
-    text = (ROOT / "house.toml").read_text("utf-8")
-    path.write_text(text.replace("[today.lines]\n", '[today.lines]\n"attic" = 2\n'))
-    with pytest.raises(ValueError, match=r"house.toml: no room attic"):
-        budget(path)
-    path.write_text(text)
-    lines = {**house.lines, "passes": 7, "graph": 1_000_000}
-
-    write_lower(replace(house, lines=lines), path)
-
-    noted, before = budget(path).today, budget().today
-    assert noted["lines.passes"] == 7
-    assert noted["lines.graph"] == before["lines.graph"]
-    assert budget(path).ceilings == budget().ceilings
