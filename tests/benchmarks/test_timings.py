@@ -1,32 +1,19 @@
 """What is timed answers right; what is missing is said, and what is done is kept."""
 
-import argparse
-import subprocess
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 import torch
 
 from benchmarks.measure.energy import COUNTER, FRAMES_MS, conditions, held
-from benchmarks.measure.gpu import ROWS, Bench
 from benchmarks.subjects.original_patterns import FORMS, restored
-from benchmarks.subjects.runtime_files import REFERENCE
 from benchmarks.subjects.subject import Subject
-from benchmarks.tools.gpu_table import table as gpu_table
 from me2e_compress.runtime.energy.energy_counter import EnergySchedule
-from me2e_compress.runtime.providers import CPU
 from models.tests.vad.sizes import SIZES
 from models.vad.stack import VadTiny
 from tests.support.frames import record
 from tests.support.nets import save_text
-
-
-@pytest.fixture
-def given() -> argparse.Namespace:
-    words: dict[str, Any] = {"plugins": [], "dialect": "tensorrt", "energy": False}
-    return argparse.Namespace(runs=6, seconds=60, warm_up=1, threads=1, **words)
 
 
 @pytest.fixture
@@ -41,22 +28,6 @@ def subject(tmp_path: Path) -> Subject:
     )
     record(found.held_out, [{"x": np.ones((1, 4), np.float32)}])
     return found
-
-
-def test_a_row_is_measured_once(
-    subject: Subject, given: argparse.Namespace, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    first = Bench(subject, 1, given).found(CPU, REFERENCE, ROWS[REFERENCE])
-    monkeypatch.setattr(subprocess, "run", None)
-
-    assert Bench(subject, 1, given).found(CPU, REFERENCE, ROWS[REFERENCE]) == first
-    assert len(first.measured["wall_s"]) == 6
-    assert first.measured["sqnr_db"] == {"plan": None, "next_x": None}
-    assert first.measured["gpu_reason"] == "runs on the CPU"
-    *_, line, _, _, joules = gpu_table([first]).splitlines()
-    assert joules == "J/frame, cpu: not asked."
-    cells = line.split("|")
-    assert [each.strip() for each in cells[-4:-1]] == ["∞", "∞", "-"]
 
 
 def test_intervals_of_energy_hold_the_truth() -> None:

@@ -1,93 +1,15 @@
 """Tools of the project: mutations of the code, files entered, files written."""
 
-import importlib
 import json
-import sys
 from pathlib import Path
 
 import pytest
 
 from benchmarks.subjects import seven_nodes
-from benchmarks.tools import replay, written_files
-from benchmarks.tools.files_entered import Entered
+from benchmarks.tools import written_files
 from benchmarks.tools.masks import masked
-from benchmarks.tools.mutate import main
 from benchmarks.tools.written_files import differences, manifest
 from tests.support.command import Cli
-
-
-@pytest.fixture
-def toy(tmp_path: Path) -> Path:
-    """A file of a package; its test, of one room, looks at one side of a border."""
-    file, test = tmp_path / "toy/room/sign.py", tmp_path / "tests/room/test_sign.py"
-    file.parent.mkdir(parents=True)
-    test.parent.mkdir(parents=True)
-    file.write_text("def positive(x):\n    return x > 0\n")
-    test.write_text(
-        "from toy.room.sign import positive\n\n"
-        "def test_one():\n    assert positive(1) and not positive(-1)\n"
-    )
-    return file
-
-
-WORDS = ("room", "--seed", "1", "--package", "toy")
-
-
-def test_what_survives_is_told(
-    toy: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    before = toy.read_bytes()
-
-    main(WORDS, tmp_path)
-
-    assert capsys.readouterr().out.splitlines() == [
-        "survived   toy/room/sign.py:2: x > 0  ->  x >= 0",
-        "killed     toy/room/sign.py:2: 0  ->  1",
-        "",
-        "room, seed 1",
-        "survived   toy/room/sign.py:2: x > 0  ->  x >= 0",
-        "2 changes: killed 1, survived 1, timed out 0; 50 % killed",
-    ]
-    assert toy.read_bytes() == before
-
-
-TRIP = {
-    "__init__": "",
-    "called": """
-import trip.imported
-
-def run():
-    return list(map(lambda x: x, trip.imported.NUMBERS))
-""",
-    "imported": """
-def count():
-    return [0, 1]
-
-class Body:
-    x = count()
-
-NUMBERS = count()
-""",
-}
-"""A package of two files, one of which is only imported."""
-
-
-def test_functions_that_ran_count_and_files_executed_at_import_are_apart(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    package = tmp_path / "trip"
-    package.mkdir()
-    for name, text in TRIP.items():
-        (package / f"{name}.py").write_text(text)
-    monkeypatch.syspath_prepend(tmp_path)
-    entered = Entered(package)
-
-    entered.during(lambda: importlib.import_module("trip.called").run())
-
-    for name in ("trip", "trip.called", "trip.imported"):
-        del sys.modules[name]
-    assert entered.functions() == {Path("called.py"): 2}
-    assert {path.stem for path in entered.imported} == TRIP.keys()
 
 
 def compressed(cli: Cli, name: str, frames: int) -> dict[str, str]:
@@ -185,31 +107,3 @@ def test_clock_versions_machine_and_paths_are_hidden_and_all_else_shows(
     tmp_path: Path, same: bool, file: str, one: str, other: str
 ) -> None:
     assert (seen(tmp_path, file, one) == seen(tmp_path, file, other)) is same
-
-
-class Played(replay.Tree):
-    """A checkout whose passes are numbers: from ``fault`` on they do otherwise."""
-
-    def __init__(self, fault: int) -> None:
-        self.fault, self.texts = fault, {}
-
-    def steps(self, job: replay.Job) -> list[str]:
-        return [f"pass-{number}" for number in range(7)]
-
-    def start(self, jobs: object) -> None:  # type: ignore[override]
-        """Start nothing."""
-
-    def finish(self, child: object, jobs: object) -> None:
-        """Wait for nothing."""
-
-    def digest(self, job: replay.Job) -> str:
-        ran = job.passes[1].count("pass") if job.passes[0] == "--passes" else 7
-        return f"{self.fault < ran}"
-
-
-@pytest.mark.parametrize("fault", range(7))
-def test_a_replay_names_the_pass_behind_which_two_graphs_differ(fault: int) -> None:
-    subject = replay.Subject("net", Path("net.onnx"), Path("net"), ("full",))
-    job = replay.Job(subject, ("-r", "full"), "tensorrt")
-    lines = replay.differences(job, Played(7), Played(fault))
-    assert list(lines) == [f"net.full.tensorrt.onnx: pass-{fault}"]

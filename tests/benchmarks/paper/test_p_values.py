@@ -1,50 +1,15 @@
 """P-values over scenario types drawn anew."""
 
-import itertools
-from statistics import fmean
-
 import numpy as np
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from benchmarks.paper.evidence import drawn_anew, p_value
-from me2e_compress.metrics import measure
-
-UNEVEN = {"a": [1.0, 5.0], "b": [-3.0], "c": [2.0, 2.0, 9.0], "d": [0.5]}
-
-
-def every_draw() -> list[float]:
-    """The mean of every ordered draw of three of four types, by hand."""
-    return [
-        fmean(value for name in drawn for value in UNEVEN[name])
-        for drawn in itertools.product(UNEVEN, repeat=3)
-    ]
 
 
 def anew_of(values: list[float], types: list[str]) -> np.ndarray:
     rows = np.stack([values, np.ones(len(values))], axis=1)
     return drawn_anew(rows, types, lambda sums: sums[:, 0] / sums[:, 1], seed=0)
-
-
-def test_types_drawn_anew_are_as_all_draws_by_brute_force(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setattr(measure, "FEWEST_TYPES", len(UNEVEN))  # all draws of 8: 2e6
-    types = [name for name, values in UNEVEN.items() for _ in values]
-    values = [value for each in UNEVEN.values() for value in each]
-
-    draws, exact = anew_of(values, types), np.array(every_draw())
-
-    found = measure.mean_estimate(values, types, "%")
-    for end, percent in ((found.anew_low, 2.5), (found.anew_high, 97.5)):
-        assert end == pytest.approx(float(np.percentile(exact, percent)), abs=0.35)
-    for edge in (-1.5, 0.2, 2.0, 4.1):
-        assert float((draws <= edge).mean()) == pytest.approx(
-            float((exact <= edge).mean()), abs=0.015
-        )
-        least = min((exact <= edge).mean(), (exact >= edge).mean())
-        assert p_value(draws, edge) == pytest.approx(min(1.0, 2 * least), abs=0.03)
 
 
 @given(st.lists(st.floats(-50, 50), min_size=20, max_size=60), st.floats(-60, 60))

@@ -1,43 +1,27 @@
 """The pages that are kept, and facts of a study that was driven."""
 
-import hashlib
-import json
 import re
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from benchmarks.paper import weigh
-from benchmarks.paper.__main__ import NOTHING, PAGE
+from benchmarks.paper.__main__ import PAGE
 from benchmarks.paper.accident import plans_before
 from benchmarks.paper.evidence import FEWEST_RUNS
 from benchmarks.paper.records import RECORDS, add_facts, read_paper
 from me2e_compress.base.errors import StudyError
 from me2e_compress.commands.result import SILENT
 from me2e_compress.simulator.routes import Route
-from me2e_compress.study import Condition, Study, Timing, Variant, load_study, run_study
+from me2e_compress.study import Condition, Study, Timing, Variant, run_study
 from me2e_compress.study.definition import StudyBlock
-from tests.benchmarks.paper.made import write_records
 from tests.evaluators.highway.drivers import straight_on
 from tests.study.conftest import IDEAL
 from tests.support.command import write_frames
 from tests.support.in_process import Here
 
 CRASHED = Route("crashed", "Accident", 1)
-
-ONE = """interval = "types"
-correction = "holm"
-alpha = 0.05
-step = 2.0
-[[question]]
-name = "rate"
-asks = "Slow is worse"
-paper = "it was"
-of = "float.ideal"
-minus = "float.fps-1"
-"""
 
 
 def test_the_page_is_that_of_the_drives_that_are_kept() -> None:
@@ -46,48 +30,6 @@ def test_the_page_is_that_of_the_drives_that_are_kept() -> None:
     [asked_at] = re.findall("; questions committed (.*?)\\. All", text)
 
     assert text == PAGE.text(asked_at)
-
-
-def test_drives_that_are_kept_make_the_same_tables(tmp_path: Path) -> None:
-    page, records, kept = PAGE, tmp_path / "run" / "records", tmp_path / "kept"
-    assert page.text("", tmp_path).endswith(NOTHING)
-    write_records(load_study(page.study, "5").of_blocks(["table-6"]), records)
-    text = page.text("", records)
-    names = {path.name for path in records.iterdir()}
-    (records / "of.another-study.jsonl").touch()
-
-    replace(page, kept=kept).keep(records)
-
-    assert {path.name for path in kept.iterdir()} == {*names, "traces"}
-    assert page.text("", kept) == text
-    assert "preview: 5 of 220 routes" in text
-
-
-@pytest.mark.parametrize(
-    ("old", "new", "asked"),
-    [
-        ("[[", "# a comment\n[[", "before its drives"),
-        ("0.05", "0.5", "changed after its drives"),
-        ('"rate"', '"r"', "added after seeing results"),
-    ],
-)
-def test_questions_that_changed_after_their_drives_are_named(
-    tmp_path: Path, old: str, new: str, asked: str
-) -> None:
-    study = load_study(PAGE.study, "5").of_blocks(["table-2"])
-    write_records(study, tmp_path)
-    (tmp_path / "questions.toml").write_text(ONE)
-    digest = hashlib.sha256(ONE.encode()).hexdigest()
-    for path in tmp_path.glob("*.jsonl"):
-        head, rows = path.read_text().split("\n", 1)
-        path.write_text(json.dumps({**json.loads(head), "questions": digest}))
-        path.write_text(f"{path.read_text()}\n{rows}")
-    now = tmp_path / "now.toml"
-    now.write_text(ONE.replace(old, new))
-
-    found = read_paper(study, tmp_path, now)
-
-    assert found.findings[0].asked == asked
 
 
 def test_a_study_that_was_driven_is_weighed_and_its_accident_kept(
