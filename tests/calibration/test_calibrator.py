@@ -170,17 +170,6 @@ def test_stale_ranges_are_refused(
         )
 
 
-@pytest.mark.parametrize("content", ["[", "{}", '{"tensors": 1}'])
-def test_a_file_that_holds_no_ranges_is_refused(tmp_path: Path, content: str) -> None:
-    path = tmp_path / "r.json"
-    path.write_text(content)
-
-    with pytest.raises(FramesError, match=r"r\.json: not ranges"):
-        Ranges.load(path)
-    with pytest.raises(FramesError, match="no such ranges"):
-        Ranges.load(tmp_path / "none.json")
-
-
 FOUR = ("image", "a", "seen", "mixed")
 
 

@@ -1,7 +1,6 @@
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 import onnx_ir as ir
 import pytest
 from hypothesis import given, settings
@@ -9,12 +8,9 @@ from hypothesis import strategies as st
 
 from me2e_compress import graph
 from me2e_compress.base.errors import FramesError, GraphError
-from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.calibration.means import token_means
 from me2e_compress.runtime.frames import Frame
-from me2e_compress.runtime.session import run_once
-from tests.support.frames import record
-from tests.support.nets import conv_attention, image, parsed
+from tests.support.nets import parsed
 from tests.support.profiles import scaled
 
 KINDS = """
@@ -38,31 +34,6 @@ def rows(*values: list[float]) -> list[Frame]:
         Frame(index, index == 0, {"x": np.array([value], np.float32)})
         for index, value in enumerate(values)
     ]
-
-
-def test_the_mean_of_a_recurrent_model_over_scenes(tmp_path: Path) -> None:
-    """Against the arithmetic written out: state fed forward, zeros at a scene."""
-    model, seeds = conv_attention(), range(5)
-    frames = CalibrationSet(
-        record(tmp_path / "f", [image(seed) for seed in seeds], scenes=(0, 2))
-    )
-    seen: list[npt.NDArray[np.float32]] = []
-    memory: npt.NDArray[np.generic] = np.zeros((1, 8, 64), np.float32)
-    exposed = model.clone()
-    exposed.graph.outputs.append(exposed.graph[3].outputs[0])
-    for seed in seeds:
-        if seed in (0, 2):
-            memory = np.zeros((1, 8, 64), np.float32)
-        found = run_once(exposed, {**image(seed), "memory": memory})
-        memory = found["memory_out"]
-        seen.append(np.asarray(found["seen"], np.float32))
-
-    means = token_means(model, frames, ["seen", "y"])
-
-    assert list(means) == ["seen", "y"]
-    assert means["seen"].dtype == np.float32
-    found_mean = np.asarray(means["seen"], np.float32)
-    np.testing.assert_allclose(found_mean, np.mean(seen, axis=0), atol=1e-5)
 
 
 @settings(max_examples=scaled(15))

@@ -20,26 +20,6 @@ from tests.support.nets import conv_attention, image, parsed
 TENSORS = ("image", "a", "r", "seen", "q", "scores", "p", "mixed")
 
 
-@pytest.mark.parametrize("optimize", [False, True])
-def test_readings_are_those_of_numpy(optimize: bool) -> None:
-    model = conv_attention()
-    feeds = {**image(3), "memory": np.zeros((1, 8, 64), np.float32)}
-    bare = model.clone()
-    made = {value.name: value for node in bare.graph for value in node.outputs}
-    bare.graph.outputs.extend(made[name] for name in TENSORS[1:-1])
-    values = {**Session(bare, threads=1, optimize=False).run(feeds), **feeds}
-    session = probed_session(
-        model, TENSORS[:-1], Extremes(), threads=1, optimize=optimize
-    )
-
-    readings = session.run(feeds, [READINGS])[READINGS].reshape(-1, 3)
-
-    for name, (low, high, square) in zip(TENSORS, readings, strict=False):
-        x = values[name].astype(np.float64)
-        expected = (x.min(), x.max(), np.mean(x * x))
-        assert (low, high, square) == pytest.approx(expected, rel=1e-4), name
-
-
 def test_models_with_probes_still_answer_and_keep_their_metadata() -> None:
     model = conv_attention()
     model.metadata_props["me2e.recurrent"] = '{"memory": "memory_out"}'

@@ -4,9 +4,7 @@ import dataclasses
 import json
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
-from typing import ClassVar
 
 import numpy as np
 import numpy.typing as npt
@@ -19,9 +17,7 @@ from me2e_compress.calibration.calibrator import Calibrator
 from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.calibration.observers import (
     OBSERVERS,
-    Bounds,
     MeanSquaredError,
-    Observer,
     Percentile,
     scale_of,
     within,
@@ -31,7 +27,6 @@ from me2e_compress.calibration.review import review
 from me2e_compress.calibration.statistics import BINS, Statistics
 from me2e_compress.graph import infer_shapes
 from tests.support.frames import record
-from tests.support.installed import install
 from tests.support.nets import conv_attention, image, parsed
 from tests.support.profiles import scaled
 
@@ -73,29 +68,6 @@ def test_a_range_is_held_against_the_tensor_itself(
 
     assert [each for each, _ in found] == ([severity] if severity else [])
     assert re.search(said, "".join(line for _, line in found))
-
-
-def test_a_range_of_zero_cuts_a_tensor_that_is_not_zero() -> None:
-    cut = dataclasses.replace(
-        GOOD, method="percentile:50.0", tensors={"a": (0.0, 0.0)}, rms={"a": 0.9}
-    )
-
-    ((severity, said),) = lines(cut)
-
-    assert severity == "warning"
-    assert said.startswith("1 range below the root mean square, which cuts most of")
-    assert cut.dead == ()
-
-
-def test_the_worst_are_named_first_and_the_rest_counted() -> None:
-    names = [f"t{at}" for at in range(7)]
-    bounds = {name: (0.0, 1000.0 * (at + 1)) for at, name in enumerate(names)}
-    wild = dataclasses.replace(GOOD, tensors=bounds, rms=dict.fromkeys(names, 1.0))
-
-    ((_, said),) = lines(wild)
-
-    assert said.startswith("7 ranges of 254")
-    assert ": t6 (7e+03); t5 (6e+03); t4 (5e+03); t3 (4e+03); t2 (3e+03); and 2" in said
 
 
 @pytest.mark.parametrize(
@@ -346,17 +318,6 @@ def test_histogram_methods_say_that_they_lack_histograms() -> None:
         Percentile().ranges(extremes((0, 1)))
 
 
-@dataclass(frozen=True)
-class RootMeanSquare(Observer):
-    """So many root mean squares to each side."""
-
-    name: ClassVar[str] = "rms"
-    times: float = 3.0
-
-    def ranges(self, seen: Statistics) -> tuple[Bounds, Bounds]:
-        return within(seen, self.times * np.sqrt(seen.mean_squares.mean(axis=0)))
-
-
 @pytest.mark.parametrize(
     ("text", "message"),
     [
@@ -371,15 +332,6 @@ class RootMeanSquare(Observer):
 def test_what_is_no_method_is_refused(text: str, message: str) -> None:
     with pytest.raises(RecipeError, match=message):
         OBSERVERS.parse(text)
-
-
-def test_a_number_goes_to_the_observer_that_it_is_written_behind(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    entry = {"rms": "tests.calibration.test_review:RootMeanSquare"}
-    install(monkeypatch, tmp_path, "an-rms", "me2e_compress.observers", entry)
-
-    assert OBSERVERS.parse("rms:4") == RootMeanSquare(4.0)
 
 
 def test_a_range_shrinks_to_what_was_seen_where_the_reach_lies_inside() -> None:
