@@ -98,29 +98,14 @@ def test_what_would_be_refused_is_listed_and_fails(cli: Cli, tmp_path: Path) -> 
     assert found["tensorrt_rtx"] is None
 
 
-@pytest.mark.parametrize(
-    ("version", "said"),
-    [
-        ("", "m.onnx for tensorrt: 0 errors, 1 warning"),
-        (
-            " --target-version 8.6.1.2",
-            "m.onnx for tensorrt 8.6.1.2: 1 error, 0 warnings",
-        ),
-        (" --target-version 10.12", "m.onnx for tensorrt 10.12: 0 errors, 0 warnings"),
-    ],
-)
-def test_a_version_refuses_what_came_later(
-    cli: Cli, tmp_path: Path, version: str, said: str
-) -> None:
-    save_text(
-        tmp_path / "m.onnx",
-        "m (int64[2] x, int64[2] p) => (int64[2] y) { y = Pow(x, p) }",
-    )
+def test_a_version_refuses_what_came_later(cli: Cli, tmp_path: Path) -> None:
+    text = "m (int64[2] x, int64[2] p) => (int64[2] y) { y = Pow(x, p) }"
+    save_text(tmp_path / "m.onnx", text)
 
-    done = cli(f"lint m.onnx{version}")
+    done = cli("lint m.onnx --target-version 8.6.1.2")
 
-    assert said in done.out
-    assert done.code == ("1 error" in said)
+    assert "m.onnx for tensorrt 8.6.1.2: 1 error, 0 warnings" in done.out
+    assert done.code == 1
 
 
 def test_trt_check_says_what_was_asked_and_of_whom(cli: Cli, dense: Path) -> None:

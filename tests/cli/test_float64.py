@@ -62,21 +62,6 @@ def test_float64_that_runs_is_proven_against_itself(cli: Cli, tmp_path: Path) ->
     assert not any("not proven" in line for line in found["verdict"])
 
 
-def test_the_lint_names_it_although_a_pool_is_wrong_too(
-    cli: Cli, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("onnxruntime.__version__", "1.31.0")
-    text = SAMPLED.replace(
-        "y = MatMul(o, w)", "p = Pad(o, pads) y = MaxPool<kernel_shape=[3,3]>(p)"
-    ).replace("<double h", "<int64[8] pads = {0,0,1,1,0,0,1,1}, double h")
-    save_text(tmp_path / "double.onnx", text)
-
-    found = cli.document("lint double.onnx --target onnxruntime", code=1)
-
-    rules = [(each["severity"], each["rule"]) for each in found["findings"]]
-    assert rules == [("error", "kernel"), ("wrong", "padded-pool")]
-
-
 def test_another_provider_is_not_held_to_the_kernels_of_the_cpu(cli: Cli) -> None:
     said = cli.refused("lint double.onnx --target onnxruntime --provider cuda")
 

@@ -21,7 +21,6 @@ from tests.support.command import Cli, contents
 WRITES = ("replace", "link", "unlink", "rmdir")
 COMMANDS = {
     "compress": "compress dense.onnx -o out.onnx -r full --frames frames",
-    "search": "search dense.onnx frames -o out.toml --max-mb 1 --map map.toml",
     "sensitivity": "sensitivity dense.onnx frames -o out.toml --map map.toml",
 }
 BOTH = pytest.mark.parametrize(
