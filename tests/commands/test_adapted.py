@@ -175,20 +175,6 @@ def test_the_command_that_picks_a_mode_has_the_name_of_the_graph() -> None:
     assert json.loads(said["me2e.plan"])["command_input"] == "navigation"
 
 
-def test_a_map_says_which_output_is_the_plan_and_what_is_fed_back(
-    mine: Path, frames: Path, parts: Path, tmp_path: Path
-) -> None:
-    small = tmp_path / "small.onnx"
-
-    found = compare(mine, mine, frames, CompareOptions(module_map=parts)).fidelity
-    compress(mine, small, "exact", frames, CompressOptions(module_map=parts))
-    timed = profile(mine, frames, None, ProfileOptions(module_map=parts))
-
-    assert found.plan_output == "waypoints"
-    assert compare(small, small, frames).fidelity.plan_output == "waypoints"
-    assert len(timed.trace.samples_us) == 4
-
-
 def test_an_adapter_overrides_the_map(mine: Path, adapter: Path, parts: Path) -> None:
     parts.write_text(parts.read_text() + "step_s = 0.1\n")
 

@@ -19,7 +19,7 @@ from me2e_compress.commands.written import size_note, speed_note
 from me2e_compress.runtime.providers import CPU
 from tests.support.command import Command
 from tests.support.frames import record
-from tests.support.nets import MAP_TEXT, conv_attention, map_text, net
+from tests.support.nets import map_text, net
 
 PROJECTION = """
 net (float[1,8,64] img, float[6,4,4] lidar2img, float[4,256] points,
@@ -187,34 +187,6 @@ def test_an_output_that_int8_freezes_is_an_alert(
 
     said = capsys.readouterr().out
     assert "\nplan is constant: it moves 0.00% as far as before" in said
-
-
-def test_state_is_fed_forward_on_held_out_frames(tmp_path: Path) -> None:
-    """What a recurrent model answers second depends on what it answered first."""
-    model = conv_attention()
-    graph.save(model, tmp_path / "in.onnx")
-    generator = np.random.default_rng(0)
-    frames = [
-        {"image": generator.standard_normal((1, 3, 8, 8)).astype("f")} for _ in range(8)
-    ]
-    record(tmp_path / "frames", frames)
-    (tmp_path / "map.toml").write_text(MAP_TEXT)
-    options = me2e.CompressOptions(
-        scheme="full", rules="paper", module_map=tmp_path / "map.toml", verify_frames=0
-    )
-    found = me2e.compress(
-        tmp_path / "in.onnx", tmp_path / "o.onnx", None, tmp_path / "frames", options
-    )
-    record(tmp_path / "kept", frames[3:6])
-
-    again = me2e.compare(
-        tmp_path / "in.onnx", tmp_path / "o.onnx", tmp_path / "kept"
-    ).fidelity
-
-    assert found.loss is not None
-    assert found.loss.fidelity is not None
-    measured = [each.sqnr_db for each in found.loss.fidelity.outputs]
-    assert measured == pytest.approx([each.sqnr_db for each in again.outputs], abs=0.2)
 
 
 LOGARITHM = """

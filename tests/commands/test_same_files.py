@@ -102,21 +102,6 @@ def test_a_workflow_is_silent_and_writes_what_its_command_writes(
         assert result.headline in repr(result)
 
 
-def test_who_listens_hears_every_stage(dense: Path) -> None:
-    heard = list[str]()
-    listener = me2e.Listener(lambda stage, *_: heard.append(stage))
-
-    me2e.measure_sensitivity(
-        dense / "dense.onnx",
-        dense / "frames",
-        dense / "s.toml",
-        me2e.SensitivityOptions(module_map=dense / MAP),
-        listener,
-    )
-
-    assert list(dict.fromkeys(heard)) == ["calibrate", "modules"]
-
-
 def written(folder: Path) -> dict[str, object]:
     """Read every file but logs and times; of a report all but the seconds."""
     return {
