@@ -6,9 +6,6 @@ import numpy as np
 import pytest
 
 from me2e_compress.base.errors import EvaluationError
-from me2e_compress.calibration.dataset import CalibrationSet
-from me2e_compress.commands.frames import record_frames
-from me2e_compress.commands.options import FramesOptions
 from me2e_compress.driving.adapter import Adapter
 from me2e_compress.driving.adapter.inputs import ModelInputs
 from me2e_compress.driving.contract import Trajectory, checked
@@ -40,22 +37,6 @@ def tcp(tmp_path: Path) -> Path:
             float[1, 39] scores = {{{scores}}},
             float[1, 2] mu = {{3, 2}}, float[1, 2] sigma = {{2, 2}}""",
     )
-
-
-@pytest.mark.usefixtures("weights")
-def test_tcp_sees_its_strip_and_its_state(tcp: Path, tmp_path: Path) -> None:
-    options = FramesOptions(count=2, seed=1, adapter=Path("tcp"), scene_length=2)
-
-    folder = record_frames(tcp, tmp_path / "frames", options)
-
-    first, second = (frame.arrays for frame in CalibrationSet(folder))
-    assert {name: array.shape for name, array in second.items()} == TCP.inputs
-    state, target = second["state"][0], second["target_point"][0]
-    assert state[1:3].tolist() == target.tolist()
-    assert 4.0 <= np.hypot(*target) <= 60.0
-    assert sorted(state[3:]) == [0, 0, 0, 0, 0, 1]
-    assert 0.0 <= state[0] <= 2.0
-    assert not np.array_equal(first["img"], second["img"])
 
 
 def test_tcps_waypoints_are_turned_to_ours(tcp: Path) -> None:
