@@ -132,16 +132,6 @@ def test_a_crash_gives_way_to_the_drive_that_followed(tmp_path: Path) -> None:
     assert result.episodes[0].succeeded
 
 
-def test_crashes_with_different_results_are_a_contradiction(tmp_path: Path) -> None:
-    further = {**CRASHED["scores"], "score_route": 30.0, "score_composed": 30.0}
-    write(tmp_path / "r.json", checkpoint({**CRASHED, "scores": further}, CRASHED))
-
-    result = collect(tmp_path)
-
-    assert result.contradictory == ["RouteScenario_2084_rep0"]
-    assert result.episodes[0].completion_percent == 0.0
-
-
 def test_repetitions_are_other_drives(tmp_path: Path) -> None:
     write(tmp_path / "r.json", checkpoint(GOOD, record(rep=1)))
 

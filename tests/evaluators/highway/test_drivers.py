@@ -1,18 +1,14 @@
 """Drivers by name: their options, their fingerprints, those of other packages."""
 
-from dataclasses import dataclass
 from pathlib import Path
-from typing import ClassVar
 
 import pytest
 
 from me2e_compress.base.errors import EvaluationError
-from me2e_compress.driving.contract import Policy
-from me2e_compress.driving.policies import Driver, driver_named
-from me2e_compress.evaluators.highway.drivers import OnnxDriver, image_size_of
+from me2e_compress.driving.policies import driver_named
+from me2e_compress.evaluators.highway.drivers import OnnxDriver
 from models.driver.expert.blind import Blind
 from tests.evaluators.highway.drivers import straight_on
-from tests.support.installed import install
 
 
 def test_drivers_by_name() -> None:
@@ -38,37 +34,6 @@ def test_results_know_a_driver_by_its_text(text: str) -> None:
 def test_a_wrong_option_of_a_driver_is_named(text: str, message: str) -> None:
     with pytest.raises(EvaluationError, match=message):
         driver_named(text)
-
-
-@dataclass(frozen=True)
-class StillDriver(Driver):
-    """Stands still.
-
-    Attributes:
-        weights: Read by nobody.
-    """
-
-    name: ClassVar[str] = "still"
-    weights: Path
-
-    def open(self) -> Policy:
-        return Blind(0.0)
-
-
-def test_a_policy_of_another_package_drives_by_name(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    entry = {"still": f"{__name__}:StillDriver"}
-    install(monkeypatch, tmp_path, "a-policy", "me2e_compress.policies", entry)
-    weights = tmp_path / "w"
-    weights.write_bytes(b"1")
-    driver = driver_named(f"still:{weights}")
-    before = driver.fingerprint()
-    weights.write_bytes(b"2")
-
-    assert driver == StillDriver(weights)
-    assert before != driver.fingerprint()
-    assert image_size_of(driver.open()) == (96, 160)
 
 
 def test_the_fingerprint_follows_the_files(tmp_path: Path) -> None:

@@ -8,8 +8,6 @@ from typing import ClassVar
 import pytest
 
 from me2e_compress.base.errors import EvaluationError
-from me2e_compress.commands.evaluate import check_model
-from me2e_compress.commands.options import GraphOptions
 from me2e_compress.driving.adapter import Adapter
 from me2e_compress.driving.contract import Trajectory
 from me2e_compress.driving.host_stage import HostStage, HostWork
@@ -116,23 +114,6 @@ output = "way"
 role = "feature"
 optional = ["**"]
 """
-
-
-def test_a_module_map_names_the_plan(tmp_path: Path) -> None:
-    model = straight_on(
-        tmp_path / "m.onnx", outputs="float[1, 6, 2] way", body="way = Identity (ahead)"
-    )
-    (tmp_path / "map.toml").write_text(MAP)
-    driver = OnnxDriver(model, module_map=str(tmp_path / "map.toml"))
-    with pytest.raises(EvaluationError, match="no output plan"):
-        OnnxDriver(model).open()
-    policy = driver.open()
-    policy.reset(EXIT)
-
-    assert isinstance(policy.plan(observation()), Trajectory)
-    assert driver.fingerprint() != OnnxDriver(model).fingerprint()
-    by_map = GraphOptions(module_map=tmp_path / "map.toml")
-    assert check_model(model, by_map).problems == ()
 
 
 def test_a_module_map_of_another_graph_does_not_drive(tmp_path: Path) -> None:

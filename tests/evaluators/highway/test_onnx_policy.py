@@ -232,17 +232,3 @@ def test_a_recurrent_model_knows_how_far_apart_its_frames_are(
             elapsed.append(planned(policy, seen)[0, 0])
 
     assert elapsed == pytest.approx([0.0, 0.35, 0.05] * 2)
-
-
-def test_an_adapter_names_the_recurrent_pair(tmp_path: Path) -> None:
-    named = {key: text.replace("steps_out", "state") for key, text in COUNTER.items()}
-    path = straight_on(tmp_path / "m.onnx", **named)  # type: ignore[arg-type]
-
-    with pytest.raises(EvaluationError, match="input steps is none of img, lidar2img"):
-        OnnxPolicy.open(path)
-    policy = OnnxPolicy.open(
-        path, Adapter.model_validate({"recurrent": {"steps": "state"}})
-    )
-    policy.reset(EXIT)
-
-    assert [planned(policy, observation())[5, 1] for _ in range(2)] == [1.0, 2.0]
