@@ -3,7 +3,7 @@
 import numpy as np
 import onnx_ir as ir
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from me2e_compress.base.errors import GraphError
@@ -14,6 +14,7 @@ from me2e_compress.passes.eliminate_redundant import EliminateRedundant
 from me2e_compress.passes.fold_constants import FoldConstants
 from me2e_compress.passes.fuse_basic import FuseBasic
 from tests.passes.small import apply, ops, read
+from tests.support.profiles import scaled
 
 NESTED = """
 g (float[2] x, bool seen) => (float[2] y) <float[2] w = {1, 2}> {
@@ -130,6 +131,7 @@ def models(draw: st.DrawFn) -> ir.Model:
 
 
 @pytest.mark.parametrize("current", [EliminateRedundant(), FuseBasic()])
+@settings(max_examples=scaled(40))
 @given(model=models())
 def test_a_second_run_changes_nothing(current: Pass, model: ir.Model) -> None:
     apply(current, model)  # which runs it twice

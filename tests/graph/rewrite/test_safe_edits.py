@@ -6,7 +6,7 @@ import numpy as np
 import onnx
 import onnx_ir as ir
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from onnx.reference import ReferenceEvaluator
 
@@ -15,6 +15,7 @@ from me2e_compress.base.errors import GraphError
 from me2e_compress.graph import rewrite
 from me2e_compress.manager.attempt import check_valid
 from tests.support.nets import parsed
+from tests.support.profiles import scaled
 
 X = np.array([[-2.0, 0.5, 3.0]], np.float32)
 
@@ -50,6 +51,7 @@ def hold(model: ir.Model, ports: object, expected: list[Any]) -> None:
         np.testing.assert_array_equal(got, want)
 
 
+@settings(max_examples=scaled(40))
 @given(models(), st.data())
 def test_put(model: ir.Model, data: st.DataObject) -> None:
     ports, expected = graph.interface(model), answers(model)
@@ -63,6 +65,7 @@ def test_put(model: ir.Model, data: st.DataObject) -> None:
     assert zero.name != "v0"
 
 
+@settings(max_examples=scaled(40))
 @given(models())
 def test_bypass_and_remove_dead(model: ir.Model) -> None:
     ports, expected = graph.interface(model), answers(model)
@@ -78,6 +81,7 @@ def test_bypass_and_remove_dead(model: ir.Model) -> None:
     assert rewrite.remove_dead(model.graph) == 0
 
 
+@settings(max_examples=scaled(40))
 @given(models(), st.data())
 def test_replace_value_keeps_the_interface(
     model: ir.Model, data: st.DataObject
