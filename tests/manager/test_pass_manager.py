@@ -148,41 +148,11 @@ def test_a_breach_of_contract_is_named(
         run(chain, context, bad)
 
 
-def test_an_operator_nobody_knows_is_carried_through(context: Context) -> None:
-    model = parsed(
-        '<ir_version: 9, opset_import: ["" : 17, "trt.plugins" : 1]>\n'
-        "m (float[1,8] x) => (float[1,8] y) {"
-        ' ["/backbone/Relu"] a = Relu(x)\n'
-        ' ["/occ_head/Rotate"] b = trt.plugins.Rotate<mode=1>(a)\n'
-        ' ["/plan_head/Neg"] y = Neg(b) }'
-    )
-    report = run(model, context, passes.IDLE)
-    (check,) = report.verifications
-    assert "trt.plugins::Rotate" in (check.skipped or "")
-    assert [node.op_type for node in report.model.graph] == ["Relu", "Rotate", "Neg"]
-
-
 def test_two_runs_give_the_same_bytes(chain: ir.Model, context: Context) -> None:
     first, second = (
         ir.to_proto(run(chain, context, passes.DROPS_RELU).model) for _ in range(2)
     )
     assert first.SerializeToString() == second.SerializeToString()
-
-
-def test_a_report_is_plain_data(
-    chain: ir.Model, context: Context, tmp_path: Path
-) -> None:
-    source, output = tmp_path / "a.onnx", tmp_path / "b.onnx"
-    graph.save(chain, source)
-    report = run(chain, context, passes.HALVES)
-    graph.save(report.model, output)
-    record = report.record(source, output)
-    assert record["pipeline"] == "import-normalize,halves"
-    assert record["source"] == {
-        "file": "a.onnx",
-        "sha256": graph.sha256_of(source),
-        "read_as": "",
-    }
 
 
 def test_progress_counts_the_passes(chain: ir.Model, context: Context) -> None:

@@ -249,11 +249,8 @@ def test_state_and_the_answers_that_are_outputs_are_those_of_the_first_graph() -
 
 
 @pytest.mark.parametrize("target", ["onnxruntime", "tensorrt"])
-@pytest.mark.parametrize("seed", range(3))
-def test_a_transformer_is_fused_behind_int8(
-    target: str, seed: int, tmp_path: Path
-) -> None:
-    draws = np.random.default_rng(seed)
+def test_a_transformer_is_fused_behind_int8(target: str, tmp_path: Path) -> None:
+    draws = np.random.default_rng(0)
     frames = draws.normal(size=(4, 1, 64, 64)).astype(np.float32)
     recording = CalibrationSet(record(tmp_path / "f", [{"x": each} for each in frames]))
     passes = tuple(
@@ -263,9 +260,7 @@ def test_a_transformer_is_fused_behind_int8(
         for current in recipe.load("full-fused")
     )
 
-    report = PassManager(passes).run(
-        transformer(seed=seed), Context(EVERYTHING, recording)
-    )
+    report = PassManager(passes).run(transformer(), Context(EVERYTHING, recording))
 
     assert not report.unproven
     kinds = {node.op_type for node in report.model.graph}
