@@ -4,7 +4,7 @@ from collections.abc import Callable
 from typing import Any
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from me2e_compress.metrics.episode import (
@@ -21,6 +21,7 @@ from me2e_compress.metrics.episode import (
     InfractionKind,
 )
 from tests.metrics.drives import cruise, drive, infraction
+from tests.support.profiles import scaled
 
 numbers = st.floats(-LARGEST, LARGEST)
 percents = st.floats(0.0, 100.0)
@@ -64,6 +65,7 @@ episodes = st.builds(
 )
 
 
+@settings(max_examples=scaled(40))
 @given(episodes)
 def test_json_brings_back_every_bit(episode: Episode) -> None:
     text = json.dumps(episode.to_json(), allow_nan=False)
