@@ -9,7 +9,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from me2e_compress.operators import Dialect
-from me2e_compress.operators.deformable_aggregation import DeformableAggregation
 from me2e_compress.operators.deformable_attention import DeformableAttention
 from me2e_compress.operators.raw_attention import raw_own_form
 from me2e_compress.runtime import runnable
@@ -61,30 +60,6 @@ def test_every_dialect_answers_its_reference(
     result = Session(model, threads=1).run(arrays)["result"]
 
     expected = dialect_reference(OPERATOR, dialect, DrawnCall(arrays))
-    assert np.allclose(result, expected, rtol=1e-4, atol=1e-4)
-
-
-def test_aggregation_over_cameras_takes_the_same_kernel() -> None:
-    random = np.random.default_rng(3)
-    sizes = np.array([[[4, 6], [2, 3]], [[3, 5], [0, 2]]], np.int32)
-    areas = sizes.astype(np.int64).prod(axis=-1)
-    starts = (areas.ravel().cumsum() - areas.ravel()).reshape(2, 2)
-    inputs = {
-        "mc_ms_feat": random.normal(size=(2, areas.sum(), 12)),
-        "spatial_shape": sizes,
-        "scale_start_index": starts.astype(np.int32),
-        "sampling_location": random.uniform(-0.2, 1.2, (2, 200, 5, 2, 2)),
-        "weights": random.normal(size=(2, 200, 5, 2, 2, 3)),
-    }
-    arrays = in_float32(inputs)
-    operator = DeformableAggregation()
-    model = graph_of(operator.dialects[0], arrays, opset=17)
-    _, needed = runnable.replace_fused(model, compiled=True)
-    assert [each.op_type for each in needed] == ["MultiScaleDeformableAttention"]
-
-    result = Session(model, threads=1).run(arrays)["result"]
-
-    expected = operator.reference(list(arrays.values()), {})
     assert np.allclose(result, expected, rtol=1e-4, atol=1e-4)
 
 

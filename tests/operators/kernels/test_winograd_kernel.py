@@ -52,7 +52,7 @@ def check(arrays: Arrays, attributes: dict[str, Any], threads: int) -> None:
     np.testing.assert_allclose(found, expected, rtol=0, atol=4e-5)
 
 
-@settings(max_examples=scaled(25))
+@settings(max_examples=scaled(12))
 @given(
     batch=st.integers(1, 3),
     deep=channels,
