@@ -176,18 +176,6 @@ def test_readers_read_the_mean_over_the_frames(recording: CalibrationSet) -> Non
     assert not provenance.missing(result.model)
 
 
-def test_means_leave_substitutes_aside(recording: CalibrationSet) -> None:
-    chosen = AblateModules(drop=("map",), fill="means", drop_outputs=True)
-    substitutes = context(substitute("*.look", "*.meet"))
-
-    result = chosen.run(net(STACK, {}), replace(substitutes, frames=recording))
-
-    seen = np.exp(-np.array([1, 0, 3, 6], "f"))
-    met = np.sqrt(np.array([0, 0, 4, 9], "f"))
-    np.testing.assert_allclose(plan_of(result.model), seen + met, rtol=1e-6)
-    assert result.removed_outputs == ("lanes",)
-
-
 def test_shapes_have_no_mean(recording: CalibrationSet) -> None:
     with pytest.raises(PreconditionError, match="size is arithmetic on shapes"):
         replace(NO_MAP, fill="means").run(

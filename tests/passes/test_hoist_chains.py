@@ -90,7 +90,7 @@ def computed(model: ir.Model) -> int:
 
 
 @hypothesis.given(repetitions())
-@hypothesis.settings(max_examples=scaled(150))
+@hypothesis.settings(max_examples=scaled(80))
 def test_any_chain_behind_a_repetition(drawn: tuple[str, dict[str, Any]]) -> None:
     """Sizes this small never pay: here a byte costs what starting a node does."""
     text, weights = drawn
