@@ -2,15 +2,11 @@
 
 import dataclasses
 from collections.abc import Collection
-from dataclasses import dataclass
-from pathlib import Path
 from typing import ClassVar
 
-import numpy as np
 import onnx_ir as ir
 import pytest
 
-from me2e_compress.graph import static_shape
 from me2e_compress.manager import recipe
 from me2e_compress.passes import PASSES, Context
 from me2e_compress.passes.quantize_int8 import QuantizeInt8
@@ -20,8 +16,7 @@ from me2e_compress.quantization.plan import make_plan
 from me2e_compress.quantization.rules import RULE_SETS, Rule, RuleFacts, RuleSet
 from me2e_compress.quantization.rules.rule_sets import PaperRules
 from me2e_compress.quantization.scheme import QuantScheme
-from tests.support.installed import install
-from tests.support.nets import MODULES, by_output, conv_attention, net, planned
+from tests.support.nets import MODULES, conv_attention
 
 
 @dataclasses.dataclass(frozen=True)
@@ -63,67 +58,11 @@ def test_a_pipeline_names_them() -> None:
     assert PASSES.parse('quantize-int8{rules="paper"}') == QuantizeInt8(rules="paper")
 
 
-# Rules and sets of rules of another package, which its entry points name.
-
-
-PRODUCTS = (
-    "p (float[9,32] x, float[32,32] w, float[32,64] v)"
-    " => (float[9,32] y, float[9,64] z) { y = MatMul(x, w) z = MatMul(x, v) }"
-)
-
-
-@dataclass(frozen=True)
-class OnlySmall(Rule):
-    """Products of more than some columns stay float."""
-
-    name: ClassVar[str] = "only-small"
-    columns: int = 8
-
-    def objection(self, node: ir.Node, facts: RuleFacts) -> str | None:
-        shape = static_shape(node.outputs[0])
-        return "too wide" if shape and shape[-1] > self.columns else None
-
-
-def test_a_rule_of_another_package_joins_a_set(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    entry = {"only-small": f"{__name__}:OnlySmall"}
-    install(monkeypatch, tmp_path, "a-rule", "me2e_compress.rules", entry)
-    model = net(PRODUCTS, {"w": np.ones((32, 32)), "v": np.ones((32, 64))})
-
-    plan = planned(model, "paper{extra=[only-small{columns=32}]}")
-
-    assert by_output(plan)["y"].rule == "layer"
-    assert by_output(plan)["z"].rule == "only-small"
-    assert plan.rules == 'paper{extra=["only-small{columns=32}"]}'
-
-
-@dataclass(frozen=True)
-class NoRules(RuleSet):
-    """Everything that can be is int8."""
-
-    name: ClassVar[str] = "no-rules"
-
-    def own_rules(self) -> tuple[Rule, ...]:
-        return PaperRules().own_rules()[:3]
-
-
-def test_a_set_of_another_package_decides(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    entry = {"no-rules": f"{__name__}:NoRules"}
-    install(monkeypatch, tmp_path, "a-set", "me2e_compress.rule_sets", entry)
-    model = net(PRODUCTS, {"w": np.ones((32, 32)), "v": np.ones((32, 64))})
-
-    assert planned(model, "no-rules").counts()["layer"] == 2
-
-
 # Int8 that does not pay stays float.
 
 
 BOTH = QuantScheme.of(("backbone", "head"), MODULES)
 A, B, C = (ir.node("Conv", [], name=name) for name in "abc")
-ALL = frozenset({A, B, C})
 
 
 def priced(costs: CostsOf | None, overrides: str = "") -> QuantPlan:
