@@ -1,4 +1,3 @@
-import os
 from dataclasses import replace
 from pathlib import Path
 
@@ -139,22 +138,6 @@ def test_a_place_that_cannot_be_written_is_named(tmp_path: Path, name: str) -> N
     with pytest.raises(EvaluationError, match=f"{name}: the picture cannot be"):
         write_picture(path, [picture(moment(0)).frame(0)])
     assert not list(tmp_path.iterdir())
-
-
-def test_a_failed_write_leaves_the_old_file(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    path = tmp_path / "moment.png"
-    path.write_bytes(b"old")
-
-    def full(*_: object, **__: object) -> None:
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr(os, "fsync", full)
-    with pytest.raises(EvaluationError, match="No space left on device"):
-        write_picture(path, [picture(moment(0)).frame(0)])
-    assert path.read_bytes() == b"old"
-    assert [p.name for p in tmp_path.iterdir()] == ["moment.png"]
 
 
 def test_two_infractions_at_one_place_are_both_named() -> None:

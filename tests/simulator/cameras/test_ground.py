@@ -1,10 +1,5 @@
-import hashlib
-import os
-import subprocess
-import sys
 from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
@@ -122,15 +117,6 @@ def test_the_texture_is_read_only_and_its_levels_nest(texture: GroundTexture) ->
         texture.classes[0, 0] = 0
 
 
-PROGRAM = """
-import hashlib
-from tests.simulator.cameras import town
-from me2e_compress.simulator.camera_rig import CameraRig, Weather
-from me2e_compress.simulator.cameras.renderer import Cameras
-for options in (Weather(), town.STORM):
-    images = Cameras(town.paint(), CameraRig(96, 160), options).render(town.busy())
-    print(hashlib.sha256(images.tobytes()).hexdigest())
-"""
 Eyes = Callable[..., npt.NDArray[np.int64]]
 
 
@@ -159,21 +145,6 @@ def test_another_seed_or_time_gives_other_noise(
 ) -> None:
     changed = see(Weather(noise=6.0, seed=seed), time_us)
     assert (changed != see(Weather(noise=6.0, seed=1))).mean() > 0.5
-
-
-def test_frames_are_the_same_in_every_process() -> None:
-    def hashes(salt: str) -> list[str]:
-        command, place = [sys.executable, "-c", PROGRAM], Path(__file__).parents[3]
-        salted = {**os.environ, "PYTHONHASHSEED": salt}
-        return subprocess.check_output(
-            command, env=salted, cwd=place, text=True
-        ).split()
-
-    first = hashes("1")
-    assert first == hashes("2")
-    assert len(set(first)) == 2
-    images = Cameras(town.paint(), CameraRig(96, 160)).render(town.busy())
-    assert hashlib.sha256(images.tobytes()).hexdigest() == first[0]
 
 
 def test_fog_halves_contrast_at_the_distance_koschmieder_gives(
