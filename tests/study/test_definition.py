@@ -203,7 +203,7 @@ def test_a_mean_is_that_of_the_drive_that_it_names(
     even = Condition("even", mean_of="faster.busy")
     names = ("busy", "even")
     blocks = (StudyBlock("tail", ("faster",), names),)
-    asked = replace(ASKED, conditions=(busy, even), blocks=blocks)
+    asked = replace(ASKED, conditions=(busy, even), blocks=blocks, routes=ROUTES[:1])
 
     run_study(asked, tmp_path, Here())
 

@@ -43,16 +43,6 @@ def made(study: Study, folder: Path) -> PreparedVariant:
     return prepare_variant(study, study.variants[0], Workspace(folder), SILENT)
 
 
-@pytest.mark.usefixtures("weights")
-def test_passes_are_run_on_a_model_that_ships(make: Make, tmp_path: Path) -> None:
-    variant = Variant("small", "highway", recipe.parse("eliminate-redundant"))
-
-    result = made(make(variants=(variant,), baseline="small"), tmp_path)
-
-    assert result.model is not None
-    assert result.model.parent == tmp_path / "models"
-
-
 def test_passes_make_a_model_of_their_own(study: Study, tmp_path: Path) -> None:
     source = Path(study.variants[0].policy)
     before = source.read_bytes()

@@ -195,24 +195,6 @@ def test_files_are_written_beside_each_other(
         write_study(result, written.tables / "study")
 
 
-def test_the_line_of_the_docs_reads_a_folder_of_records(
-    result: StudyResult, folder: Path
-) -> None:
-    pandas = pytest.importorskip("pandas")
-    text = Path("docs/study.md").read_text("utf-8")
-    (line,) = re.findall(r"^    (pandas\.concat.*)$", text, re.MULTILINE)
-
-    names = {"pandas": pandas, "Path": Path}
-    rows = eval(line.replace("OUT/", f"{folder}/"), names)
-
-    means = rows.groupby(level=0).driving_score.mean().to_dict()
-    assert means == {
-        drive.name: pytest.approx(drive.scores.driving_score.value)
-        for drive in result.drives
-        if drive.scores is not None
-    }
-
-
 def test_a_scoreboard_has_a_row_a_drive(result: StudyResult) -> None:
     board = scoreboard(result)
 

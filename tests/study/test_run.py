@@ -125,19 +125,6 @@ def test_what_is_there_is_not_made_again_and_shared_by_studies(
         run_study(other, tmp_path, Here())
 
 
-@pytest.mark.usefixtures("short")
-def test_a_study_is_silent_and_its_file_is_taken_as_it_is(
-    make: Make, tmp_path: Path, capfd: pytest.CaptureFixture[str]
-) -> None:
-    toml = tmp_path / "study.toml"
-    toml.write_text(STUDY.replace("routes = 3", "routes = 1"))
-
-    result = run_study(toml, tmp_path / "out", Here())
-
-    assert capfd.readouterr() == ("", "")
-    assert result.study == load_study(toml)
-
-
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
