@@ -122,7 +122,6 @@ def test_an_average_is_int8_on_its_own_grid_unless_it_is_read_as_float(
 @pytest.mark.parametrize(
     ("reader", "output"),
     [
-        ("y = Conv(p, k)", IMAGE),
         ("z = Relu(p) y = Conv(z, k)", IMAGE),
         ("t = Transpose<perm=[0,2,3,1]>(p) y = MatMul(t, l)", "float[3,h,w,8] y"),
     ],

@@ -7,7 +7,7 @@ from me2e_compress.base.errors import PreconditionError
 from me2e_compress.quantization.plan import make_plan
 from me2e_compress.targets.onnxruntime import convert, unranged
 from me2e_compress.targets.tensorrt import TensorRT
-from tests.support.nets import FULL, PAPER, conv_attention, drawn, parsed
+from tests.support.nets import FULL, PAPER, drawn, parsed
 from tests.targets.onnxruntime.lowered import (
     IMAGE,
     TOKENS,
@@ -85,20 +85,6 @@ def test_weights_behind_a_pair_become_stored_integers() -> None:
     assert len(stored) == 1
     np.testing.assert_array_equal(stored[0], np.rint(steps).astype(np.int8))
     assert kernels(small)["MatMulIntegerToFloat"] == 1
-
-
-def test_attention_products_of_a_tensorrt_graph_become_float() -> None:
-    generator = np.random.default_rng(0)
-    fed = {
-        "image": generator.standard_normal((1, 3, 8, 8)).astype(np.float32),
-        "memory": np.zeros((1, 8, 64), np.float32),
-    }
-    source = placed(conv_attention(), fed)
-
-    found = kernels(converted(source, fed))
-
-    assert found["MatMul"] + found["FusedMatMul"] == 2
-    assert found["QLinearConv"] == 1
 
 
 def test_an_output_behind_a_pair_stays_an_output() -> None:

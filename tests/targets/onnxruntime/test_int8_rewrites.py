@@ -58,7 +58,7 @@ def layers(draw: st.DrawFn) -> Drawn:
     )
 
 
-@settings(max_examples=scaled(150))
+@settings(max_examples=scaled(80))
 @given(layers())
 def test_what_runs_otherwise_is_named_and_nothing_else(drawn: Drawn) -> None:
     rules = [each.rule for each in int8_rewrites(drawn.model())]

@@ -3,7 +3,7 @@
 import numpy as np
 import onnx_ir as ir
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from me2e_compress.targets.onnxruntime.region import (
@@ -14,6 +14,7 @@ from me2e_compress.targets.onnxruntime.region import (
     never_negative,
 )
 from tests.support.calls import calls
+from tests.support.profiles import scaled
 from tests.targets.onnxruntime.draws import (
     AVERAGED,
     MOVED,
@@ -41,6 +42,7 @@ def test_every_operator_that_moves_is_drawn() -> None:
 
 
 @pytest.mark.parametrize("op", sorted({*MOVES, *MOVED, *AVERAGED}))
+@settings(max_examples=scaled(40))
 @given(SEEDS, st.sampled_from([0, 128]))
 def test_what_moves_gives_the_same_integers_before_and_behind(
     op: str, seed: int, zero: int
@@ -99,6 +101,7 @@ UNARY = (
 
 
 @pytest.mark.parametrize("op", UNARY)
+@settings(max_examples=scaled(20))
 @given(SEEDS)
 def test_what_counts_as_never_negative_is_not(op: str, seed: int) -> None:
     rng = np.random.default_rng(seed)
@@ -113,6 +116,7 @@ def test_what_counts_as_never_negative_is_not(op: str, seed: int) -> None:
 
 
 @pytest.mark.parametrize("op", sorted({*MOVED, *AVERAGED}))
+@settings(max_examples=scaled(40))
 @given(SEEDS)
 def test_what_hands_on_that_nothing_is_negative_does(op: str, seed: int) -> None:
     model, x = drawn(op, seed)
