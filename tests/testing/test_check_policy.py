@@ -1,6 +1,5 @@
 import itertools
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import ClassVar
 
 import numpy as np
@@ -17,12 +16,10 @@ from me2e_compress.driving.contract import (
     Trajectory,
 )
 from me2e_compress.driving.policies import Driver
-from me2e_compress.evaluators.highway.drivers import OnnxDriver
 from me2e_compress.simulator.scene import Control
 from me2e_compress.simulator.world import World
 from me2e_compress.testing import check_policy
 from models.driver.expert.blind import BlindDriver
-from tests.evaluators.highway.drivers import straight_on
 
 DENSE = np.array([0.1, 0.2])
 AHEAD = np.array([[2.0 * k, 0.0] for k in range(1, 7)])
@@ -30,20 +27,6 @@ AHEAD = np.array([[2.0 * k, 0.0] for k in range(1, 7)])
 
 def test_a_privileged_policy_holds() -> None:
     assert len(check_policy(BlindDriver(6.0))) == 8
-
-
-def test_a_recurrent_model_holds(tmp_path: Path) -> None:
-    model = straight_on(
-        tmp_path / "m.onnx",
-        inputs="float[1] count",
-        outputs="float[1, 6, 2] plan, float[1] count_out",
-        body="count_out = Add (count, one)\nplan = Mul (ahead, count_out)",
-        initializers=", float[1] one = {1.0}",
-    )
-
-    first, *_, last = (points(answer) for answer in check_policy(OnnxDriver(model)))
-
-    assert last.tolist() == (first * 8).tolist()
 
 
 def points(answer: Trajectory | PedalsAndWheel) -> npt.NDArray[np.floating]:
