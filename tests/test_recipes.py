@@ -12,7 +12,7 @@ import onnx_ir as ir
 import pytest
 
 from me2e_compress import graph
-from me2e_compress.base.errors import FramesError, RecipeError
+from me2e_compress.base.errors import RecipeError
 from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.driving.onnx_policy import OnnxPolicy
 from me2e_compress.graph import provenance
@@ -51,45 +51,6 @@ class Sample(Pass):
 def known(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     entry = {"sample": f"{__name__}:Sample"}
     install(monkeypatch, tmp_path, "a-package", "me2e_compress.passes", entry)
-
-
-@pytest.mark.parametrize(
-    ("text", "expected"),
-    [
-        ("sample", Sample()),
-        ("sample{}", Sample()),
-        ("sample{drop=[occ]}", Sample(drop=("occ",))),
-        ('sample{drop=["occ", "map"]}', Sample(drop=("occ", "map"))),
-        ("sample{limit=3, strict=true}", Sample(limit=3, strict=True)),
-        ("sample{ratio=1e-3,fill=a-b}", Sample(ratio=1e-3, fill="a-b")),
-        ("sample{fill=recipes/x.json}", Sample(fill="recipes/x.json")),
-        ('sample{fill="zeros, or so"}', Sample(fill="zeros, or so")),
-    ],
-)
-def test_text_becomes_a_pass_and_is_written_as_it_is_read(
-    text: str, expected: Sample
-) -> None:
-    assert recipe.parse(text) == (expected,)
-    assert recipe.parse(f"{text}, sample,{text}") == (expected, Sample(), expected)
-    assert recipe.parse(recipe.to_text([expected, Sample()])) == (expected, Sample())
-
-
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ("smple", "no pass 'smple'; there are"),
-        ("sample{limitt=3}", "sample has no option 'limitt'; it has drop, limit"),
-        ("sample{limit=many}", "sample: limit: Input should be a valid integer"),
-        ("sample{drop=[}", "pass: cannot read .* from '}' on: a value is expected"),
-        ("sample{limit=3", "pass: cannot read .* to the end: a comma or }"),
-        ("", "pass: cannot read '' to the end: a name is expected"),
-        ("sample sample", "from 'sample' on: a comma or the end is expected"),
-    ],
-)
-def test_bad_text_names_the_culprit(text: str, message: str) -> None:
-    with pytest.raises(RecipeError, match=message) as caught:
-        recipe.parse(text)
-    assert "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize(
@@ -199,13 +160,6 @@ def test_what_is_left_still_drives(without: Without, tmp_path: Path) -> None:
         "prev_bev": "prev_bev_out",
         "prev_memory": "prev_memory_out",
     }
-
-
-def test_without_frames_there_is_no_mean(model: Path) -> None:
-    loaded = graph.load(model)
-
-    with pytest.raises(FramesError, match="fill=means needs recorded frames"):
-        PassManager(recipe.load("minus-occ")).run(loaded, Context(detect(loaded)))
 
 
 Numbers = npt.NDArray[np.float32]
