@@ -332,19 +332,3 @@ def test_what_is_no_number_of_one_type_stays(body: str) -> None:
     model = bare(OPSET.replace("17", "26") + text, {})
 
     assert check_pass(ConvertFloat16(), model).changes == 0
-
-
-def test_a_weight_that_float32_reads_too_is_stored_in_both() -> None:
-    half = converted(
-        """w (float[1,4,8,8] f, float[2,2,2,8] q, float[8,2] w, float[3,8] z)
-            => (float[1,4,2,2] y, float[3,2] u) {
-            grid = MatMul(q, w)
-            y = GridSample(f, grid)
-            u = MatMul(z, w)
-        }""",
-        w=np.ones((8, 2), np.float32),
-    )
-    stored = {v.dtype for v in half.graph.initializers.values()}
-
-    assert stored == {HALF, FLOAT}
-    assert casts(half) == 2  # z and u

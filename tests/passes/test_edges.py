@@ -71,19 +71,6 @@ def test_an_added_query_is_repeated_for_every_mode() -> None:
     np.testing.assert_allclose(plan, attended(query + ego, bev), 1e-4)
 
 
-def test_a_track_query_is_broadcast_in_the_place_of_six_modes() -> None:
-    edge = Edge("track", "planner", "replace", of="motion")
-    chosen = AblateModules(("motion",), fill="zeros", edges=(edge,))
-
-    result = chosen.run(stack(), context())
-
-    bev, ego, _ = scene()
-    answer = answers(result.model)
-    np.testing.assert_allclose(answer["plan"][0, 0], attended(2 * ego, bev), 1e-4)
-    assert "planner reads ego [1,8] in the place of modes [1,6,8]" in result.notes
-    assert not answer["taken"].any()  # occupancy reads motion's agents as zeros
-
-
 def test_a_map_says_who_reads_a_substitute() -> None:
     wanted = 'substitutes = [{ scope = "motion", by = "track", reader = "planner" }]'
 

@@ -132,19 +132,6 @@ def test_repetitions_that_a_product_does_not_do_stay(
     assert apply(FlattenMatmul(), model).changes == 0
 
 
-def test_constant_points_are_stored_as_rows() -> None:
-    text = graph_of(
-        "(double[6,1,1,4,4] a) => (double[6,4,1000,4,1] y)", "y=MatMul(a,b)"
-    )
-    points = RANDOM.normal(size=POINTS)
-    model = read(text, b=points)
-    apply(FlattenMatmul(), model)
-    assert ops(model) == ["Reshape", "Transpose", "MatMul", "Reshape"]
-    a = RANDOM.normal(size=MATRICES)
-    (got,) = compute(model, {"a": a})
-    np.testing.assert_allclose(got, a @ points, rtol=0, atol=1e-9)
-
-
 @pytest.mark.parametrize(
     ("left", "right"),
     [

@@ -72,29 +72,6 @@ def test_an_attention_of_constants_is_folded_within_the_limit_alone() -> None:
     assert ops(large) == ["Add", "Mul", "MatMul"]
 
 
-def test_slices_of_a_packed_weight_are_folded_beside_what_stays_computed() -> None:
-    """Together they are no larger than it, whatever the expansion behind them costs."""
-    text = (
-        "g (float[90000,32] x) => (float[90000,32] y) {"
-        " cut = Slice(packed, zero, half, zero) turned = Transpose<perm = [1, 0]>(cut)"
-        " rest = Slice(packed, half, end, zero)"
-        " a = MatMul(x, turned) b = Add(a, rest)"
-        " row = ReduceSum<keepdims = 1>(rest, zero)"
-        " table = Expand(row, shape) y = Add(b, table) }"
-    )
-    model = read(
-        text,
-        packed=np.ones((64, 32), np.float32)[:33],
-        zero=np.array([0]),
-        half=np.array([32]),
-        end=np.array([33]),
-        shape=np.array([90000, 32]),
-    )
-    apply(FoldConstants(), model)
-
-    assert ops(model) == ["MatMul", "Add", "Expand", "Add"]
-
-
 TABLE = """
 g (float[1000,64] x) => (float[1000,64] y) {
     table = Expand(row, shape)
