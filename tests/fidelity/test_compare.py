@@ -185,6 +185,20 @@ def test_small_channels_beside_large_ones_are_judged_apart() -> None:
     assert of_one_output(boxes, boxes + 0.5).small == ""
 
 
+@pytest.mark.parametrize("values", [(600, 600, 1), (600, 90, 11, 1), (50, 6, 1)])
+@pytest.mark.parametrize("layers", [(2, 1), (1, 6), (1, 3, 5, 5), ()])
+def test_what_is_30_times_smaller_is_apart_wherever_its_channels_stand(
+    values: tuple[float, ...], layers: tuple[int, ...]
+) -> None:
+    sizes = np.array([*values, 1.0])
+    truth = np.random.default_rng(0).uniform(-1, 1, (*layers, 30, len(sizes))) * sizes
+    small = of_one_output(truth, truth + 0.1).small
+
+    apart = np.flatnonzero(sizes * 30 < sizes[0]).tolist()
+    ranges = {1: f"{apart[0]}", 2: f"{apart[0]}:{len(sizes)}"}[min(2, len(apart))]
+    assert small == f"[{':, ' * (len(layers) + 1)}{ranges}]"
+
+
 @pytest.mark.parametrize(
     ("axes", "shapes"),
     [
