@@ -2,7 +2,7 @@
 
 A graph may keep nearly every decibel and have one output that is dead: a plan that
 rests while boxes and view are perfect. So the standard deviation of each output over
-the frames is held against that of the first graph.
+the frames is compared with that of the first graph.
 """
 
 import dataclasses
@@ -17,14 +17,12 @@ from me2e_compress.fidelity import ALIVE
 from me2e_compress.runtime.frames import Array, Frame
 from me2e_compress.runtime.session import Session
 
+# A deviation, over the length of the output, that may be rounding alone: two runtimes
+# are 3e-5 to 6e-5 apart in float32 on UniAD-tiny (models/README.md)
 ROUNDING = 1e-4
-"""A deviation, over the length of the output, that may be rounding alone: two runtimes
-are 3e-5 to 6e-5 apart in float32 on UniAD-tiny (models/README.md)."""
+WEAK = 0.5  # an output that moves less far than this share of before is alive, but weak
 
 Verdict: TypeAlias = Literal["alive", "weak", "constant", "frozen", "not judged"]
-
-WEAK = 0.5
-"""An output that moves less far than this share of before is alive, but weak."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -69,7 +67,7 @@ class Liveness:
     @property
     def faults(self) -> tuple[str, ...]:
         """A sentence for each dead output, and for each state that is not fed back."""
-        dead = [str(each) for each in self.outputs if each.is_dead]
+        dead = [str(output) for output in self.outputs if output.is_dead]
         return (*dead, *(f"{name} is not fed back any more" for name in self.not_fed))
 
     def lines(self) -> Iterator[str]:
@@ -78,27 +76,23 @@ class Liveness:
             yield f"liveness: not measured ({self.reason})"
             return
         moving = [
-            (each.moves, each.output)
-            for each in self.outputs
-            if each.verdict in ("alive", "weak") and each.moves is not None
+            (output.moves, output.output)
+            for output in self.outputs
+            if output.verdict in ("alive", "weak") and output.moves is not None
         ]
         if moving and not self.faults:
             share, output = min(moving)
             words = "every output is alive" if share >= WEAK else "none dead, but weak"
             yield f"{words} (least of all {output}: {share:.0%})"
-        rests = [
-            f"{each.output} ({each.reason})"
-            for each in self.outputs
-            if each.verdict == "not judged"
-        ]
+        rests = [o for o in self.outputs if o.verdict == "not judged"]
         if rests:
-            yield f"liveness not judged: {', '.join(rests)}"
+            reasons = ", ".join(f"{o.output} ({o.reason})" for o in rests)
+            yield f"liveness not judged: {reasons}"
 
     def table(self) -> Table:
         """Return a row for each output."""
         rows = [
-            (each.output, each.verdict, format_number(each.moves, ".2f"))
-            for each in self.outputs
+            (o.output, o.verdict, format_number(o.moves, ".2f")) for o in self.outputs
         ]
         note = (
             "Standard deviation over the frames, as a share of the first graph's: dead"
@@ -107,68 +101,52 @@ class Liveness:
         return table("Liveness", ("output", "it is", "moves"), rows, note, words=2)
 
 
-class Deviation:
-    """The standard deviation of one output over frames, all elements pooled."""
-
-    def __init__(self) -> None:
-        self.frames, self.resized, self.discrete = 0, False, False
-        self._mean = self._squares = np.zeros(())
-
-    def add(self, value: Array) -> None:
-        """Add a frame; NaN and infinities count as 0, another shape as ``resized``."""
-        wide = np.nan_to_num(np.asarray(value, np.float64), posinf=0.0, neginf=0.0)
-        self.frames += 1
-        if self.frames == 1:
-            self.discrete = value.dtype.kind not in "fc"
-            self._mean, self._squares = wide.copy(), np.zeros_like(wide)
-        elif wide.shape != self._mean.shape:
-            self.resized = True
-        else:  # Welford's update of mean and sum of squares
-            gap = wide - self._mean
-            self._mean += gap / self.frames
-            self._squares += gap * (wide - self._mean)
-
-    @property
-    def deviation(self) -> float:
-        """Euclidean norm of the elements' standard deviations over the frames."""
-        return math.sqrt(float(self._squares.sum()) / max(self.frames, 1))
-
-    @property
-    def is_constant(self) -> bool:
-        """Whether it moves by rounding at most."""
-        length = math.hypot(float(np.linalg.norm(self._mean)), self.deviation)
-        return self.deviation <= ROUNDING * length
-
-
 class OutputTally:
-    """The deviation of one output in both graphs."""
+    """The standard deviation of one output over frames, in both graphs."""
 
     def __init__(self, name: str) -> None:
-        self.name, self._first, self._second = name, Deviation(), Deviation()
+        self.name = name
+        self._frames, self._resized, self._discrete = 0, False, False
+        self._mean = self._squares = np.zeros(2)  # (graphs, *shape of the output)
 
     def add(self, first: Array, second: Array) -> None:
-        """Add what both graphs give of it in a frame."""
-        self._first.add(first)
-        self._second.add(second)
+        """Add what both graphs give in a frame; NaN and infinities count as 0."""
+        if first.shape != second.shape or (
+            self._frames and first.shape != self._mean.shape[1:]
+        ):
+            self._resized = True
+            return
+        pair = np.stack((first, second)).astype(np.float64)
+        pair = np.nan_to_num(pair, posinf=0.0, neginf=0.0)
+        if not self._frames:
+            self._discrete = first.dtype.kind not in "fc"
+            self._mean, self._squares = np.zeros_like(pair), np.zeros_like(pair)
+        # Welford's update of mean and sum of squares
+        self._frames += 1
+        gap = pair - self._mean
+        self._mean += gap / self._frames
+        self._squares += gap * (pair - self._mean)
 
     def result(self, alive: float) -> OutputLiveness:
-        """Judge the output; it is dead below ``alive`` of the first one's deviation."""
-        first, second = self._first, self._second
-        if first.resized or second.resized:
+        """Return the verdict: dead below ``alive`` of the first graph's deviation."""
+        if self._resized:
             return OutputLiveness(self.name, "not judged", None, "its shape changes")
-        if first.is_constant:
+        # Norms over all elements: of the standard deviations, and of the first mean
+        squares = self._squares.reshape(2, -1).sum(axis=1)
+        first, second = np.sqrt(squares / max(self._frames, 1)).tolist()
+        length = math.hypot(float(np.linalg.norm(self._mean[0])), first)
+        if first <= ROUNDING * length:
             reason = "it rests in the first graph too"
             return OutputLiveness(self.name, "not judged", None, reason)
-        moves = second.deviation / first.deviation
-        if first.discrete:
+        moves = second / first
+        if self._discrete:
             return OutputLiveness(self.name, "not judged", moves, "whole numbers")
         if moves >= alive:
             verdict: Verdict = "alive" if moves >= WEAK else "weak"
             return OutputLiveness(self.name, verdict, moves)
+        verdict = "frozen" if moves else "constant"
         reason = f"it moves {moves:.2%} as far as before"
-        return OutputLiveness(
-            self.name, "frozen" if moves else "constant", moves, reason
-        )
+        return OutputLiveness(self.name, verdict, moves, reason)
 
 
 class LivenessTally:
@@ -185,12 +163,12 @@ class LivenessTally:
     ) -> None:
         """Add the outputs of both graphs in a frame; those of one alone are ignored."""
         self._frames += 1
-        for name in (each for each in right if each in left):
+        for name in (output for output in right if output in left):
             tally = self._tallies.setdefault(name, OutputTally(name))
             tally.add(left[name], right[name])
 
     def result(self, alive: float = ALIVE) -> Liveness:
-        """Judge every output, if there are two frames or more."""
+        """Return the verdicts, if there are two frames or more."""
         if self._frames < 2:
             return Liveness((), alive, reason="one frame alone: nothing moves")
         outputs = (tally.result(alive) for tally in self._tallies.values())
