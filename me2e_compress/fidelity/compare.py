@@ -217,15 +217,12 @@ def common_adapter(a: Session, b: Session) -> tuple[PlanAdapter | None, str]:
     return adapter, ""
 
 
-MODES_RANK = 4
-"""Rank of a plan with modes: [1, modes, n, 2]."""
+MODES_RANK = 4  # rank of a plan with modes: [1, modes, n, 2]
+# Channels so many times smaller than the largest, and than the next larger ones, have
+# an SQNR of their own: of the 127 steps of a scale that all share, four are theirs
 SMALL_RATIO, GAP_RATIO = 30.0, 4.0
-"""Channels so many times smaller than the largest, and than the next larger ones, have
-an SQNR of their own: of the 127 steps of a scale that all share, four are theirs."""
-_MOST_CHANNELS = 128
-"""The longest axis that may be one of channels."""
-_MOST_ASPECT = 4
-"""Largest ratio of the sides of a picture."""
+_MOST_CHANNELS = 128  # the longest axis that may be one of channels
+_MOST_ASPECT = 4  # largest ratio of the sides of a picture
 
 
 class Tally:
@@ -356,11 +353,10 @@ def decibels(signal: float, noise: float) -> float:
 # strength after rounding, so each is compared with the other model's nearest one.
 
 
-PRESENCE_SCORE = 0.5
-"""Least score of an agent that counts: it is there rather than not."""
+PRESENCE_SCORE = 0.5  # least score of an agent that counts: it is there rather than not
+# Centres farther apart are two agents: the largest distance at which nuScenes'
+# detection benchmark matches them
 MATCH_M = 2.0
-"""Centres farther apart are two agents: the largest distance at which nuScenes'
-detection benchmark matches them."""
 
 
 class SetOutputs(pydantic.BaseModel):

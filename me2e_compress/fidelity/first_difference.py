@@ -21,9 +21,9 @@ from me2e_compress.runtime.frames import Array, Frame
 from me2e_compress.runtime.providers import CPU, Provider
 from me2e_compress.runtime.session import Session, detached, feed_forward
 
+# SQNR of two float32 values that differ by rounding alone: two runtimes are 3e-5 to
+# 6e-5 apart on UniAD-tiny (models/README.md)
 ROUNDING_DB = 80.0
-"""SQNR of two float32 values that differ by rounding alone: two runtimes are 3e-5 to
-6e-5 apart on UniAD-tiny (models/README.md)."""
 NARROW = (ir.DataType.FLOAT16, ir.DataType.BFLOAT16)
 
 

@@ -5,11 +5,11 @@ import dataclasses
 from me2e_compress.fidelity import SQNR_FLOOR_DB
 from me2e_compress.fidelity.compare import Fidelity, SetFidelity
 
+# Metres by which a car 1.9 m wide may leave the middle of a lane of 3.5 m and still
+# keep 0.3 m to its lines
 PLAN_FLOOR_M = 0.5
-"""Metres by which a car 1.9 m wide may leave the middle of a lane of 3.5 m and still
-keep 0.3 m to its lines."""
+# What the excess is cut at: an output that should be zero has no finite one
 LARGEST_EXCESS = 1e6
-"""What the excess is cut at: an output that should be zero has no finite one."""
 
 
 @dataclasses.dataclass(frozen=True)

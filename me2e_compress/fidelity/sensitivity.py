@@ -163,8 +163,7 @@ class Trials:
         return self._known[choice]
 
 
-BLAME_SHARE = 0.5
-"""Least share of its module's loss that a node to blame has alone."""
+BLAME_SHARE = 0.5  # least share of its module's loss that a node to blame has alone
 
 
 @dataclasses.dataclass(frozen=True)
@@ -369,8 +368,8 @@ def write_recipe(
 # Choose the modules to make int8 under budgets of time, size and energy.
 
 
+# All 2^16 assignments are weighed; a map of more modules must be coarser
 MOST_MODULES = 16
-"""All 2^16 assignments are weighed; a map of more modules must be coarser."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -127,8 +127,8 @@ OPERATORS: Registry[Operator] = Registry(
     },
 )
 
+# Domains that define their operators; names there match no other dialect
 RESERVED = (OWN_DOMAIN, "com.microsoft")
-"""Domains that define their operators; names there match no other dialect."""
 
 
 def find(node: ir.Node) -> tuple[Operator, Dialect] | None:

@@ -18,8 +18,7 @@ from me2e_compress.operators.call import FusedCall
 from me2e_compress.operators.grid_sampler import BILINEAR, grid_sample_array
 from me2e_compress.operators.kernels.kernel import DOMAIN
 
-GRID_SAMPLE_OPSET = 16
-"""The first opset of ONNX's GridSample."""
+GRID_SAMPLE_OPSET = 16  # the first opset of ONNX's GridSample
 
 Numbers = npt.NDArray[np.float64]
 Sizes = npt.NDArray[np.integer]

@@ -21,8 +21,8 @@ from me2e_compress.graph.shapes import REFUSALS, infer_node, static_shape
 
 AttributeValue: TypeAlias = int | float | str | Sequence[int]
 Attributes: TypeAlias = Mapping[str, AttributeValue]
+# One dimension: a number, or an int64 value of shape [1] that holds it at run time
 Size: TypeAlias = int | ir.Value
-"""One dimension: a number, or an int64 value of shape [1] that holds it at run time."""
 
 
 class FusedCall:
@@ -244,8 +244,8 @@ class FusedCall:
         return self.add("Unsqueeze", [value, self.integers(list(axes))])
 
 
+# Before this opset, a 0 in a shape copies the dimension of the input
 _ALLOWZERO_OPSET = 14
-"""Before this opset, a 0 in a shape copies the dimension of the input."""
 
 
 def _shape(sizes: Sequence[Size]) -> ir.Shape:

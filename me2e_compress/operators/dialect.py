@@ -12,8 +12,8 @@ from me2e_compress.graph.nodes import input_at
 from me2e_compress.graph.shapes import Dims, open_shape
 from me2e_compress.operators.call import Attributes, AttributeValue, FusedCall
 
+# The domain of the toolkit's own form of every fused operator, opset 1
 OWN_DOMAIN = "me2e"
-"""The domain of the toolkit's own form of every fused operator, opset 1."""
 
 NdArray: TypeAlias = npt.NDArray[Any]
 Arrays: TypeAlias = Sequence[NdArray | None]
@@ -26,8 +26,8 @@ INT8_TOO = (*FLOATS, ir.DataType.INT8)
 INT32 = (ir.DataType.INT32,)
 INTEGERS = (ir.DataType.INT32, ir.DataType.INT64)
 
+# Attributes by which TensorRT finds a plugin, besides the operator's name
 PLUGIN_ATTRIBUTES = ("plugin_version", "plugin_namespace")
-"""Attributes by which TensorRT finds a plugin, besides the operator's name."""
 
 
 @dataclasses.dataclass(frozen=True)

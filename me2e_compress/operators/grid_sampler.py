@@ -26,11 +26,11 @@ from me2e_compress.operators.dialect import (
 
 _BILINEAR, _NEAREST, _BICUBIC = range(3)
 _ZEROS, _BORDER, _REFLECTION = range(3)
+# Attributes of zeros outside, where -1 and 1 are the outer edges
 BILINEAR = {"interpolation_mode": _BILINEAR, "padding_mode": _ZEROS, "align_corners": 0}
-"""Attributes of zeros outside, where -1 and 1 are the outer edges."""
 
+# The parameter of torch's and ONNX's cubic convolution (Keys 1981 has -0.5)
 _CUBIC = -0.75
-"""The parameter of torch's and ONNX's cubic convolution (Keys 1981 has -0.5)."""
 
 
 def grid_sample_array(inputs: Arrays, attributes: Attributes) -> NdArray:
@@ -100,8 +100,7 @@ def _padded(pixel: NdArray, size: int, options: Attributes) -> NdArray:
     return pixel if padding == _ZEROS else pixel.clip(0, size - 1)
 
 
-_SCALE = 10.0
-"""BEVFormer_tensorrt multiplies a grid by this for a better int8 range."""
+_SCALE = 10.0  # BEVFormer_tensorrt multiplies a grid by this for a better int8 range
 
 
 def _options(first: str, *, required: bool = True) -> tuple[Attribute, ...]:
@@ -226,8 +225,8 @@ class GridSampler2D(Operator):
 
 
 _MODES, _NEW_MODES = ("bilinear", "nearest", "bicubic"), ("linear", "nearest", "cubic")
+# The opset from which GridSample's modes have other names and volumes are allowed
 _RENAMED = 20
-"""The opset from which GridSample's modes have other names and volumes are allowed."""
 _PADDING = ("zeros", "border", "reflection")
 
 

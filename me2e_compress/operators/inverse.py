@@ -22,8 +22,7 @@ from me2e_compress.operators.dialect import (
     present,
 )
 
-_LARGEST = 16
-"""Largest n: the n * n minors of (n - 1) x (n - 1) numbers take n^5 work."""
+_LARGEST = 16  # largest n: the n * n minors of (n - 1) x (n - 1) numbers take n^5 work
 
 _ANY, _EITHER = (
     (Operand("matrix", None, types, positions=True),) for types in (FLOAT32, FLOATS)

@@ -25,8 +25,7 @@ from me2e_compress.operators.dialect import (
 )
 from me2e_compress.operators.kernels.kernel import DOMAIN
 
-FILTER = 3
-"""Rows and columns of a filter."""
+FILTER = 3  # rows and columns of a filter
 
 
 @dataclasses.dataclass(frozen=True)

@@ -39,8 +39,7 @@ __all__ = [
 ]
 
 Severity = Literal["error", "wrong", "warning"]
-SEVERITIES: tuple[Severity, ...] = get_args(Severity)
-"""The worst first."""
+SEVERITIES: tuple[Severity, ...] = get_args(Severity)  # the worst first
 
 
 @dataclasses.dataclass(frozen=True)
@@ -61,8 +60,8 @@ class LintFinding:
     message: str
 
 
+# Inspects a graph whose shapes are inferred and yields findings
 LintRule: TypeAlias = Callable[[ir.Model], Iterator[LintFinding]]
-"""Inspects a graph whose shapes are inferred and yields findings."""
 
 
 def error(rule: str, node: ir.Node | None, message: str) -> LintFinding:
@@ -281,8 +280,8 @@ class Target(abc.ABC):
 
 _HERE = "me2e_compress.targets"
 
+# For whom int8 is written where nobody is named: who runs it on this machine
 DEFAULT_TARGET = "onnxruntime"
-"""For whom int8 is written where nobody is named: who runs it on this machine."""
 
 TARGETS: Registry[Target] = Registry(
     "target",

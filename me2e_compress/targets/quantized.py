@@ -10,6 +10,7 @@ from me2e_compress.graph.nodes import maker
 from me2e_compress.quantization.decision import METADATA
 
 QUANTIZE, DEQUANTIZE = PAIR = ("QuantizeLinear", "DequantizeLinear")
+# Operators on integers (ONNX, com.microsoft) that quantizers of runtimes write
 INTEGER_OPS = frozenset(
     {
         "ConvInteger", "DynamicQuantizeLinear", "DynamicQuantizeLSTM",
@@ -20,7 +21,6 @@ INTEGER_OPS = frozenset(
         "QLinearSigmoid", "QLinearSoftmax", "QLinearWhere",
     }
 )  # fmt: skip
-"""Operators on integers (ONNX, com.microsoft) that quantizers of runtimes write."""
 
 
 def pairs_of(model: ir.Model) -> Iterator[ir.Node]:

@@ -19,8 +19,7 @@ from me2e_compress.quantization.decision import Decision
 from me2e_compress.runtime.frames import Array
 from me2e_compress.runtime.session import run_once
 
-Stored = TypeVar("Stored", bound=np.generic)
-"""The type of stored integers."""
+Stored = TypeVar("Stored", bound=np.generic)  # the type of stored integers
 
 
 @dataclasses.dataclass(frozen=True)
@@ -232,9 +231,9 @@ def evaluate_constants(model: ir.Model, names: Sequence[str]) -> dict[str, Array
 # Biases of quantized layers, and the least scales of weights beside them.
 
 
+# Largest int32 bias: half the accumulator is left for the products, which need at most
+# 127 * 255 * K: enough for K up to 33,000
 BIAS_MAX = 2**30
-"""Largest int32 bias: half the accumulator is left for the products, which need at most
-127 * 255 * K: enough for K up to 33,000."""
 
 Floats = npt.NDArray[np.float32]
 

@@ -25,8 +25,8 @@ from me2e_compress.operators.kernels.trampoline import (
 _POINTER = ctypes.c_void_p
 _INT, _SIZE = ctypes.c_int, ctypes.c_size_t
 
+# What this thread is registering; onnxruntime calls back within that same call
 _asked = threading.local()
-"""What this thread is registering; onnxruntime calls back within that same call."""
 
 
 def register(options: ort.SessionOptions, kernels: Iterable[CompiledKernel]) -> None:

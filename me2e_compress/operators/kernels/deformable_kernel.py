@@ -34,15 +34,14 @@ F = np.float32
 I32 = np.int32
 
 VALUE, SHAPES, STARTS, SCALE, ZERO, OUT = range(6)
+# Words of one call, as `compute` hands them to every `block`: addresses and sizes
 N, S, M, D, L, Q, P, SCALES, WIDE_SHAPES, WIDE_STARTS = range(6, 16)
-"""Words of one call, as `compute` hands them to every `block`: addresses and sizes."""
-OTHERS = 16
-"""The first word that is a kernel's own."""
+OTHERS = 16  # the first word that is a kernel's own
 
+# Weights of four corners; then width and height of each point's level
 corner_weights = stack(types.float32, 6 * CAPACITY)
-"""Weights of four corners; then width and height of each point's level."""
+# Offsets of four corners; then what `write_tables` writes
 corner_offsets = stack(types.int32, 8 * CAPACITY)
-"""Offsets of four corners; then what :func:`write_tables` writes."""
 
 
 @compiled
@@ -181,8 +180,8 @@ def dequantize_sums(a: Any, out: int, head: int, shares: Any) -> None:
             numbers[d] = (numbers[d] - zero) * scales[head * a[D] + d]
 
 
+# Messages, as `kernel` lists them
 RANK_WRONG, SIZE_WRONG, NOT_WHOLE, BEYOND, TOO_LARGE, TOO_MANY, SCALE_WRONG = range(7)
-"""Messages, as :mod:`kernel` lists them."""
 
 _LARGEST = 2**31 - 1
 _WHOLE = (abi.INT32, abi.INT64)
@@ -277,8 +276,7 @@ def _message_of_sizes(a: Any, x: Any) -> Word:
     return BEYOND if is_beyond_rows(a) else -1
 
 
-QUERIES = 128
-"""Queries per block of work, few enough to balance the threads."""
+QUERIES = 128  # queries per block of work, few enough to balance the threads
 
 PLACES, SHARES, SHARED, WORDS = range(OTHERS, OTHERS + 4)
 RANKS = (4, 2, 1, 6, 5, 1, 1)

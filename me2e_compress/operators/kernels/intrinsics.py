@@ -25,17 +25,16 @@ ELEMENTS = {
     types.uint8: BYTE,
 }
 
+# Options of every compilation: numpy's error model, fused multiply-add, and no
+# reference counting, since nothing here owns memory
 OPTIONS: Any = {
     "error_model": "numpy",
     "fastmath": {"contract"},
     "_nrt": False,
     "forceinline": True,
 }
-"""Options of every compilation: numpy's error model, fused multiply-add, and no
-reference counting, since nothing here owns memory."""
 
-Word: TypeAlias = Any
-"""An int64 for Numba; untyped for type checkers."""
+Word: TypeAlias = Any  # an int64 for Numba; untyped for type checkers
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
@@ -72,19 +71,18 @@ def _call(context: Any, at: Any, a: Any, b: Any, c: Any, d: Any, e: Any) -> Any:
     return types.intp(*[types.intp] * 6), generate
 
 
+# `words(address)[index]`: numbers in memory; nothing is checked
 words: Any = _at(types.int64)
-"""``words(address)[index]``: numbers in memory; nothing is checked."""
 ints: Any = _at(types.int32)
 floats: Any = _at(types.float32)
 signed_bytes: Any = _at(types.int8)
 unsigned_bytes: Any = _at(types.uint8)
 
-address_of: Any = intrinsic(_address)
-"""``address_of(pointer)``: the inverse."""
+address_of: Any = intrinsic(_address)  # `address_of(pointer)`: the inverse
 
+# `call(address, a, b, c, d, e)`: call a C function of up to five words; one that takes
+# fewer ignores the rest. The result is a word, undefined for `void`.
 call: Any = intrinsic(_call)
-"""``call(address, a, b, c, d, e)``: call a C function of up to five words; one that
-takes fewer ignores the rest. The result is a word, undefined for ``void``."""
 
 
 def stack(kind: Any, count: int) -> Any:
@@ -148,8 +146,7 @@ def create_output(t: Any, context: int, dims: Any, rank: int, to: int) -> Word:
     return status
 
 
-LINE = 64
-"""Bytes of a cache line, on which memory begins."""
+LINE = 64  # bytes of a cache line, on which memory begins
 
 _slots = stack(types.int64, 2)
 

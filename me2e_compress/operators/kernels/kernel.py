@@ -19,9 +19,9 @@ class CompiledKernel:
     output: int = FLOAT
 
 
+# The domain to which nodes move when a graph is opened. No file has nodes in it, so no
+# function body and no other library can claim them.
 DOMAIN = "me2e.kernels"
-"""The domain to which nodes move when a graph is opened. No file has nodes in it, so
-no function body and no other library can claim them."""
 
 _DEFORMABLE = (
     "the inputs have not the ranks that they must: value 4, spatial_shapes 2,"
@@ -56,8 +56,7 @@ LEAST_EXPONENT = -100
 """Of that power: below, float32 cannot hold bins per unit."""
 
 ATTENTION = "MultiHeadAttention"
-WIDEST_HEAD = 256
-"""Channels of a head at most, for attention."""
+WIDEST_HEAD = 256  # channels of a head at most, for attention
 
 _ATTENTION = (
     "the inputs must be of rank 4",
@@ -86,6 +85,7 @@ def _deformable(
     )
 
 
+# All compiled kernels
 KERNELS = (
     *_deformable("MultiScaleDeformableAttention", "deformable_kernel", 2, _DEFORMABLE),
     *_deformable("RawDeformableAttention", "raw_attention_kernel", 4, _RAW),
@@ -103,4 +103,3 @@ KERNELS = (
         ("the inputs must be of rank 1, 0 and 0",),
     ),
 )
-"""All compiled kernels."""

@@ -21,10 +21,12 @@ from me2e_compress.base.errors import GraphError
 from me2e_compress.operators.kernels.kernel import CompiledKernel
 from me2e_compress.operators.kernels.trampoline import keep, private
 
+# C library functions that kernels may call. Code that calls into Python or Numba would
+# crash a process into which Numba is not loaded.
 _FOREIGN = frozenset({"memset", "memcpy", "memmove", "floorf", "expf", "sqrt"})
-"""C library functions that kernels may call. Code that calls into Python or Numba
-would crash a process into which Numba is not loaded."""
 
+# A C function around a Numba function, whose first two arguments are pointers to the
+# result and to its exception; `cfunc`'s own wrapper raises in Python
 _WRAPPER = """
 declare i32 @"{inner}"(ptr, ptr, i64, i64)
 define i64 @{name}(i64 %first, i64 %second) {{
@@ -36,13 +38,11 @@ define i64 @{name}(i64 %first, i64 %second) {{
     ret i64 %value
 }}
 """
-"""A C function around a Numba function, whose first two arguments are pointers to the
-result and to its exception; ``cfunc``'s own wrapper raises in Python."""
 
 _DIGEST = hashlib.sha256().digest_size
 _LOCK = threading.Lock()
+# Owners of the code, which may run for as long as the process lives
 _ENGINES: list[Any] = []
-"""Owners of the code, which may run for as long as the process lives."""
 
 
 def load_or_compile(kernel: CompiledKernel, folder: Path) -> Mapping[str, int]:

@@ -32,11 +32,10 @@ class Tile:
         return self.vectors * self.lanes
 
 
+# Lanes and number of the vector registers of x86-64, by the feature that adds them
 _VECTORS = {"avx512f": (16, 32), "avx": (8, 16), "sse2": (4, 16)}
-"""Lanes and number of the vector registers of x86-64, by the feature that adds them."""
 
-_OTHERS = (4, 32)
-"""Those of aarch64."""
+_OTHERS = (4, 32)  # those of aarch64
 
 
 @functools.cache

@@ -110,9 +110,9 @@ def softmax(scores: Any, weights: Any, rows: int, size: int) -> None:
         done += size
 
 
+# Queries per block of work: cells that cameras see are together, so fewer than in
+# `deformable_kernel` to balance the threads
 QUERIES = 64
-"""Queries per block of work: cells that cameras see are together, so fewer than in
-:mod:`deformable_kernel` to balance the threads."""
 
 # An operand's words: its address, its steps along batch, queries and heads, and how
 # many levels and points it has

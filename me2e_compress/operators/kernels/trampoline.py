@@ -26,9 +26,9 @@ from pathlib import Path
 
 import platformdirs
 
+# Bytes from an operator's description to the state of its kernels, which follows it:
+# `CreateKernel` is one addition then, and needs no Python
 STATE_OFFSET = 0x180
-"""Bytes from an operator's description to the state of its kernels, which follows it:
-``CreateKernel`` is one addition then, and needs no Python."""
 
 _CODE, _SYMBOLS, _HASH, _NAMES = 0x200, 0x280, 0x380, 0x3C0
 _FUNCTIONS = ("RegisterCustomOps", "CreateKernel", "KernelDestroy")

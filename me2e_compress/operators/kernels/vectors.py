@@ -14,22 +14,21 @@ from numba.extending import intrinsic
 
 from me2e_compress.operators.kernels.intrinsics import FLOAT, INT, WORD
 
-LANES = 16
-"""Numbers of a vector of :func:`vector_intrinsic`."""
+LANES = 16  # numbers of a vector of `vector_intrinsic`
 
 LOG2_E = 1.4426950408889634
+# Polynomial of 2^r for r in -0.5..0.5, highest power first, of the Cephes library (S.
+# L. Moshier, single/exp2f.c, netlib.org/cephes): relative error below 2e-7 in float32.
 POWERS = (
     1.535336188319500e-4, 1.339887440266574e-3, 9.618437357674640e-3,
     5.550332471162809e-2, 2.402264791363012e-1, 6.931472028550421e-1, 1.0,
 )  # fmt: skip
-"""Polynomial of 2^r for r in -0.5..0.5, highest power first, of the Cephes library (S.
-L. Moshier, single/exp2f.c, netlib.org/cephes): relative error below 2e-7 in float32."""
 
+# Smaller powers count as 2^-125, so that results are normal float32 numbers
 LEAST = -125.0
-"""Smaller powers count as 2^-125, so that results are normal float32 numbers."""
 
+# Added to a float32, it leaves the nearest whole number in the lowest bits
 ROUNDING = 1.5 * 2.0**23
-"""Added to a float32, it leaves the nearest whole number in the lowest bits."""
 
 _FAST = ("contract",)
 

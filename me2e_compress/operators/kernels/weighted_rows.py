@@ -16,12 +16,11 @@ from me2e_compress.operators.kernels.vectors import (
     while_fit,
 )
 
+# Points at a time, and the distance of the four arrays of offsets and weights
 CAPACITY = 1024
-"""Points at a time, and the distance of the four arrays of offsets and weights."""
 
 CORNERS = 4
-WIDTHS = (32, 16, 8, 4, 1)
-"""Channels at a time, the widest first."""
+WIDTHS = (32, 16, 8, 4, 1)  # channels at a time, the widest first
 
 
 def weighted_rows(kind: Any, *, onto: bool = False) -> Any:

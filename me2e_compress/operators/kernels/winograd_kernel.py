@@ -45,11 +45,10 @@ from me2e_compress.operators.kernels.vectors import LANES, Vectors, vector_intri
 
 # The transforms, as vector instructions.
 
+# Numbers along one axis of a tile of outputs, a filter, and a tile of inputs
 OUT, FILTER, SIDE = 4, 3, 6
-"""Numbers along one axis of a tile of outputs, a filter, and a tile of inputs."""
 
-PRODUCTS = SIDE * SIDE
-"""Numbers of a transformed tile or filter."""
+PRODUCTS = SIDE * SIDE  # numbers of a transformed tile or filter
 
 _NEAR, _FAR = math.sqrt(0.5), math.sqrt(2)
 
@@ -176,67 +175,55 @@ def _outputs(
             w.fetch(builder.gep(place, [ahead]))
 
 
+# `((image, y, high, x, wide, to, row))`: multiply B^T by 16 columns of an image.
+# `image` is the address of one channel [high, wide]; six of its rows from y, and 16
+# columns from x, are read, zeros where they lie outside. The six results are written
+# `row` numbers from each other. The same place of the next channel is fetched ahead: no
+# processor foresees the leap, and this transform would wait for memory (VAD-tiny's
+# layers of 64 channels took 18 ms, of which 6 for this, and now 12).
 input_rows = vector_intrinsic(_input_rows)
-"""``((image, y, high, x, wide, to, row))``: multiply B^T by 16 columns of an image.
 
-``image`` is the address of one channel [high, wide]; six of its rows from y, and 16
-columns from x, are read, zeros where they lie outside. The six results are written
-``row`` numbers from each other. The same place of the next channel is fetched ahead:
-no processor foresees the leap, and this transform would wait for memory (VAD-tiny's
-layers of 64 channels took 18 ms, of which 6 for this, and now 12).
-"""
-
+# `((rows, row, to, plane, count))`: multiply up to 16 tiles by B. `rows` are results of
+# `input_rows`, those of tile t from column 4 t on; the 36 numbers of a tile are written
+# `plane` numbers from each other, tile beside tile.
 input_columns = vector_intrinsic(_input_columns)
-"""``((rows, row, to, plane, count))``: multiply up to 16 tiles by B.
 
-``rows`` are results of :data:`input_rows`, those of tile t from column 4 t on; the 36
-numbers of a tile are written ``plane`` numbers from each other, tile beside tile.
-"""
-
+# `((elements, step, count, to, plane, ahead))`: write G g G^T of up to 16 filters. The
+# nine elements of filters are `step` numbers from each other, filter beside filter; the
+# 36 results `plane` numbers. Those of filters beyond `count` are zeros. The elements
+# `ahead` numbers behind these are fetched.
 filters = vector_intrinsic(_filters)
-"""``((elements, step, count, to, plane, ahead))``: write G g G^T of up to 16 filters.
 
-The nine elements of filters are ``step`` numbers from each other, filter beside filter;
-the 36 results ``plane`` numbers. Those of filters beyond ``count`` are zeros. The
-elements ``ahead`` numbers behind these are fetched.
-"""
-
+# `((m, plane, bias, to, wide, rows, count, ahead))`: write A^T m A of 16 tiles. The 36
+# numbers of a tile are `plane` numbers from each other. To the results, the number at
+# `bias` is added, and they are at least the second number there. Of the 4 rows of
+# results, `wide` numbers from each other, `rows` are written, and of their 64 columns
+# `count`. The place `ahead` numbers behind is fetched.
 outputs = vector_intrinsic(_outputs)
-"""``((m, plane, bias, to, wide, rows, count, ahead))``: write A^T m A of 16 tiles.
-
-The 36 numbers of a tile are ``plane`` numbers from each other. To the results, the
-number at ``bias`` is added, and they are at least the second number there. Of the 4
-rows of results, ``wide`` numbers from each other, ``rows`` are written, and of their
-64 columns ``count``. The place ``ahead`` numbers behind is fetched.
-"""
 
 
 # Filters of a panel, inputs and outputs of a block.
 
-TILES = 48
-"""Tiles per block."""
+TILES = 48  # tiles per block
 
+# Output channels per group. Their products with a block, 442 kB, and the transformed
+# inputs of 64 channels fit into a second cache of 1 MB.
 GROUP = 64
-"""Output channels per group. Their products with a block, 442 kB, and the transformed
-inputs of 64 channels fit into a second cache of 1 MB."""
 
 PANELS = GROUP // LANES
 
-AHEAD = 4
-"""Channels by which filters are fetched ahead."""
+AHEAD = 4  # channels by which filters are fetched ahead
 
-ROW = OUT * TILES + LANES
-"""Columns of one row of input tiles of a block."""
+ROW = OUT * TILES + LANES  # columns of one row of input tiles of a block
 
+# Numbers from one of the 36 products to the next, a vector more than needed here and
+# below: planes of a multiple of 4 kB would all share the same sets of the first cache
 PRODUCT_PLANE = GROUP * TILES + LANES
-"""Numbers from one of the 36 products to the next, a vector more than needed here and
-below: planes of a multiple of 4 kB would all share the same sets of the first cache."""
 
 # words of one call
 X, FILTERS, BIAS, OPTIONS, Y = range(5)
 N, C, H, W, K, TOP, LEFT, HIGH, WIDE, DOWN, ACROSS = range(5, 16)
-RELU = 4
-"""The index of the flag among the options, behind the pads."""
+RELU = 4  # the index of the flag among the options, behind the pads
 
 _rows = stack(types.float32, SIDE * ROW)
 _ends = stack(types.float32, 2)
@@ -331,8 +318,7 @@ def write_outputs(a: Any, block: int, channel: int, m: int) -> None:
         tile += count
 
 
-STRIPS = 16
-"""Threads that can work at once: each has memory of its own."""
+STRIPS = 16  # threads that can work at once: each has memory of its own
 
 # words of one call, behind those of winograd_blocks
 BLOCKS, SHARED, OWN, STRIDE, BY_BLOCK, FIRST_STAGE, PARTS = range(16, 23)
@@ -340,8 +326,7 @@ WORDS = 23
 
 RANKS = (4, 4, 1, 1)
 RANK_WRONG, SIZE_WRONG = range(2)
-NUMBERS = 5
-"""Numbers of the options: four pads, and whether negative results become 0."""
+NUMBERS = 5  # numbers of the options: four pads, and whether negative results become 0
 
 _words = stack(types.int64, WORDS)
 _inputs = stack(types.int64, EACH * len(RANKS))

@@ -123,13 +123,13 @@ class OnnxRuntime(Target):
         return tuple(findings)
 
 
+# Layers in the optimized graph that compute in float
 _FLOAT_KERNELS = frozenset(
     {
         "Conv", "ConvTranspose", "FusedConv", "FusedGemm", "FusedMatMul", "Gemm",
         "MatMul", "NhwcFusedConv",
     }
 )  # fmt: skip
-"""Layers in the optimized graph that compute in float."""
 
 
 def _int8_of(plan: QuantPlan) -> tuple[dict[str, Decision], dict[str, Decision]]:

@@ -246,10 +246,10 @@ def _integers(dequantize: ir.Node, step: Floats) -> npt.NDArray[np.int8] | None:
 # become unsigned when a session opens, so the sign alone costs nothing.
 
 
+# Types of activations that there are integer kernels for, with their least number
 _LEAST = {ir.DataType.INT8: -128, ir.DataType.UINT8: 0}
-"""Types of activations that there are integer kernels for, with their least number."""
+# Types of activations that TensorRT takes, with zero points 0
 _OF_TENSORRT = (ir.DataType.INT8, ir.DataType.FLOAT8E4M3FN)
-"""Types of activations that TensorRT takes, with zero points 0."""
 
 
 def slow_here(model: ir.Model, provider: Provider = CPU) -> str | None:

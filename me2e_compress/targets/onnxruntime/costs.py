@@ -15,12 +15,12 @@ from me2e_compress.quantization.costs import Border, Costs, Join, Layers
 from me2e_compress.targets.onnxruntime.lower import PACKED, blocks_of
 from me2e_compress.targets.onnxruntime.region import JOINS, Region, end_of, find_region
 
+# Float32 feature maps up to this size are sampled as fast as uint8 ones: one core's
+# share of the second-level cache
 CACHE_BYTES = 2**21
-"""Float32 feature maps up to this size are sampled as fast as uint8 ones: one core's
-share of the second-level cache."""
 
+# How often each constant of `CpuSeconds` is added
 Counts: TypeAlias = Mapping[str, int]
-"""How often each constant of :class:`CpuSeconds` is added."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -66,6 +66,11 @@ class CpuSeconds:
         return 1e-9 * sum(float(getattr(self, each)) * n for each, n in counts.items())
 
 
+# Fitted to single layers and chains on an AMD EPYC (Zen 5), onnxruntime 1.31, by
+# `python -m benchmarks.tools.fit_cpu_costs`; sampling by hand, to the results of
+# `python -m benchmarks.measure.int8_sampling`, uneven channels to a Xeon (Sapphire
+# Rapids), where what int8 writes and converts is twice as dear beside a multiplication.
+# Its own constants were right about 89 to 91 % of layers there, as these are.
 ZEN5 = CpuSeconds(
     machine="onnxruntime (one core with VNNI)",
     kernel=300,
@@ -87,11 +92,6 @@ ZEN5 = CpuSeconds(
     quantize=0.1,
     dequantize=0.17,
 )
-"""Fitted to single layers and chains on an AMD EPYC (Zen 5), onnxruntime 1.31, by
-``python -m benchmarks.tools.fit_cpu_costs``; sampling by hand, to the results of
-``python -m benchmarks.measure.int8_sampling``, uneven channels to a Xeon (Sapphire
-Rapids), where what int8 writes and converts is twice as dear beside a multiplication.
-Its own constants were right about 89 to 91 % of layers there, as these are."""
 
 
 def costs_of(
@@ -170,10 +170,10 @@ def sampled_work(node: ir.Node) -> tuple[Counts, Counts] | None:
     return {}, {"int8_cached_mac": macs}
 
 
+# Operators that onnxruntime computes on blocks of channels, as convolutions
 _BLOCKED = frozenset(
     ["Add", "AveragePool", "Concat", "Conv", "GlobalAveragePool", "MaxPool", "Mul"]
 )
-"""Operators that onnxruntime computes on blocks of channels, as convolutions."""
 
 
 class _Surroundings:

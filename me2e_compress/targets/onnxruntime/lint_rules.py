@@ -54,14 +54,14 @@ from me2e_compress.targets.weights import evaluate_constants, quantize_weight
 
 INT32_MAX = 2.0**31 - 1  # a bias of more steps becomes -2^31
 
+# Relative difference of two scales that are meant to be equal: twice what rounding to
+# float16 moves one
 SCALES_APART = 1e-3
-"""Relative difference of two scales that are meant to be equal: twice what rounding to
-float16 moves one."""
 
 _REMEDY = "disabled_optimizers=['WeightBiasQuantization'] keeps it"
 _CLIPS = ("Clip", "Dropout", "Identity", "Relu")
+# Operators that onnxruntime moves a pair across, to the layer (QDQPropagation)
 PASSED = ("MaxPool", "Reshape", "Slice", "Squeeze", "Transpose", "Unsqueeze")
-"""Operators that onnxruntime moves a pair across, to the layer (QDQPropagation)."""
 _FOLDED = ("Add", "BatchNormalization", "Mul")  # into a float weight, first
 
 Constants = Mapping[str, Array]
@@ -318,8 +318,8 @@ def _quantizer(layer: _Layer, folded: tuple[str, ...] = ()) -> ir.Node | None:
     return None
 
 
+# What says how a layer is computed otherwise, or nothing, by rule
 _RULES = {"wrapped-bias": _wrapped, "bias-scale": _misread, "float-weight": _rounded}
-"""What says how a layer is computed otherwise, or nothing, by rule."""
 
 
 # Lint rules: can onnxruntime's CPU run a graph, and its int8 fast?

@@ -38,8 +38,7 @@ from me2e_compress.targets.quantized import QUANTIZE, is_dequantized
 from me2e_compress.targets.weights import QuantizedWeight
 from me2e_compress.targets.writer import BY, Writer
 
-PACKED = 4
-"""Channels that onnxruntime's kernel reads at once."""
+PACKED = 4  # channels that onnxruntime's kernel reads at once
 
 
 @dataclasses.dataclass(frozen=True)
@@ -140,8 +139,8 @@ def read_blocks(writer: Writer, node: ir.Node, cut: Blocks) -> ir.Value:
     return blocks
 
 
+# The low and the high bound of tensors by name
 Bounds: TypeAlias = Mapping[str, tuple[float, float]]
-"""The low and the high bound of tensors by name."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -15,24 +15,23 @@ from me2e_compress.graph.shapes import extent, is_one_matrix, open_shape, static
 from me2e_compress.operators import int8_inputs
 from me2e_compress.targets.weights import is_bias
 
+# Operators that pick or move elements: before quantization or behind it, on one grid,
+# they give the same integers. A grid of their own would gain nothing.
 MOVES = frozenset(
     {
         "Flatten", "MaxPool", "Reshape", "Resize", "Slice", "SpaceToDepth", "Squeeze",
         "Transpose", "Unsqueeze",
     }
 )  # fmt: skip
-"""Operators that pick or move elements: before quantization or behind it, on one grid,
-they give the same integers. A grid of their own would gain nothing."""
 
+# Operators whose output may be a small part of the input's range: it has a grid of its
+# own
 AVERAGES = frozenset({"AveragePool", "GlobalAveragePool"})
-"""Operators whose output may be a small part of the input's range: it has a grid of
-its own."""
 
-LAYERS = ("Conv", "Gemm", "MatMul")
-"""Operators with a weight that have an int8 kernel."""
+LAYERS = ("Conv", "Gemm", "MatMul")  # operators with a weight that have an int8 kernel
 
+# Operators that read several activations, each on its own grid
 JOINS = frozenset({"Add", "Concat"})
-"""Operators that read several activations, each on its own grid."""
 
 
 def objection(node: ir.Node) -> str | None:
@@ -152,12 +151,11 @@ def is_clip_at_zero(node: ir.Node) -> bool:
 # Find the int8 part of a graph: its uint8 tensors and their grids.
 
 
-MIDDLE = 128
-"""The uint8 zero point of a signed tensor: int8 value plus 128."""
+MIDDLE = 128  # the uint8 zero point of a signed tensor: int8 value plus 128
 
+# Ranges so many times as wide on one side of zero as on the other have uint8 steps a
+# quarter smaller, or less, than those of int8: 2.5 dB to 6
 LOPSIDED = 2.0
-"""Ranges so many times as wide on one side of zero as on the other have uint8 steps a
-quarter smaller, or less, than those of int8: 2.5 dB to 6."""
 
 _UNSIGNED = frozenset(
     {"Abs", "Exp", "HardSigmoid", "Sigmoid", "Softmax", "Softplus", "Sqrt"}

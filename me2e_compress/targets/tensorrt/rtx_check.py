@@ -26,8 +26,8 @@ from me2e_compress.graph import rewrite
 from me2e_compress.graph.nodes import is_plugin
 from me2e_compress.runtime.children import run_script
 
+# GPU generations that TensorRT-RTX 1.7 builds for: Turing, Ampere, Ada, Blackwell
 SM = (75, 80, 86, 89, 120, 121)
-"""GPU generations that TensorRT-RTX 1.7 builds for: Turing, Ampere, Ada, Blackwell."""
 
 EXTRA = "trt-check"
 
@@ -113,8 +113,8 @@ def _ask(part: ir.Model, scratch: Path, sm: int, *, build: bool) -> dict[str, An
     return result
 
 
+# Operators that TensorRT supports by its own plugins, and TensorRT-RTX does not
 LACKING = frozenset({"DeformConv", "NonMaxSuppression", "NonZero", "RoiAlign"})
-"""Operators that TensorRT supports by its own plugins, and TensorRT-RTX does not."""
 
 
 def cut(model: ir.Model) -> tuple[ir.Model, tuple[str, ...]]:

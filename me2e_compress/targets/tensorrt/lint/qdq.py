@@ -26,8 +26,8 @@ from me2e_compress.targets.quantized import (
     stored_type,
 )
 
+# Says what is wrong about one node; None if nothing is
 Check: TypeAlias = Callable[[ir.Node], str | None]
-"""Says what is wrong about one node; None if nothing is."""
 
 
 def _rule(
@@ -66,9 +66,9 @@ def scales(node: ir.Node) -> str | None:
 
 
 _ACTIVATIONS = (ir.DataType.INT8, ir.DataType.FLOAT8E4M3FN)
+# Quantized types of TensorRT 10 ("Working with Quantized Types"): int4 is for weights
+# alone, with scales by block
 _WEIGHTS = (*_ACTIVATIONS, ir.DataType.INT4)
-"""Quantized types of TensorRT 10 ("Working with Quantized Types"): int4 is for weights
-alone, with scales by block."""
 
 
 def zero_points(model: ir.Model) -> Iterator[LintFinding]:

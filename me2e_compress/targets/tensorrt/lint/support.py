@@ -75,31 +75,30 @@ _BY_TYPE: dict[frozenset[ir.DataType], str] = {
     _CAST: "Cast CastLike",
 }
 
+# Element types of the data that an operator accepts; pairs have their own rules
 SUPPORTED: dict[str, frozenset[ir.DataType]] = {
     name: types for types, names in _BY_TYPE.items() for name in names.split()
 }
-"""Element types of the data that an operator accepts; pairs have their own rules."""
 
+# Operators that TensorRT 10.1 did not support, and the version that brought them
 LATER: dict[str, str] = {
     **dict.fromkeys(("BlackmanWindow", "HammingWindow", "HannWindow"), "10.4"),
     "STFT": "10.5",
     "Attention": "10.14",
     **dict.fromkeys(("RMSNormalization", "RotaryEmbedding", "TensorScatter"), "10.15"),
 }
-"""Operators that TensorRT 10.1 did not support, and the version that brought them."""
 
+# Element types that came to an operator after 10.1, and the version that did it
 TYPES_LATER: dict[str, tuple[frozenset[ir.DataType], str]] = {
     "Pow": (_NUMBER - _FLOAT, "10.12")
 }
-"""Element types that came to an operator after 10.1, and the version that did it."""
 
+# Newest opset that the parser of a version reads (operators.md of 10.1 and of 10.15;
+# NVIDIA's "ONNX Opset Guide" of 11.x): one between two of them reads at least the older
+# one's
 NEWEST_OPSETS: dict[str, int] = {"10.1": 20, "10.15": 24, "11.5": 25}
-"""Newest opset that the parser of a version reads (operators.md of 10.1 and of 10.15;
-NVIDIA's "ONNX Opset Guide" of 11.x): one between two of them reads at least the older
-one's."""
 
-Version: TypeAlias = tuple[int, int]
-"""Major and minor: patches change no table."""
+Version: TypeAlias = tuple[int, int]  # major and minor: patches change no table
 
 
 def version_of(text: str) -> Version:
@@ -113,6 +112,7 @@ def version_of(text: str) -> Version:
     raise ValueError(f"{text!r} is no version of TensorRT, such as 10.13")
 
 
+# Operators that the matrix lists as not supported
 UNSUPPORTED = frozenset(
     {
         "AffineGrid", "Bernoulli", "BitCast", "BitShift", "BitwiseAnd",
@@ -128,7 +128,6 @@ UNSUPPORTED = frozenset(
         "StringNormalizer", "StringSplit", "TfIdfVectorizer", "Unique",
     }
 )  # fmt: skip
-"""Operators that the matrix lists as not supported."""
 
 
 OLDEST_OPSET = 9
@@ -274,8 +273,7 @@ def plugin_shapes(model: ir.Model) -> Iterator[LintFinding]:
             )
 
 
-MAX_K = 3840
-"""Largest K of a TopK."""
+MAX_K = 3840  # largest K of a TopK
 
 _RESIZE_MODES = ("nearest", "linear")
 _RESIZE_TRANSFORMS = (
