@@ -5,14 +5,11 @@ entries are only ever added at the end. Numba is not imported here: kernels that
 machine has compiled run without it.
 """
 
-API_VERSION = 17
-"""The first with ``KernelContext_ParallelFor``: onnxruntime 1.17."""
+API_VERSION = 17  # the first with `KernelContext_ParallelFor`: onnxruntime 1.17
+OP_VERSION = 16  # the first with `KernelComputeV2`, which returns a status
 
-OP_VERSION = 16
-"""The first with ``KernelComputeV2``, which returns a status."""
-
+# Functions of `OrtApi` by offset: those that Python calls, and those of kernels
 CREATE_DOMAIN, ADD_OP, ADD_DOMAIN, CREATE_MEMORY = 26, 27, 28, 69
-
 CALLED_BY_KERNELS = (
     0,  # CreateStatus
     90,  # KernelContext_GetInput
@@ -29,40 +26,22 @@ CALLED_BY_KERNELS = (
     76,  # AllocatorFree
     132,  # ReleaseAllocator
 )
-(
-    CREATE_STATUS,
-    GET_INPUT,
-    GET_OUTPUT,
-    GET_DATA,
-    GET_INFO,
-    GET_TYPE,
-    GET_RANK,
-    GET_DIMS,
-    RELEASE_INFO,
-    PARALLEL_FOR,
-    GET_ALLOCATOR,
-    ALLOCATE,
-    FREE,
-    RELEASE_ALLOCATOR,
-) = range(len(CALLED_BY_KERNELS))
-"""Words of a kernel's state: the addresses of those functions, then"""
-BLOCK = len(CALLED_BY_KERNELS)
-"""the address of the kernel's own ``block``, which ``ParallelFor`` calls, then"""
-MEMORY = BLOCK + 1
-"""what describes the memory of the CPU, then"""
-MESSAGES = MEMORY + 1
-"""the addresses of its error messages."""
+
+# Words of a kernel's state: the addresses of those functions, that of its own `block`,
+# which `ParallelFor` calls, what describes the memory of the CPU, and the addresses of
+# up to 16 error messages
+CREATE_STATUS, GET_INPUT, GET_OUTPUT, GET_DATA, GET_INFO, GET_TYPE = range(6)
+GET_RANK, GET_DIMS, RELEASE_INFO, PARALLEL_FOR, GET_ALLOCATOR = range(6, 11)
+ALLOCATE, FREE, RELEASE_ALLOCATOR, BLOCK, MEMORY, MESSAGES = range(11, 17)
 STATE_WORDS = MESSAGES + 16
 
-ARENA, DEFAULT = 1, 0
-"""``OrtArenaAllocator`` and ``OrtMemTypeDefault``."""
+ARENA, DEFAULT = 1, 0  # `OrtArenaAllocator` and `OrtMemTypeDefault`
+INVALID_ARGUMENT = 2  # `ORT_INVALID_ARGUMENT`
 
-INVALID_ARGUMENT = 2
-"""``ORT_INVALID_ARGUMENT``."""
-
+# `ONNXTensorElementDataType`; `ANY` leaves the check to the kernel
 FLOAT, UINT8, INT8, INT32, INT64, ANY = 1, 2, 3, 6, 7, 0
-"""``ONNXTensorElementDataType``; ``ANY`` leaves the check to the kernel."""
 
+# Fields of `OrtCustomOp`, one word each; the fields after them are newer
 VARIADIC = (
     "GetVariadicInputMinArity",
     "GetVariadicInputHomogeneity",
@@ -90,8 +69,6 @@ FIELDS = (
     "CreateKernelV2",
     "KernelComputeV2",
 )
-"""Fields of ``OrtCustomOp``, one word each; the fields after them are newer."""
 
-
+# Words of an input: eight dimensions, then address and element type; EACH in all
 ADDRESS, TYPE, EACH = 8, 9, 10
-"""Ten words an input: eight dimensions, address and element type."""

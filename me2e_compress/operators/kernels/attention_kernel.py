@@ -37,8 +37,13 @@ from me2e_compress.operators.kernels.intrinsics import (
     words,
 )
 from me2e_compress.operators.kernels.kernel import WIDEST_HEAD
-from me2e_compress.operators.kernels.matrix_tile import host_tile, matrix_product
-from me2e_compress.operators.kernels.vectors import LOG2_E, Vectors, vector_intrinsic
+from me2e_compress.operators.kernels.vectors import (
+    LOG2_E,
+    Vectors,
+    host_tile,
+    matrix_product,
+    vector_intrinsic,
+)
 
 MOST, SUM = range(2)  # rows of a step's state
 
@@ -61,14 +66,13 @@ class _Step:
     """Writes the loops of a step: largest scores, corrected sums, powers."""
 
     def __init__(
-        self, simd: Vectors, vectors: int, scores: Any, count: Any, *others: Any
-    ) -> None:
-        state, sums, self.channels = others
+        self, simd: Vectors, vectors: int,
+        scores: Any, count: Any, state: Any, sums: Any, channels: Any,
+    ) -> None:  # fmt: skip
         self.builder, self.simd, self.vectors = simd.builder, simd, vectors
-        self.scores, self.state, self.sums = (
-            simd.pointer(at) for at in (scores, state, sums)
-        )
-        self.count = count
+        self.scores, self.state = simd.pointer(scores), simd.pointer(state)
+        self.sums = simd.pointer(sums)
+        self.count, self.channels = count, channels
 
     def write(self) -> None:
         builder = self.builder
@@ -88,21 +92,17 @@ class _Step:
             self.simd.power_of_2(builder.fsub(old, new))
             for old, new in zip(before, most, strict=True)
         ]
-        totals = [
-            self._variable(builder.fmul(each, correction))
-            for each, correction in zip(
-                self._row(self.state, WORD(SUM)), corrections, strict=True
-            )
-        ]
+        row = zip(self._row(self.state, WORD(SUM)), corrections, strict=True)
+        totals = [self._variable(builder.fmul(old, factor)) for old, factor in row]
         with cgutils.for_range(builder, self.channels) as loop:
             row = zip(self._row(self.sums, loop.index), corrections, strict=True)
-            corrected = [builder.fmul(total, correction) for total, correction in row]
+            corrected = [builder.fmul(total, factor) for total, factor in row]
             self._set_row(self.sums, loop.index, corrected)
         # 2^(score - new), and the total of these
         with cgutils.for_range(builder, self.count) as loop:
             row = zip(self._row(self.scores, loop.index), most, strict=True)
             powers = [
-                self.simd.power_of_2(builder.fsub(score, each)) for score, each in row
+                self.simd.power_of_2(builder.fsub(score, new)) for score, new in row
             ]
             self._set_row(self.scores, loop.index, powers)
             for total, power in zip(totals, powers, strict=True):
@@ -122,8 +122,8 @@ class _Step:
     def _places(self, rows: Any, index: Any) -> list[Any]:
         builder, lanes = self.builder, self.simd.lanes
         first = builder.mul(index, WORD(self.vectors * lanes))
-        each = [builder.add(first, WORD(n * lanes)) for n in range(self.vectors)]
-        return [builder.gep(rows, [at]) for at in each]
+        offsets = [builder.add(first, WORD(n * lanes)) for n in range(self.vectors)]
+        return [builder.gep(rows, [offset]) for offset in offsets]
 
 
 F = np.float32
@@ -145,8 +145,8 @@ PANELS = 4  # panels of a block at most: keys and values are read again for each
 
 CAPACITY = WIDEST_HEAD * WIDTH  # numbers of the queries of a block, and of its sums
 
-# words of one call, as `compute` hands them to every `block`: ROW numbers from one
-# query or key to the next, QUERIES in a block, BLOCKS of a head
+# Words of one call, as `compute` passes them to every `block`: four addresses, sizes,
+# ROW numbers from one query or key to the next, QUERIES in a block, BLOCKS of a head
 QUERY, KEY, VALUE, OUT, N, Q, M, D, K, ROW, QUERIES, BLOCKS = range(12)
 WORDS = 12
 RANK_WRONG, SIZE_WRONG, TOO_WIDE = range(3)
@@ -189,33 +189,36 @@ def _end(a: Any, out: int, count: int, state: Any, sums: Any) -> None:
 def _block(user: int, index: int) -> Word:
     a = words(user)
     # The queries of this block, and how many panels they are
-    both = index // a[BLOCKS]
-    n, m = both // a[M], both % a[M]
-    first = (index - both * a[BLOCKS]) * a[QUERIES]
+    head = index // a[BLOCKS]
+    n, m = head // a[M], head % a[M]
+    first = (index - head * a[BLOCKS]) * a[QUERIES]
     count = min(a[QUERIES], a[Q] - first)
-    panels, each = (count + WIDTH - 1) // WIDTH, a[D] * WIDTH * 4
-    q, s = address_of(_numbers()), address_of(_scores())
-    r, o = address_of(_states()), address_of(_numbers())
+    panels, size = (count + WIDTH - 1) // WIDTH, a[D] * WIDTH * 4
+    q, s = address_of(_numbers()), address_of(_scores())  # (D, WIDTH), (KEYS, WIDTH)
+    r, o = address_of(_states()), address_of(_numbers())  # (2, WIDTH), (D, WIDTH)
     rows = ((n * a[Q] + first) * a[ROW] + m * a[D]) * 4
     for p in range(panels):
         left, at = min(WIDTH, count - p * WIDTH), rows + p * WIDTH * a[ROW] * 4
-        state, sums = floats(r + p * STATE * 4), floats(o + p * each)
-        _begin(a, a[QUERY] + at, left, floats(q + p * each), state, sums)
+        state, sums = floats(r + p * STATE * 4), floats(o + p * size)
+        _begin(a, a[QUERY] + at, left, floats(q + p * size), state, sums)
     # All panels read a block of keys before the next one
     for k in range(0, a[K], KEYS):
         at = ((n * a[K] + k) * a[ROW] + m * a[D]) * 4
         key, value, many = a[KEY] + at, a[VALUE] + at, min(KEYS, a[K] - k)
         for p in range(panels):
-            # Columns that no query fills hold anything; nothing of them is kept
-            left, out = min(WIDTH, count - p * WIDTH), o + p * each
+            # Columns that no query fills hold anything; nothing of them is read
+            left, out = min(WIDTH, count - p * WIDTH), o + p * size
+            # s = key q: (keys, D) (D, queries)
             sizes = (a[ROW], 1, WIDTH, WIDTH, many, left, a[D], 0)
-            _multiply((key, q + p * each, s, *sizes))
+            _multiply((key, q + p * size, s, *sizes))
+            # s = 2^(s - largest), and o corrected to the new largest
             _soften((s, many, r + p * STATE * 4, out, a[D]))
+            # o += value^T s: (D, keys) (keys, queries)
             sizes = (1, a[ROW], WIDTH, WIDTH, a[D], left, many, 1)
             _multiply((value, s, out, *sizes))
     for p in range(panels):
         left, at = min(WIDTH, count - p * WIDTH), rows + p * WIDTH * a[ROW] * 4
-        _end(a, a[OUT] + at, left, floats(r + p * STATE * 4), floats(o + p * each))
+        _end(a, a[OUT] + at, left, floats(r + p * STATE * 4), floats(o + p * size))
     return 0
 
 
@@ -226,6 +229,7 @@ def _compute(state: int, context: int) -> Word:
         if read_input(t, context, i, address_of(x) + 8 * EACH * i) != RANK:
             return error_status(t, RANK_WRONG)
         a[i] = x[EACH * i + ADDRESS]
+    # Key and value are alike, and like query but for the number of rows
     for i in range(RANK):
         if x[EACH + i] != x[2 * EACH + i] or (i != 1 and x[EACH + i] != x[i]):
             return error_status(t, SIZE_WRONG)

@@ -1,8 +1,8 @@
 """The kernel of multi-scale deformable attention, vectorized per block of queries.
 
 For all points of one query the positions and weights of the four corners are computed
-first; then the rows are summed (:mod:`weighted_rows`). All sizes are read at run time,
-and loops are written so that LLVM vectorizes them.
+first; then the rows are summed (:func:`~vectors.weighted_rows`). All sizes are read at
+run time, and loops are written so that LLVM vectorizes them.
 """
 
 from collections.abc import Callable, Mapping
@@ -28,13 +28,13 @@ from me2e_compress.operators.kernels.intrinsics import (
     unsigned_bytes,
     words,
 )
-from me2e_compress.operators.kernels.weighted_rows import CAPACITY, weighted_rows
+from me2e_compress.operators.kernels.vectors import CAPACITY, weighted_rows
 
 F = np.float32
 I32 = np.int32
 
+# Words of one call, as `compute` passes them to every `block`: addresses and sizes
 VALUE, SHAPES, STARTS, SCALE, ZERO, OUT = range(6)
-# Words of one call, as `compute` hands them to every `block`: addresses and sizes
 N, S, M, D, L, Q, P, SCALES, WIDE_SHAPES, WIDE_STARTS = range(6, 16)
 OTHERS = 16  # the first word that is a kernel's own
 
@@ -120,7 +120,7 @@ def write_corners(
     cost next to nothing, and a NaN there has no effect (in the body, 0 x NaN is NaN).
     """
     for j in range(count):
-        # Pixel position, clipped to just outside
+        # Pixel position x W - 1/2, clipped to just outside: -1..W
         k = start + j
         width, height = w[4 * CAPACITY + k], w[5 * CAPACITY + k]
         x = places[2 * j] * width - F(0.5)
@@ -130,7 +130,7 @@ def write_corners(
         y = y if y > F(-1) else F(-1)
         y = y if y < height else height
         floor_x, floor_y = np.floor(x), np.floor(y)
-        # Shares of the corners; 0 outside of the map
+        # Shares of the corners, bilinear: right = x - floor(x); 0 outside of the map
         right, below = x - floor_x, y - floor_y
         x0, y0 = I32(floor_x), I32(floor_y)
         last_x, last_y = o[5 * CAPACITY + k], o[6 * CAPACITY + k]
@@ -144,7 +144,7 @@ def write_corners(
         w[CAPACITY + j] = right * (above * share)
         w[2 * CAPACITY + j] = left * (below * share)
         w[3 * CAPACITY + j] = right * (below * share)
-        # Offsets of the corners, clipped to the map
+        # Offsets of the corners, clipped to the map: first + (y W + x) M D
         column = I32(max(min(x0, last_x), I32(0)) * row)
         following = I32(max(min(I32(x0 + 1), last_x), I32(0)) * row)
         first, stride = o[4 * CAPACITY + k], o[7 * CAPACITY + k]
@@ -170,6 +170,7 @@ def sum_of_weights(w: Any, first: int, last: int) -> Any:
 @compiled
 def dequantize_sums(a: Any, out: int, head: int, shares: Any) -> None:
     """Turn sums of one head's int8 values into sums of the numbers they stand for."""
+    # sum w (q - zero) scale = (sum w q - zero sum w) scale
     numbers, scales = floats(out), floats(a[SCALE])
     zero = F(a[ZERO]) * shares
     if a[SCALES] == 1:

@@ -40,12 +40,13 @@ from me2e_compress.operators.kernels.intrinsics import (
     words,
 )
 from me2e_compress.operators.kernels.vectors import (
+    CAPACITY,
     LANES,
     LOG2_E,
     Vectors,
     vector_intrinsic,
+    weighted_rows,
 )
-from me2e_compress.operators.kernels.weighted_rows import CAPACITY, weighted_rows
 
 F = np.float32
 

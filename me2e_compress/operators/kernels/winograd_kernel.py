@@ -40,8 +40,13 @@ from me2e_compress.operators.kernels.intrinsics import (
     stack,
     words,
 )
-from me2e_compress.operators.kernels.matrix_tile import host_tile, matrix_product
-from me2e_compress.operators.kernels.vectors import LANES, Vectors, vector_intrinsic
+from me2e_compress.operators.kernels.vectors import (
+    LANES,
+    Vectors,
+    host_tile,
+    matrix_product,
+    vector_intrinsic,
+)
 
 # The transforms, as vector instructions.
 

@@ -19,7 +19,7 @@ def product() -> Callable[..., None]:
     import numba
 
     from me2e_compress.operators.kernels.intrinsics import OPTIONS
-    from me2e_compress.operators.kernels.matrix_tile import host_tile, matrix_product
+    from me2e_compress.operators.kernels.vectors import host_tile, matrix_product
 
     multiply = matrix_product(host_tile())
 
