@@ -68,6 +68,7 @@ class Operator(abc.ABC):
 
     def output_shape(self, shapes: Shapes, attributes: Attributes) -> Dims | None:
         """Return the output's shape in the own form; unknown sizes are None."""
+        # Nothing is known unless an operand that has one of its letters has a shape
         letters = set(self.output.split())
         pairs = zip(self.own.operands, shapes, strict=False)
         if not any(shape and letters & set(one.letters) for one, shape in pairs):
@@ -184,13 +185,10 @@ def op_types(name: str) -> frozenset[str]:
 @functools.cache
 def position_inputs() -> Mapping[str, tuple[int, ...]]:
     """Return the indices of inputs with positions or matrices to invert, by op_type."""
+    operands = {op_type: rows[0][1].operands for op_type, rows in _rows().items()}
     return {
-        op_type: tuple(
-            index
-            for index, operand in enumerate(rows[0][1].operands)
-            if operand.positions
-        )
-        for op_type, rows in _rows().items()
+        op_type: tuple(i for i, operand in enumerate(row) if operand.positions)
+        for op_type, row in operands.items()
     }
 
 
@@ -220,6 +218,7 @@ def int8_op_types() -> frozenset[str]:
 
 
 def _calls() -> list[tuple[Operator, Dialect]]:
+    """Return every operator in every dialect."""
     return [
         (operator, dialect)
         for operator in operators()
@@ -237,6 +236,7 @@ def _rows() -> dict[str, list[tuple[Operator, Dialect]]]:
 
 
 def _fits(dialect: Dialect, node: ir.Node) -> bool:
+    """Return whether a node's inputs have the types and shapes of a dialect."""
     try:
         dialect.check(node)
     except PreconditionError:

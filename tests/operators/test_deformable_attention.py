@@ -20,8 +20,8 @@ from me2e_compress.operators import (
 from me2e_compress.operators.deformable_attention import (
     DeformableAttention,
     RawAttention,
+    RawOwnForm,
 )
-from me2e_compress.operators.raw_attention import RawOwnForm
 from me2e_compress.testing.check_operator import DrawnCall, dialect_reference
 from tests.operators.running import body_and_reference, graph_of, in_float32, run
 from tests.support.profiles import scaled

@@ -12,7 +12,7 @@ from me2e_compress.base.errors import PreconditionError
 from me2e_compress.graph import array_of, is_standard, static_shape
 from me2e_compress.graph.nodes import producer_of, sole_reader
 from me2e_compress.operators import OWN_DOMAIN, FusedCall
-from me2e_compress.operators.raw_attention import RAW_ATTENTION
+from me2e_compress.operators.deformable_attention import RAW_ATTENTION
 from me2e_compress.passes.digits import Digit, Layout, flat, merged, whole
 from me2e_compress.passes.digits import sizes as sizes_of
 from me2e_compress.passes.fuse_operators.fused_form import (

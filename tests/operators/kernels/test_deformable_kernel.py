@@ -10,7 +10,6 @@ from hypothesis import strategies as st
 
 from me2e_compress.operators import Dialect
 from me2e_compress.operators.deformable_attention import DeformableAttention
-from me2e_compress.operators.raw_attention import raw_own_form
 from me2e_compress.runtime import runnable
 from me2e_compress.runtime.session import Session
 from me2e_compress.testing.check_operator import DrawnCall, dialect_reference
@@ -22,7 +21,7 @@ from tests.support.profiles import scaled
 pytestmark = needs_kernels
 
 OPERATOR = DeformableAttention()
-RAW = raw_own_form()
+RAW = DeformableAttention.dialects[-1]
 calls = st.fixed_dictionaries(
     {
         "sizes": st.lists(
