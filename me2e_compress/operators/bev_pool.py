@@ -75,10 +75,9 @@ class BEVPool(Operator):
         rows = call.add("Gather", [rows, of_feature], {"axis": 0})
         numbers = call.add("Gather", [numbers, of_depth], {"axis": 0})
         # float16 products overflow nowhere that their sum does not
-        weighted = call.add(
-            "Mul", [call.cast(each, ir.DataType.DOUBLE) for each in (rows, numbers)]
-        )
-        # Sum each interval as a difference of running sums
+        factors = [call.cast(part, ir.DataType.DOUBLE) for part in (rows, numbers)]
+        weighted = call.add("Mul", factors)  # [K, C]
+        # Sum each interval as a difference of running sums, [K + 1, C]
         running = call.add("CumSum", [weighted, call.integers(0)])
         running = call.add("Pad", [running, call.integers([1, 0, 0, 0])])
         ends = call.add("Add", [starts, lengths])

@@ -85,7 +85,7 @@ def _by_grid_sample(
     grids = call.add("Sub", [scaled, call.numbers(1.0, locations)])
     grids = call.transpose(grids, (0, 2, 3, 1, 4, 5))  # [N, M, L, Q, P, 2]
     by_head = call.transpose(value, (0, 2, 3, 1))  # [N, M, D, S]
-    samples, kept = [], []
+    samples, sampled = [], []
     for level, (height, columns, start) in enumerate(maps):
         if not height * columns:
             continue
@@ -93,20 +93,20 @@ def _by_grid_sample(
         image = call.reshape(rows, (images, channels, height, columns))
         grid = call.slice(grids, level, level + 1, 2)
         grid = call.reshape(grid, (images, queries, points, 2))
-        taken = call.add("GridSample", [image, grid], {"align_corners": 0})
+        sample = call.add("GridSample", [image, grid], {"align_corners": 0})
         if shared:
-            taken = call.reshape(taken, (both, width, queries, points))
-        samples.append(taken)  # [N*M, D, Q, P]
-        kept.append(level)
+            sample = call.reshape(sample, (both, width, queries, points))
+        samples.append(sample)  # [N*M, D, Q, P]
+        sampled.append(level)
     if not samples:
         return call.full((batch, queries, heads, width), 0.0, value)
     # Multiply by the weights and sum over levels and points
     weights = call.transpose(weights, (0, 2, 1, 3, 4))  # [N, M, Q, L, P]
-    if len(kept) < len(maps):
-        weights = call.add("Gather", [weights, call.integers(kept)], {"axis": 3})
-    flat = call.product(len(kept), points)
+    if len(sampled) < len(maps):
+        weights = call.add("Gather", [weights, call.integers(sampled)], {"axis": 3})
+    flat = call.product(len(sampled), points)
     weights = call.reshape(weights, (both, 1, queries, flat))
-    weighted = call.add("Mul", [call.concat(samples, 3), weights])
+    weighted = call.add("Mul", [call.concat(samples, 3), weights])  # [.., D, Q, L*P]
     summed = call.reshape(call.sum(weighted, (3,)), (batch, heads, width, queries))
     return call.transpose(summed, (0, 3, 1, 2))
 
@@ -138,18 +138,19 @@ def _by_gather(
     many = call.value_of(heads)
     nothing, zero = call.integers(0), call.numbers(0.0, weights)
     parts = []
-    # Add the four corners
+    # Add the four corners, each in row base + (y W + x) M
     for row, row_inside, row_part in axes[1]:
         for column, inside, part in axes[0]:
-            where = call.add("And", [inside, row_inside])
+            where = call.add("And", [inside, row_inside])  # [N, Q, M, L, P]
             at = call.add("Add", [call.add("Mul", [row, columns]), column])
             index = call.add("Add", [base, call.add("Mul", [at, many])])
             index = call.add("Where", [where, index, nothing])
+            # Bilinear share times weight; 0 outside
             share = call.add("Mul", [call.add("Mul", [part, row_part]), weights])
             share = call.add("Where", [where, share, zero])
-            taken = call.add("Gather", [rows, index], {"axis": 0})
-            taken = call.add("Mul", [taken, call.unsqueeze(share, (5,))])
-            parts.append(call.sum(taken, (3, 4)))
+            corner = call.add("Gather", [rows, index], {"axis": 0})
+            corner = call.add("Mul", [corner, call.unsqueeze(share, (5,))])
+            parts.append(call.sum(corner, (3, 4)))  # [N, Q, M, D]
     return functools.reduce(lambda one, two: call.add("Add", [one, two]), parts)
 
 
@@ -177,6 +178,7 @@ def _neighbours(
 
 
 def _first_rows(call: FusedCall, padded: ir.Value, starts: ir.Value) -> ir.Value:
+    """Write the first row of image n, head m, level l: (n S + start + 1) M + m."""
     batch, length, heads = (call.size(padded, axis) for axis in (0, 1, 2))
     many = call.value_of(heads)
     starts = call.cast(starts, ir.DataType.INT64)
@@ -201,12 +203,13 @@ def sample_levels_array(
     for level, ((height, columns), start) in enumerate(zip(sizes, starts, strict=True)):
         if not height * columns:
             continue
-        # One image per head
-        image = value[:, start : start + height * columns].transpose(0, 2, 3, 1)
+        # One image per head, positions in -1..1
+        rows = value[:, start : start + height * columns]  # [N, H*W, M, D]
+        image = rows.transpose(0, 2, 3, 1).reshape(-1, width, height, columns)
         grid = 2 * locations[:, :, :, level].transpose(0, 2, 1, 3, 4) - 1
-        grid = np.broadcast_to(grid, (batch, heads, *grid.shape[2:]))
-        image = image.reshape(-1, width, height, columns)
-        taken = grid_sample_array((image, grid.reshape(-1, *grid.shape[2:])), BILINEAR)
-        taken = taken.reshape(batch, heads, width, *grid.shape[2:4])
-        total += np.einsum("nmdqp,nqmp->nqmd", taken, weights[:, :, :, level])
+        grid = np.broadcast_to(grid, (batch, heads, *grid.shape[2:]))  # [N, M, Q, P, 2]
+        flat = grid.reshape(-1, *grid.shape[2:])
+        samples = grid_sample_array((image, flat), BILINEAR)  # [N*M, D, Q, P]
+        samples = samples.reshape(batch, heads, width, *grid.shape[2:4])
+        total += np.einsum("nmdqp,nqmp->nqmd", samples, weights[:, :, :, level])
     return total

@@ -73,16 +73,16 @@ class FusedCall:
                     f" call.numbers({value!r}, like=x)"
                 )
         name = fresh_name(f"{self._stem}/{op_type}", self.names)
-        made = ir.node(
+        node = ir.node(
             op_type, inputs, attributes, domain=domain, name=name, num_outputs=outputs
         )
-        for index, value in enumerate(made.outputs):
+        for index, value in enumerate(node.outputs):
             value.name = fresh_name(f"{name}_{index}", self.names)
         # Shape and type are inferred at once
-        provenance.inherit(made, self.sources, by=self.by)
-        self._where.insert_before(self.node, made)
-        _infer(made, self.opset)
-        return made.outputs[0]
+        provenance.inherit(node, self.sources, by=self.by)
+        self._where.insert_before(self.node, node)
+        _infer(node, self.opset)
+        return node.outputs[0]
 
     def put(self, result: ir.Value) -> None:
         """Replace the fused node by a value, which gets the name of its output."""
@@ -106,11 +106,11 @@ class FusedCall:
         name = f"{self._stem}/{name}"
         if isinstance(self._where, ir.Graph):
             return add_constant(self._where, array, name, self.names)
-        made = ir.node("Constant", [], {"value": ir.tensor(array)}, num_outputs=1)
-        made.name = made.outputs[0].name = fresh_name(name, self.names)
-        self._where.insert_before(self.node, made)
-        _infer(made, self.opset)
-        return made.outputs[0]
+        node = ir.node("Constant", [], {"value": ir.tensor(array)}, num_outputs=1)
+        node.name = node.outputs[0].name = fresh_name(name, self.names)
+        self._where.insert_before(self.node, node)
+        _infer(node, self.opset)
+        return node.outputs[0]
 
     def numbers(
         self, values: float | Sequence[float] | Array, like: ir.Value
@@ -249,6 +249,7 @@ _ALLOWZERO_OPSET = 14
 
 
 def _shape(sizes: Sequence[Size]) -> ir.Shape:
+    """Return a shape of sizes, those open that are not known or -1."""
     return ir.Shape([n if isinstance(n, int) and n >= 0 else None for n in sizes])
 
 

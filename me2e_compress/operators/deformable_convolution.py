@@ -49,8 +49,6 @@ def _operands(types: tuple[ir.DataType, ...]) -> tuple[Operand, ...]:
 
 
 _OWN = _options("groups", "deform_groups")
-
-
 _OSS = _options("group", "deformable_group")
 _CONV, _MMCV = "ModulatedDeformConv2d", "MMCVModulatedDeformConv2d"
 _LIBRARY = ("trt.plugins", _operands(FLOATS), "TensorRT OSS")
@@ -108,23 +106,23 @@ class DeformableConvolution(Operator):
         out, part, *elements = weight.shape
         count, places = math.prod(elements), down * across
         parts, groups = number(attributes, "deform_groups"), deep // part
-        # Sample each kernel element at its moved position
+        # Sample each kernel element at its moved position: K elements, F * G places
         grid = kernel_positions((down, across), (elements[0], elements[1]), attributes)
         moved = offset.reshape(batch, parts, count, 2, places).transpose(0, 4, 2, 1, 3)
-        at = (moved + grid)[..., ::-1] + 0.5
+        at = (moved + grid)[..., ::-1] + 0.5  # [N, F * G, K, parts, 2], (x, y)
         shape = (batch, places * count, parts, 1, 1)
         shares = mask.reshape(batch, parts, count, places).transpose(0, 3, 2, 1)
-        taken = sample_levels_array(
+        samples = sample_levels_array(
             image.reshape(batch, parts, -1, high * wide).transpose(0, 3, 1, 2),
             np.array([[high, wide]]),
             np.array([0]),
             (at / np.array([wide, high])).reshape(*shape, 2),
             shares.reshape(shape),
         )
-        taken = taken.reshape(batch, places, count, groups, part)
+        samples = samples.reshape(batch, places, count, groups, part)
         # Multiply the samples by the weight, group by group
         matrix = weight.reshape(groups, out // groups, part, count)
-        result: NdArray = np.einsum("gock,npkgc->ngop", matrix, taken)
+        result: NdArray = np.einsum("gock,npkgc->ngop", matrix, samples)
         result = result.reshape(batch, out, down, across)
         return np.add(result, bias[0].reshape(-1, 1, 1)) if bias else result
 

@@ -51,8 +51,8 @@ def grid_sample_array(inputs: Arrays, attributes: Attributes) -> NdArray:
         share, step = np.ones(grid.shape[:-1]), 1
         for (along, part), size in zip(near, reversed(sizes), strict=True):
             index, share, step = index + along * step, share * part, step * size
-        taken = rows[first, :, index]  # [N, ..., C]
-        total += np.moveaxis(taken * share[..., None], -1, 1)
+        values = rows[first, :, index]  # [N, ..., C]
+        total += np.moveaxis(values * share[..., None], -1, 1)
     return total
 
 
@@ -78,23 +78,26 @@ def _neighbours(
     result = []
     for place, share in around:
         edge = _padded(place, size, options) if mode == _BICUBIC else place
-        kept = edge.clip(0, size - 1)
-        result.append((kept.astype(np.int64), np.where(kept == edge, share, 0)))
+        inner = edge.clip(0, size - 1)  # what is outside has no share
+        result.append((inner.astype(np.int64), np.where(inner == edge, share, 0)))
     return result
 
 
 def _cubic(distance: NdArray) -> NdArray:
+    """Return the weights of cubic convolution at distances of up to 1, and 1 to 2."""
     near = ((_CUBIC + 2) * distance - (_CUBIC + 3)) * distance**2 + 1
     far = _CUBIC * (((distance - 5) * distance + 8) * distance - 4)
     return np.where(distance <= 1, near, far)
 
 
 def _padded(pixel: NdArray, size: int, options: Attributes) -> NdArray:
+    """Move positions in pixels into the image, as the padding mode does."""
     padding, aligned = options["padding_mode"], bool(options["align_corners"])
     if padding == _REFLECTION:
         low, span = (0.0, size - 1) if aligned else (-0.5, size)
         if span == 0:
             return np.zeros_like(pixel)
+        # Distance from the low edge, folded at both edges
         off = np.abs(pixel - low) % (2 * span)
         pixel = np.minimum(off, 2 * span - off) + low
     return pixel if padding == _ZEROS else pixel.clip(0, size - 1)

@@ -64,7 +64,7 @@ class Inverse(Operator):
             )
         if size == 1:
             return call.cast(call.add("Reciprocal", [matrix]), kind)
-        # Determinants of all minors, with alternating signs
+        # Element (i, j): (-1)^(i + j) times the minor without row j and column i
         rank = len(matrix.shape) if matrix.shape is not None else 2
         outer = tuple(call.size(matrix, axis) for axis in range(rank - 2))
         flat = call.reshape(matrix, (*outer, size * size))
@@ -91,9 +91,9 @@ class Inverse(Operator):
 
 def _minors(size: int) -> NdArray:
     """Return the indices of each adjugate element's minor, [n, n, n - 1, n - 1]."""
-    # Rows and columns without the i-th
-    kept = np.array([[j for j in range(size) if j != i] for i in range(size)])
+    # Rows and columns without the i-th, [n, n - 1]
+    others = np.array([[j for j in range(size) if j != i] for i in range(size)])
     # Element (i, j) of the adjugate is the minor without row j and column i
-    rows, columns = kept[None, :, :, None], kept[:, None, None, :]
+    rows, columns = others[None, :, :, None], others[:, None, None, :]
     index: NdArray = rows * size + columns
     return index

@@ -82,7 +82,7 @@ class FusedMultiHeadAttention(Operator):
         width = call.known_size(query, -1)
         fits = width is not None and 0 < width <= WIDEST_HEAD * heads
         if call.compiled and fits and query.dtype in (None, ir.DataType.FLOAT):
-            rows = [_split(call, each, heads) for each in (query, key, value)]
+            rows = [_split(call, part, heads) for part in (query, key, value)]
             result = call.add(ATTENTION, rows, domain=DOMAIN)
             result.type, result.shape = rows[0].type, rows[0].shape
             return _joined(call, result, query)
@@ -99,9 +99,10 @@ class FusedMultiHeadAttention(Operator):
     def reference(self, inputs: Arrays, attributes: Attributes) -> NdArray:
         """Compute it in numpy, [B, Q, C] float64."""
         heads = _heads(attributes)
-        query, key, value = (
+        arrays = (np.asarray(array, np.float64) for array in inputs)
+        query, key, value = (  # [B, heads, rows, C / heads]
             rows.reshape(*rows.shape[:2], heads, -1).transpose(0, 2, 1, 3)
-            for rows in (np.asarray(each, np.float64) for each in inputs)
+            for rows in arrays
         )
         scores = query @ key.transpose(0, 1, 3, 2) / math.sqrt(query.shape[-1])
         weights = np.exp(scores - scores.max(axis=-1, keepdims=True))
@@ -111,6 +112,7 @@ class FusedMultiHeadAttention(Operator):
 
 
 def _split(call: FusedCall, rows: ir.Value, heads: int) -> ir.Value:
+    """Split heads: [B, Q, C] to [B, Q, heads, C / heads]."""
     return call.reshape(rows, (call.size(rows, 0), call.size(rows, 1), heads, -1))
 
 
@@ -125,6 +127,6 @@ def _written(
     width = call.size(query, -1)
     count = call.cast(call.value_of(width), query.dtype or ir.DataType.FLOAT)
     query = call.add("Div", [query, call.add("Sqrt", [count])])
-    scores = call.add("MatMul", [query, turned_key])
+    scores = call.add("MatMul", [query, turned_key])  # [..., Q, K]
     weights = call.add("Softmax", [scores], {"axis": -1})
     return call.add("MatMul", [weights, value])

@@ -45,7 +45,7 @@ class SelectAndPad(Operator):
     """The first flagged rows, in order, padded with a given row.
 
     Own form ``me2e::SelectAndPad``: feat [B, Q, C]; flag int32 or int64 [B, Q], above 0
-    where a row is taken; invalid [C]; ``P`` rows. Output [B, P, C].
+    where a row is selected; invalid [C]; ``P`` rows. Output [B, P, C].
     """
 
     name = "select-and-pad"
@@ -72,8 +72,8 @@ class SelectAndPad(Operator):
         first = call.add("Sub", [call.numbers(0.0, numbers), numbers])
         last = call.numbers(float("-inf"), numbers)
         wide = call.cast(flag, ir.DataType.INT64)
-        taken = call.add("Greater", [wide, call.integers(0)])
-        order = call.add("Where", [taken, first, last])
+        flagged = call.add("Greater", [wide, call.integers(0)])
+        order = call.add("Where", [flagged, first, last])  # -index or -infinity, [B, Q]
         best = call.add("TopK", [order, call.integers([count])], outputs=2)
         index = best.producer().outputs[1]  # type: ignore[union-attr]
         index = call.unsqueeze(index, (2,))

@@ -62,9 +62,9 @@ class WinogradConvolution(Operator):
 
     def macs(self, shapes: Shapes, attributes: Attributes) -> int | None:
         """Count those of the convolution, not of the algorithm."""
-        made = self.output_shape(shapes, attributes)
-        (deep,) = self._sizes("C", shapes, attributes)
-        return None if made is None else product((*made, deep, FILTER, FILTER))
+        dims = self.output_shape(shapes, attributes)
+        (channels,) = self._sizes("C", shapes, attributes)
+        return None if dims is None else product((*dims, channels, FILTER, FILTER))
 
     def body(self, call: FusedCall, inputs: Values, attributes: Attributes) -> ir.Value:
         """Write the kernel's call, or a Conv and a Relu."""
@@ -86,10 +86,10 @@ class WinogradConvolution(Operator):
         else:
             weight = call.constant(np.ascontiguousarray(known.transpose(order)))
         options = (*numbers(attributes, "pads"), number(attributes, "relu"))
-        given = [image, weight, bias, call.integers(options)]
-        result = call.add(self.own.op_type, given, domain=DOMAIN)
-        made = self.output_shape([open_shape(value) for value in inputs], attributes)
-        result.shape = None if made is None else ir.Shape(made)
+        operands = [image, weight, bias, call.integers(options)]
+        result = call.add(self.own.op_type, operands, domain=DOMAIN)
+        dims = self.output_shape([open_shape(value) for value in inputs], attributes)
+        result.shape = None if dims is None else ir.Shape(dims)
         result.type = ir.TensorType(ir.DataType.FLOAT)
         return result
 
@@ -100,9 +100,8 @@ class WinogradConvolution(Operator):
         )
         top, left, bottom, right = numbers(attributes, "pads")
         padded = np.pad(image, ((0, 0), (0, 0), (top, bottom), (left, right)))
-        taken = np.lib.stride_tricks.sliding_window_view(
-            padded, (FILTER, FILTER), (2, 3)
-        )
-        result: NdArray = np.einsum("nchwij,kcij->nkhw", taken, weight, optimize=True)
+        window = (FILTER, FILTER)
+        patches = np.lib.stride_tricks.sliding_window_view(padded, window, (2, 3))
+        result: NdArray = np.einsum("nchwij,kcij->nkhw", patches, weight, optimize=True)
         result = result + bias[:, None, None]
         return np.maximum(result, 0) if number(attributes, "relu") else result
