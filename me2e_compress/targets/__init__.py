@@ -24,20 +24,6 @@ from me2e_compress.quantization.costs import Costs
 from me2e_compress.quantization.decision import KeptFloat, QuantPlan
 from me2e_compress.runtime.providers import CPU, Provider
 
-__all__ = [
-    "DEFAULT_TARGET",
-    "TARGETS",
-    "LintFinding",
-    "LintRule",
-    "Severity",
-    "Target",
-    "divided_grids",
-    "error",
-    "of_opset",
-    "valid",
-    "warning",
-]
-
 Severity = Literal["error", "wrong", "warning"]
 SEVERITIES: tuple[Severity, ...] = get_args(Severity)  # the worst first
 
@@ -72,6 +58,24 @@ def error(rule: str, node: ir.Node | None, message: str) -> LintFinding:
 def warning(rule: str, node: ir.Node | None, message: str) -> LintFinding:
     """Return a finding with which the target still runs the graph, but badly."""
     return LintFinding("warning", rule, name_of(node), message)
+
+
+def rule_of_nodes(
+    rule: str,
+    severity: Severity,
+    nodes: Callable[[ir.Model], Iterable[ir.Node]] = graph.nodes_of,
+) -> Callable[[Callable[[ir.Node], Iterator[str]]], LintRule]:
+    """Make a rule of a function that yields what is wrong about one node."""
+
+    def decorate(check: Callable[[ir.Node], Iterator[str]]) -> LintRule:
+        def lint(model: ir.Model) -> Iterator[LintFinding]:
+            for node in nodes(model):
+                for message in check(node):
+                    yield LintFinding(severity, rule, name_of(node), message)
+
+        return lint
+
+    return decorate
 
 
 def valid(model: ir.Model) -> Iterator[LintFinding]:

@@ -20,9 +20,8 @@ from typing import TypeAlias
 
 import onnx_ir as ir
 
-from me2e_compress import graph
 from me2e_compress.base.errors import PreconditionError
-from me2e_compress.graph import input_at, is_standard, nodes_of, rank_of
+from me2e_compress.graph import array_of, input_at, is_standard, nodes_of, rank_of
 from me2e_compress.graph.nodes import is_plugin
 from me2e_compress.graph.opset import on_disk
 from me2e_compress.graph.shapes import unshaped_plugins
@@ -33,6 +32,7 @@ from me2e_compress.targets import (
     divided_grids,
     error,
     of_opset,
+    rule_of_nodes,
     valid,
     warning,
 )
@@ -154,10 +154,11 @@ class Parser:
                 more = "; TensorRT-RTX 1.7 parses newer (measured)"
                 yield warning("opset", None, f"{message}, by their pages{more}")
             return
-        # never an error: it was read from some version in between on
-        since = next(each for each, newest in NEWEST_OPSETS.items() if opset <= newest)
-        oldest, given = next(iter(NEWEST_OPSETS)), self.version
-        if since != oldest and (given is None or given < version_of(since)):
+        # Never an error: some version in between began to read it
+        since = next(name for name, newest in NEWEST_OPSETS.items() if opset <= newest)
+        oldest = next(iter(NEWEST_OPSETS))
+        is_older = self.version is None or self.version < version_of(since)
+        if since != oldest and is_older:
             text = f"TensorRT {since} reads it, {oldest} reads {NEWEST_OPSETS[oldest]}"
             yield warning("opset", None, f"opset {opset}: {text}")
 
@@ -177,12 +178,12 @@ class Parser:
     def element_types(self, model: ir.Model) -> Iterator[LintFinding]:
         """Find data of a type that its operator does not accept."""
         for node in nodes_of(model):
-            taken = SUPPORTED.get(node.op_type) if is_standard(node) else None
+            types = SUPPORTED.get(node.op_type) if is_standard(node) else None
             value = input_at(node, _DATA_INPUT.get(node.op_type, 0))
             if node.op_type in _TYPE_OF_OUTPUT:
                 value = node.outputs[0]
             kind = None if value is None else value.dtype
-            if taken is None or kind is None:
+            if types is None or kind is None:
                 continue
             what = f"{node.op_type} of {kind.name.lower()}"
             late, since = TYPES_LATER.get(node.op_type, (frozenset(), ""))
@@ -191,34 +192,33 @@ class Parser:
             elif kind == ir.DataType.DOUBLE:  # TensorRT casts it down by itself
                 message = f"{node.op_type} of float64 is cast down"
                 yield warning("element-type", node, message)
-            elif kind not in taken and node.op_type not in _UNTYPED:
-                names = ", ".join(sorted(each.name.lower() for each in taken))
+            elif kind not in types and node.op_type not in _UNTYPED:
+                names = ", ".join(sorted(other.name.lower() for other in types))
                 yield error("element-type", node, f"{what}; it accepts {names}")
 
     def _late(
         self, rule: str, node: ir.Node | None, what: str, since: str
     ) -> Iterator[LintFinding]:
-        """Say that something needs a version: an error if the parser is older."""
+        """Yield that something needs a version: an error if the parser is older."""
+        message = f"{what} needs TensorRT {since} or later"
         if self.version is None:
-            yield warning(rule, node, f"{what} needs TensorRT {since} or later")
+            yield warning(rule, node, message)
         elif self.version < version_of(since):
-            given = ".".join(map(str, self.version))
-            message = f"{what} needs TensorRT {since} or later, not {given}"
-            yield error(rule, node, message)
+            own = ".".join(map(str, self.version))
+            yield error(rule, node, f"{message}, not {own}")
 
 
-def one_type(model: ir.Model) -> Iterator[LintFinding]:
+@rule_of_nodes("mixed-types", "error")
+def one_type(node: ir.Node) -> Iterator[str]:
     """Find operators with two float types: networks are strongly typed."""
+    if not is_standard(node) or node.op_type in (*PAIR, "CastLike", "Resize"):
+        return
+    # Integers do not matter, only float types
     floats = (ir.DataType.FLOAT, ir.DataType.FLOAT16, ir.DataType.BFLOAT16)
-    for node in nodes_of(model):
-        if not is_standard(node) or node.op_type in (*PAIR, "CastLike", "Resize"):
-            continue
-        # Integers do not matter, only float types.
-        kinds = {each.dtype for each in node.inputs if each is not None}
-        names = [each.name.lower() for each in floats if each in kinds]
-        if len(names) > 1:
-            message = f"{node.op_type} of {' and '.join(names)}: cast one of them"
-            yield error("mixed-types", node, message)
+    kinds = {value.dtype for value in node.inputs if value is not None}
+    names = [kind.name.lower() for kind in floats if kind in kinds]
+    if len(names) > 1:
+        yield f"{node.op_type} of {' and '.join(names)}: cast one of them"
 
 
 def plugins(model: ir.Model) -> Iterator[LintFinding]:
@@ -226,21 +226,16 @@ def plugins(model: ir.Model) -> Iterator[LintFinding]:
 
     TensorRT looks at the name alone; exporters leave the domain out.
     """
-    for node in nodes_of(model):
-        if not is_plugin(node):
-            continue
-        # A local function makes an unknown operator acceptable.
+    for node in filter(is_plugin, nodes_of(model)):
         dialect = _plugin(node)
         if dialect is not None:
             for message in _misfits(node, dialect):
                 yield error("plugin", node, message)
+        # A local function makes an unknown operator acceptable
         elif node.op_identifier() not in model.functions:
-            yield error(
-                "plugin",
-                node,
-                f"{node.domain or 'ai.onnx'}::{node.op_type} is neither an operator nor"
-                " a known plugin, and has no local function",
-            )
+            name = f"{node.domain or 'ai.onnx'}::{node.op_type}"
+            message = "is neither an operator nor a known plugin, and has no local"
+            yield error("plugin", node, f"{name} {message} function")
 
 
 def _plugin(node: ir.Node) -> Dialect | None:
@@ -250,10 +245,10 @@ def _plugin(node: ir.Node) -> Dialect | None:
 
 
 def _misfits(node: ir.Node, dialect: Dialect) -> Iterator[str]:
-    """Say where a node does not fit a plugin."""
+    """Yield where a node does not fit a plugin."""
     name = f"{node.op_type} of {dialect.source}"
-    required = [each.name for each in dialect.attributes if each.required]
-    if missing := [each for each in required if each not in node.attributes]:
+    required = [attr.name for attr in dialect.attributes if attr.required]
+    if missing := [attr for attr in required if attr not in node.attributes]:
         yield f"{name} needs attributes {', '.join(missing)}"
     try:
         dialect.check(node)
@@ -261,16 +256,14 @@ def _misfits(node: ir.Node, dialect: Dialect) -> Iterator[str]:
         yield str(refusal).replace(dialect.call_of(node), name, 1)
 
 
-def plugin_shapes(model: ir.Model) -> Iterator[LintFinding]:
+@rule_of_nodes("plugin-shape", "warning", unshaped_plugins)
+def plugin_shapes(node: ir.Node) -> Iterator[str]:
     """Find known plugins whose outputs have no shape, nor what follows them."""
-    for node in unshaped_plugins(model):
-        if _plugin(node) is not None:
-            yield warning(
-                "plugin-shape",
-                node,
-                f"{node.op_type} tells no shape of what it gives: written as"
-                " value_info, folding, MACs and int8 go on behind it",
-            )
+    if _plugin(node) is not None:
+        yield (
+            f"{node.op_type} tells no shape of what it gives: written as value_info,"
+            " folding, MACs and int8 go on behind it"
+        )
 
 
 MAX_K = 3840  # largest K of a TopK
@@ -282,26 +275,28 @@ _RESIZE_TRANSFORMS = (
 )  # fmt: skip
 
 
-def restrictions(model: ir.Model) -> Iterator[LintFinding]:
-    """Check every node against the restrictions on its operator."""
-    for node in nodes_of(model):
-        for check in _CHECKS.get(node.op_type, ()) if is_standard(node) else ():
-            if objection := check(node):
-                yield error("restriction", node, f"{node.op_type}: {objection}")
+@rule_of_nodes("restriction", "error")
+def restrictions(node: ir.Node) -> Iterator[str]:
+    """Check a node against the restrictions on its operator."""
+    for check in _CHECKS.get(node.op_type, ()) if is_standard(node) else ():
+        if objection := check(node):
+            yield f"{node.op_type}: {objection}"
 
 
-def rtx(model: ir.Model) -> Iterator[LintFinding]:
+@rule_of_nodes("rtx", "warning")
+def rtx(node: ir.Node) -> Iterator[str]:
     """Find what TensorRT takes, and TensorRT-RTX 1.7 does not: measured."""
-    for node in nodes_of(model):
-        message, value = "", graph.input_at(node, 0)
-        floats = value is not None and value.dtype == ir.DataType.FLOAT
-        if node.op_type == "Attention" and floats:
-            message = "is parsed, and not built, of float32: convert-float16 helps"
-        elif node.op_type == "ScatterElements" and _no_reduction(node):
-            message = "is not parsed with a reduction"
-        if message and is_standard(node):
-            message = f"{node.op_type} {message}, by TensorRT-RTX 1.7 (measured)"
-            yield warning("rtx", node, message)
+    reason, value = "", input_at(node, 0)
+    is_float = value is not None and value.dtype == ir.DataType.FLOAT
+    if node.op_type == "Attention" and is_float:
+        reason = "is parsed, and not built, of float32: convert-float16 helps"
+    elif node.op_type == "ScatterElements" and _no_reduction(node):
+        reason = "is not parsed with a reduction"
+    if reason and is_standard(node):
+        yield f"{node.op_type} {reason}, by TensorRT-RTX 1.7 (measured)"
+
+
+# Restrictions of operators: what is wrong with a node, or None
 
 
 def _image(node: ir.Node) -> str | None:
@@ -311,6 +306,7 @@ def _image(node: ir.Node) -> str | None:
 
 
 def _four(node: ir.Node) -> str | None:
+    """Check for two spatial dimensions."""
     rank = rank_of(node.inputs[0])
     return None if rank in (None, 4) else f"rank {rank}, must be 4"
 
@@ -328,9 +324,8 @@ def _first_output(node: ir.Node) -> str | None:
 def _constant(index: int, name: str) -> Callable[[ir.Node], str | None]:
     def check(node: ir.Node) -> str | None:
         value = input_at(node, index)
-        if value is None or graph.array_of(value) is not None:
-            return None
-        return f"{name} is computed, must be a constant"
+        computed = value is not None and array_of(value) is None
+        return f"{name} is computed, must be a constant" if computed else None
 
     return check
 
@@ -338,10 +333,9 @@ def _constant(index: int, name: str) -> Callable[[ir.Node], str | None]:
 def _top_k(node: ir.Node) -> str | None:
     if node.attributes.get_int("sorted", 1) != 1:
         return "sorted must be 1"
-    k = graph.array_of(node.inputs[1])
-    if k is None or int(k.reshape(-1)[0]) <= MAX_K:
-        return None
-    return f"K = {int(k.reshape(-1)[0])}, at most {MAX_K}"
+    k = array_of(node.inputs[1])
+    number = 0 if k is None else int(k.reshape(-1)[0])
+    return f"K = {number}, at most {MAX_K}" if number > MAX_K else None
 
 
 def _no_reduction(node: ir.Node) -> str | None:
@@ -370,9 +364,8 @@ def _resize(node: ir.Node) -> str | None:
 def _even_pads(node: ir.Node) -> str | None:
     pads = tuple(node.attributes.get_ints("pads", ()))
     half = len(pads) // 2
-    if pads[:half] == pads[half:]:
-        return None
-    return f"pads {list(pads)} differ between begin and end"
+    uneven = pads[:half] != pads[half:]
+    return f"pads {list(pads)} differ between begin and end" if uneven else None
 
 
 _CHECKS: dict[str, tuple[Callable[[ir.Node], str | None], ...]] = {
@@ -392,13 +385,7 @@ _CHECKS: dict[str, tuple[Callable[[ir.Node], str | None], ...]] = {
     "Squeeze": (_constant(1, "axes"),),
     "TopK": (_top_k,),
     "Unsqueeze": (_constant(1, "axes"),),
-    **{
-        f"Reduce{name}": (_constant(1, "axes"),)
-        for name in (
-            "L1", "L2", "LogSum", "LogSumExp", "Max", "Mean", "Min", "Prod", "Sum",
-            "SumSquare",
-        )
-    },
+    **{name: (_constant(1, "axes"),) for name in SUPPORTED if name[:6] == "Reduce"},
 }  # fmt: skip
 
 
