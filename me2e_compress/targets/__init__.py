@@ -17,7 +17,7 @@ from me2e_compress.base.errors import PreconditionError, RecipeError
 from me2e_compress.base.registry import Registry
 from me2e_compress.calibration.ranges import Ranges
 from me2e_compress.graph import is_standard, opset_of
-from me2e_compress.graph.nodes import LAYOUT_OPERATORS, grid_of
+from me2e_compress.graph.nodes import LAYOUT_OPERATORS, bodies, grid_of
 from me2e_compress.graph.rewrite.raise_opset import OLDEST_OPSET, raise_opset
 from me2e_compress.graph.validity import refusal
 from me2e_compress.quantization.costs import Costs
@@ -86,7 +86,9 @@ def valid(model: ir.Model) -> Iterator[LintFinding]:
 
 def worst_first(findings: Iterable[LintFinding]) -> tuple[LintFinding, ...]:
     """Sort findings by their severity."""
-    return tuple(sorted(findings, key=lambda each: SEVERITIES.index(each.severity)))
+    return tuple(
+        sorted(findings, key=lambda finding: SEVERITIES.index(finding.severity))
+    )
 
 
 def of_opset(model: ir.Model) -> Iterator[LintFinding]:
@@ -94,20 +96,15 @@ def of_opset(model: ir.Model) -> Iterator[LintFinding]:
 
     TensorRT's parser does not look at the opset; onnxruntime does.
     """
-    main, defs = opset_of(model), onnx.defs
-    parts: tuple[ir.Graph | ir.Function, ...]
-    parts = (model.graph, *model.functions.values())
-    for part in parts:
-        own = opset_of(part) if isinstance(part, ir.Function) else None
-        opset = own or main
+    for part, opset in bodies(model):
         for node in part.all_nodes():
             name = node.op_type
-            if not is_standard(node) or not defs.has(name, domain=""):
+            if not is_standard(node) or not onnx.defs.has(name, domain=""):
                 continue
-            if not defs.has(name, max_inclusive_version=opset, domain=""):
+            if not onnx.defs.has(name, max_inclusive_version=opset, domain=""):
                 since = min(
                     schema.since_version
-                    for schema in defs.get_all_schemas_with_history()
+                    for schema in onnx.defs.get_all_schemas_with_history()
                     if schema.name == name and schema.domain == ""
                 )
                 message = f"{name} came with opset {since}, the graph is of {opset}"
@@ -119,33 +116,33 @@ def divided_grids(model: ir.Model) -> Iterator[LintFinding]:
 
     Points of depth 0 give 0 / 0 there.
     """
-    seen, positive = set[ir.Node](), dict[ir.Value, bool]()
-    for node in graph.nodes_of(model):
-        pending = [grid_of(node)]
+    visited, positive = set[ir.Node](), dict[ir.Value, bool]()
+    for sampler in graph.nodes_of(model):
+        # Walk back from the grid over what moves or combines positions
+        pending = [grid_of(sampler)]
         while pending:
-            made = graph.producer_of(pending.pop())
-            if made is None or made in seen or made.op_type not in _TO_A_GRID:
+            node = graph.producer_of(pending.pop())
+            if node is None or node in visited or node.op_type not in _TO_A_GRID:
                 continue
-            seen.add(made)
-            pending += made.inputs
-            divisor = made.inputs[-1]
-            if made.op_type not in ("Div", "Reciprocal") or divisor is None:
+            visited.add(node)
+            pending += node.inputs
+            divisor = node.inputs[-1]
+            if node.op_type not in ("Div", "Reciprocal") or divisor is None:
                 continue
             if graph.array_of(divisor) is None and not _is_positive(divisor, positive):
-                yield warning(
-                    "divided-grid",
-                    made,
+                message = (
                     f"{divisor.name}, by which it divides, may be 0, and"
-                    f" {node.op_type} {name_of(node)!r} samples there: of NaN"
+                    f" {sampler.op_type} {name_of(sampler)!r} samples there: of NaN"
                     " onnxruntime 1.31 makes a pixel, OpenVINO NaN (measured); bound it"
-                    " by Max or Clip",
+                    " by Max or Clip"
                 )
+                yield warning("divided-grid", node, message)
 
 
 _MOVES = LAYOUT_OPERATORS | {"Cast", "Expand", "Gather", "Slice", "Split", "Tile"}
 _TO_A_GRID = _MOVES | {
-    *("Add", "Clip", "Concat", "Div", "Max", "Min", "Mul", "Neg", "Reciprocal", "Sub"),
-}
+    "Add", "Clip", "Concat", "Div", "Max", "Min", "Mul", "Neg", "Reciprocal", "Sub",
+}  # fmt: skip
 _POSITIVE = frozenset({"Exp", "Shape", "Sigmoid", "Size", "Softmax", "Softplus"})
 _OF_POSITIVE = _MOVES | {"ReduceMax", "ReduceMean", "ReduceMin", "ReduceSum", "Sqrt"}
 
@@ -161,7 +158,7 @@ def _is_positive(value: ir.Value | None, known: dict[ir.Value, bool]) -> bool:
         return False
     if value not in known:
         kind, inputs = node.op_type, node.inputs
-        sides = (_is_positive(each, known) for each in inputs)
+        sides = (_is_positive(side, known) for side in inputs)
         if kind == "Clip":
             low = node.attributes.get_float("min", 0.0)
             known[value] = low > 0 or _is_positive(graph.input_at(node, 1), known)
@@ -236,9 +233,9 @@ class Target(abc.ABC):
                 f"int8 by channel needs opset {OLDEST_OPSET}, the graph is of"
                 f" {opset_of(model)}: {keeper}; -r exact writes a graph without int8"
             )
+        # Float16 needs kernels, and scales of that type
         types = {v.name: v.dtype for node in model.graph for v in node.outputs}
-        # Float16 needs kernels, and scales of that type.
-        halves = [e for e in plan.chosen if types[e.output] == ir.DataType.FLOAT16]
+        halves = [d for d in plan.chosen if types[d.output] == ir.DataType.FLOAT16]
         opset, since = opset_of(model), self.half_since
         if not halves or (since is not None and since <= opset):
             return

@@ -48,7 +48,7 @@ def is_in_a_pair(node: ir.Node) -> bool:
     before, after = node.inputs[0], node.outputs[0]
     if before is None or not is_quantized(before) or after.is_graph_output():
         return False
-    readers = {each.op_type for each in after.consumers()}
+    readers = {reader.op_type for reader in after.consumers()}
     return readers == {DEQUANTIZE} and len(before.uses()) == 1
 
 
@@ -70,23 +70,17 @@ def stored_type(node: ir.Node) -> ir.DataType:
 
 def describe_quantized(model: ir.Model) -> str | None:
     """Describe operators, grid and producer of a quantized graph; None for others."""
-    counts = Counter(
-        node.op_type
-        for node in model.graph.all_nodes()
-        if node.op_type in INTEGER_OPS or node.op_type in PAIR
-    )
+    nodes = list(model.graph.all_nodes())
+    counts = Counter(n.op_type for n in nodes if n.op_type in {*INTEGER_OPS, *PAIR})
     if not counts:
         return None
-    listed = ", ".join(f"{count} {op}" for op, count in sorted(counts.items()))
-    # Operators first, then the grid and the producer.
-    parts = [listed]
-    if any(op in counts for op in PAIR):
-        # the element types of all pairs, and whether they are symmetric
-        pairs = [node for node in model.graph.all_nodes() if node.op_type in PAIR]
-        zeros = [graph.input_at(node, 2) for node in pairs]
+    # Operators first, then the grid and the producer
+    parts = [", ".join(f"{count} {op}" for op, count in sorted(counts.items()))]
+    if pairs := [node for node in nodes if node.op_type in PAIR]:
+        # The element types of all pairs, and whether they are symmetric
         types = dict.fromkeys(stored_type(node).name.lower() for node in pairs)
-        arrays = [graph.array_of(zero) for zero in zeros]
-        centred = not any(array.any() for array in arrays if array is not None)
+        zeros = [graph.array_of(graph.input_at(node, 2)) for node in pairs]
+        centred = not any(zero.any() for zero in zeros if zero is not None)
         grid = "zero points 0" if centred else "zero points that are not 0"
         parts.append(f"{' and '.join(types)} with {grid}")
     if METADATA in model.metadata_props:

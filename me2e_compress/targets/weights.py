@@ -52,28 +52,27 @@ def weights_of(
     nodes = {str(node.outputs[0].name): node for node in model.graph}
     layers = dict[str, tuple[ir.Value, int | None]]()
     plain = set[tuple[ir.Value, int | None]]()
-    for each in chosen:
-        if each.weight is None:
+    for decision in chosen:
+        if decision.weight is None:
             continue
-        node, axis = nodes[each.output], each.axis
-        weight = node.inputs[each.weight]
-        if weight is None:
-            raise PreconditionError(f"{each.node} is planned as a layer without weight")
+        node, axis = nodes[decision.output], decision.axis
+        weight = node.inputs[decision.weight]
+        assert weight is not None
         layer = weight, -1 if axis is not None and node.op_type == "MatMul" else axis
-        layers[each.output] = layer
+        layers[decision.output] = layer
         # The errors of a weight add up over neighbouring pixels, and over elements that
         # are never negative. Over tokens of both signs, behind a LayerNormalization,
         # balance only adds to the errors: on the driver such products lose up to 1.7
         # dB, while products behind a ReLU and convolutions gain 0.2 to 8.6, but for
         # one that loses 0.2 (``python -m benchmarks.measure.weights``).
-        made = producer_of(node.inputs[0])
-        behind_relu = made is not None and made.op_type == "Relu"
+        producer = producer_of(node.inputs[0])
+        behind_relu = producer is not None and producer.op_type == "Relu"
         if node.op_type not in CONVOLUTIONS and not behind_relu:
             plain.add(layer)
     # Weights that nodes compute are evaluated together.
     values = dict.fromkeys(value for value, _ in layers.values())
-    made_by_nodes = [str(each.name) for each in values if each.producer() is not None]
-    computed = evaluate_constants(model, made_by_nodes)
+    names = [str(value.name) for value in values if value.producer() is not None]
+    computed = evaluate_constants(model, names)
     # Quantize each weight once.
     quantized = {
         layer: _quantize(*layer, computed, balanced and layer not in plain)
@@ -92,17 +91,17 @@ def quantize_weight(
     there are channels. The scale of an all-zero channel is 1. Returns int8 of the same
     shape, and float32 [channels], or [] without an axis.
     """
-    # Reduce over every axis but that of the channels.
-    others = tuple(each for each in range(weight.ndim) if each != axis)
+    # One step per channel: max|w| / 127 over every other axis
+    others = tuple(other for other in range(weight.ndim) if other != axis)
     reach = np.abs(weight).max(axis=others, initial=0.0, keepdims=True)
     steps = np.asarray(reach / np.float32(QUANT_MAX), np.float32)
     steps[steps == 0] = 1
     exact = weight / steps
     rounded = np.rint(exact)
     if balanced and axis is not None and exact.size:
-        sides = np.moveaxis(exact, axis, 0)
-        kernels = sides.reshape(*sides.shape[:2], -1)
-        rounded = np.moveaxis(balanced_steps(kernels).reshape(sides.shape), 0, axis)
+        first = np.moveaxis(exact, axis, 0)  # (outputs, inputs, *kernel)
+        kernels = first.reshape(*first.shape[:2], -1)
+        rounded = np.moveaxis(balanced_steps(kernels).reshape(first.shape), 0, axis)
     integers = np.clip(rounded, -QUANT_MAX, QUANT_MAX).astype(np.int8)
     return integers, steps.reshape(() if axis is None else -1)
 
@@ -126,6 +125,7 @@ def requantized(
     shape = [1] * integers.ndim
     if axis is not None and scales.size > 1:
         shape[axis] = -1
+    # (q - zero) scale = (q' - zero) fresh, so q' = (q - zero) scale / fresh + zero
     ratio = (scales.astype(np.float64) / fresh.astype(np.float64)).reshape(shape)
     centre = np.zeros(1) if zero is None else zero.astype(np.float64).reshape(shape)
     kind = np.iinfo(integers.dtype.name)
@@ -164,11 +164,11 @@ def balanced_steps(exact: npt.NDArray[np.float32]) -> npt.NDArray[np.float64]:
     wide = exact.astype(np.float64)
     steps: npt.NDArray[np.float64] = np.rint(wide)
     error: npt.NDArray[np.float64] = steps - wide
-    # The elements of a kernel
+    # The elements of a kernel: its errors sum to half a step at most
     moved = _excess(error)
     steps, error = steps - moved, error - moved
-    # The kernels of a channel: each moves one element
-    moved = _excess(error.sum(2))[..., None]
+    # The kernels of a channel: each moves one element, that of the largest error
+    moved = _excess(error.sum(2))[..., None]  # (outputs, inputs, 1)
     at = (error * moved).argmax(2)[..., None]
     np.put_along_axis(steps, at, np.take_along_axis(steps, at, 2) - moved, 2)
     return steps
@@ -181,6 +181,7 @@ def _excess(error: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
     """
     total = error.sum(-1, keepdims=True)
     sign = np.sign(total)
+    # The round(|total|) largest errors of its sign move by one step
     order = np.argsort(-error * sign, axis=-1, kind="stable")
     first = np.arange(error.shape[-1]) < np.rint(np.abs(total))
     excess = np.empty_like(error)
@@ -192,13 +193,12 @@ def _quantize(
     value: ir.Value, axis: int | None, computed: Mapping[str, Array], balanced: bool
 ) -> QuantizedWeight:
     name = str(value.name)
-    if name in computed:
-        array = computed[name]
-    elif value.const_value is not None:
+    array = computed.get(name)
+    if array is None and value.const_value is not None:
         array = value.const_value.numpy()
-    else:
+    if array is None:
         raise PreconditionError(f"{name} is planned as a weight, but is not a constant")
-    # A batch of one matrix is stored as that matrix.
+    # A batch of one matrix is stored as that matrix
     if axis == -1:
         array, axis = array.reshape(array.shape[-2:]), 1
     weight = array.astype(np.float32)
@@ -218,9 +218,9 @@ def evaluate_constants(model: ir.Model, names: Sequence[str]) -> dict[str, Array
     # Cut a copy of the graph down to the wanted values and run it.
     part = model.clone()
     part.metadata_props.clear()  # it speaks of inputs and outputs that go
-    made = {str(each.name): each for node in part.graph for each in node.outputs}
+    values = {str(value.name): value for n in part.graph for value in n.outputs}
     part.graph.outputs.clear()
-    part.graph.outputs.extend(made[name] for name in names)
+    part.graph.outputs.extend(values[name] for name in names)
     rewrite.sweep(part)
     used = [value for value in part.graph.inputs if value.uses()]
     part.graph.inputs.clear()

@@ -4,12 +4,13 @@ import hashlib
 from collections.abc import Sequence
 
 import numpy as np
-import numpy.typing as npt
 import onnx_ir as ir
 
 from me2e_compress import graph
 from me2e_compress.graph import provenance, rewrite
+from me2e_compress.graph.nodes import Array
 from me2e_compress.operators import FusedCall
+from me2e_compress.targets.quantized import DEQUANTIZE, QUANTIZE
 
 BY = "quantize-int8"
 
@@ -23,16 +24,15 @@ class Writer:
         self._constants: dict[tuple[str, bytes], ir.Value] = {}
         self.names = rewrite.value_names(where)
 
-    def constant(self, array: npt.NDArray[np.generic], name: str) -> ir.Value:
+    def constant(self, array: Array, name: str) -> ir.Value:
         """Return the initializer of an array, or add one."""
         if not self._share:
             return rewrite.add_constant(self.graph, array, name, self.names)
         kind = f"{array.dtype}{array.shape}"
         key = (kind, hashlib.sha256(array.tobytes()).digest())
         if key not in self._constants:
-            self._constants[key] = rewrite.add_constant(
-                self.graph, array, name, self.names
-            )
+            value = rewrite.add_constant(self.graph, array, name, self.names)
+            self._constants[key] = value
         return self._constants[key]
 
     def call(self, before: ir.Node, sources: Sequence[ir.Node]) -> FusedCall:
@@ -68,11 +68,9 @@ class Writer:
         ``grid`` is scale and zero point, ``source`` gives the provenance.
         """
         scale, zero = grid
-        quantize = self.node("QuantizeLinear", [value, *grid], names[0], [source])
+        quantize = self.node(QUANTIZE, [value, *grid], names[0], [source])
         integers = quantize.outputs[0]
-        dequantize = self.node(
-            "DequantizeLinear", [integers, *grid], names[1], [source]
-        )
+        dequantize = self.node(DEQUANTIZE, [integers, *grid], names[1], [source])
         # Both have the shape of the value
         integers.type = zero.type
         dequantize.outputs[0].type = scale.type
@@ -87,8 +85,8 @@ class Writer:
     def dequantized(
         self,
         name: str,
-        integers: npt.NDArray[np.generic],
-        scales: npt.NDArray[np.generic],
+        integers: Array,
+        scales: Array,
         axis: int | None,
         reader: ir.Node,
         label: str = "",
@@ -109,7 +107,7 @@ class Writer:
         axes = None if axis is None else {"axis": axis}
         # Weights may be shared, the name of the reader is not
         label = label or f"{reader.name or reader.outputs[0].name}/{name}_float"
-        node = self.node("DequantizeLinear", inputs, label, [reader], axes)
+        node = self.node(DEQUANTIZE, inputs, label, [reader], axes)
         node.outputs[0].shape = ir.Shape(integers.shape)
         node.outputs[0].type = steps.type
         self.graph.insert_before(reader, node)
@@ -124,8 +122,6 @@ class _SharingCall(FusedCall):
         super().__init__(node, opset=opset, by=BY, names=writer.names)
         self._writer = writer
 
-    def constant(
-        self, array: npt.NDArray[np.generic], name: str = "constant"
-    ) -> ir.Value:
+    def constant(self, array: Array, name: str = "constant") -> ir.Value:
         """Return the initializer of an array."""
         return self._writer.constant(array, name)

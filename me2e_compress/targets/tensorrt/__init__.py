@@ -35,8 +35,6 @@ from me2e_compress.targets.weights import (
 )
 from me2e_compress.targets.writer import Writer
 
-__all__ = ["TensorRT"]
-
 
 @dataclasses.dataclass(frozen=True)
 class TensorRT(Target):
@@ -134,12 +132,11 @@ def _with_room(
         key = weight.name, weight.axis
         wanted = least_scales(bias, scale_of(*known))
         least[key] = np.maximum(wanted, least.get(key, 0.0))
-    return {
-        output: weight
-        if (weight.name, weight.axis) not in least
-        else with_room(weight, least[weight.name, weight.axis])
-        for output, weight in weights.items()
-    }
+    raised = dict(weights)
+    for output, weight in weights.items():
+        if (scales := least.get((weight.name, weight.axis))) is not None:
+            raised[output] = with_room(weight, scales)
+    return raised
 
 
 class _Pairs:
@@ -158,7 +155,7 @@ class _Pairs:
         """Rewrite one node to read int8."""
         # Fused operators get integers; layers get pairs and weights.
         if reads := int8_inputs(node):
-            self._feed(node, reads[0])
+            self._connect_integers(node, reads[0])
             return
         for index in decision.activations:
             value = node.inputs[index]
@@ -169,8 +166,8 @@ class _Pairs:
         if weight is not None and at is not None and like is not None:
             node.replace_input_with(at, self._weight(weight, like, node))
 
-    def _feed(self, plugin: ir.Node, index: int) -> None:
-        """Feed integers to a plugin, with their scale for every channel."""
+    def _connect_integers(self, plugin: ir.Node, index: int) -> None:
+        """Let a plugin read integers, with their scale for every channel."""
         value, known = plugin.inputs[index], find(plugin)
         at = None if known is None else known[1].int8_scale
         channels = (static_shape(value) or ())[-1:]
@@ -203,6 +200,7 @@ class _Pairs:
     def _weight(
         self, weight: QuantizedWeight, like: ir.Value, reader: ir.Node
     ) -> ir.Value:
+        """Return the dequantized weight that all its readers share."""
         key = weight.name, weight.axis
         if key not in self._weights:
             scales = scales_in(weight.scales, _numpy(like))

@@ -76,8 +76,7 @@ def check(model: ir.Model, sm: int = 86, *, build: bool = True) -> BuildResult:
     if importlib.util.find_spec("tensorrt_rtx") is None:
         raise MissingExtraError("tensorrt-rtx", EXTRA)
     if sm not in SM:
-        listed = ", ".join(str(each) for each in SM)
-        raise RecipeError(f"no GPU generation {sm}; there are {listed}")
+        raise RecipeError(f"no GPU generation {sm}; there are {str(SM)[1:-1]}")
     # Cut out the plugins, and build the rest in another process.
     ready = model.clone()
     graph.infer_shapes(ready)
@@ -97,6 +96,7 @@ def check(model: ir.Model, sm: int = 86, *, build: bool = True) -> BuildResult:
 
 
 def _ask(part: ir.Model, scratch: Path, sm: int, *, build: bool) -> dict[str, Any]:
+    """Run ``rtx_main.py`` on a graph in another process, and return its answer."""
     model, answer = scratch / "m.onnx", scratch / "a.json"
     graph.save(part, model)
     words = [str(model), str(answer), str(sm), "build" if build else "parse"]
@@ -125,7 +125,7 @@ def cut(model: ir.Model) -> tuple[ir.Model, tuple[str, ...]]:
     out.
     """
     copy = model.clone()
-    copy.metadata_props.clear()  # it speaks of inputs and outputs that change
+    copy.metadata_props.clear()  # it names inputs and outputs that change
     gone = [
         node
         for node in copy.graph
@@ -143,6 +143,7 @@ def cut(model: ir.Model) -> tuple[ir.Model, tuple[str, ...]]:
 
 
 def _detach(where: ir.Graph, node: ir.Node) -> None:
+    """Remove a node: its outputs become graph inputs, what it reads graph outputs."""
     for value in node.outputs:
         if value.is_graph_output():
             where.outputs.remove(value)
