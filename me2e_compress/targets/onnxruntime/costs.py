@@ -28,42 +28,35 @@ class CpuSeconds:
     """Nanoseconds of one core for one unit of work.
 
     Attributes:
-        kernel: any kernel call.
-        float_element: an element that a layer reads or writes.
         float_reorder: an element passed between a convolution, which works on channels
             in blocks, and anything else.
-        int8_uneven_mac: one over channels that are no multiple of four.
-        int8_patch: a pixel copied into place for a kernel larger than 1.
-        int8_answer: an element that a convolution rounds to uint8.
-        int8_product: a float32 output element of a matrix product.
         float_sampled_mac: a multiply-accumulate of a fused operator that samples
             feature maps too large for the cache.
-        int8_cached_mac: what uint8 adds to one on maps in the cache.
     """
 
     machine: str
-    kernel: float
+    kernel: float  # any kernel call
     float_mac: float
     float_grouped_mac: float
-    float_element: float
+    float_element: float  # an element that a layer reads or writes
     float_reorder: float
     float_weight: float
     int8_mac: float
     int8_grouped_mac: float
-    int8_uneven_mac: float
-    int8_patch: float
-    int8_answer: float
-    int8_product: float
+    int8_uneven_mac: float  # one over channels that are no multiple of four
+    int8_patch: float  # a pixel copied into place for a kernel larger than 1
+    int8_answer: float  # an element that a convolution rounds to uint8
+    int8_product: float  # a float32 output element of a matrix product
     int8_weight: float
     float_sampled_mac: float
     int8_sampled_mac: float
-    int8_cached_mac: float
+    int8_cached_mac: float  # what uint8 adds to one on maps in the cache
     quantize: float
     dequantize: float
 
     def seconds(self, counts: Counts) -> float:
         """Return the time of some work."""
-        return 1e-9 * sum(float(getattr(self, each)) * n for each, n in counts.items())
+        return 1e-9 * sum(float(getattr(self, name)) * n for name, n in counts.items())
 
 
 # Fitted to single layers and chains on an AMD EPYC (Zen 5), onnxruntime 1.31, by
@@ -124,12 +117,11 @@ def costs_of(
 
 def work_of(layer: ir.Node) -> tuple[Counts, Counts] | None:
     """Count the work of a layer in float and in int8; None where shapes are open."""
-    macs = graph.macs(layer)
-    read, weight = static_shape(layer.inputs[0]), static_shape(layer.inputs[1])
-    made = static_shape(layer.outputs[0])
-    if macs is None or read is None or weight is None or made is None:
+    macs, result = graph.macs(layer), static_shape(layer.outputs[0])
+    image, weight = static_shape(layer.inputs[0]), static_shape(layer.inputs[1])
+    if macs is None or image is None or weight is None or result is None:
         return None
-    inputs, outputs, weights = map(math.prod, (read, made, weight))
+    inputs, outputs, weights = map(math.prod, (image, result, weight))
     float_ = {"kernel": 1, "float_element": inputs + outputs, "float_weight": weights}
     int8 = {"kernel": 1, "int8_weight": weights}
     # Products give float32; convolutions write uint8.
@@ -138,9 +130,8 @@ def work_of(layer: ir.Node) -> tuple[Counts, Counts] | None:
         int8 |= {"int8_mac": macs, "int8_product": outputs}
         return float_, int8
     # A float convolution reorders what it exchanges with others than convolutions.
-    source, end, reordered = layer.inputs[0], end_of(layer), 0
-    made_by = None if source is None else source.producer()
-    if made_by is None or made_by.op_type not in (*_BLOCKED, "Clip", "Relu"):
+    source, end, reordered = graph.producer_of(layer.inputs[0]), end_of(layer), 0
+    if source is None or source.op_type not in (*_BLOCKED, "Clip", "Relu"):
         reordered += inputs
     if not any(reader.op_type in _BLOCKED for reader in end.consumers()):
         reordered += math.prod(static_shape(end) or ())
@@ -190,20 +181,18 @@ class _Surroundings:
         """Describe one of the tensors."""
         elements = math.prod(static_shape(value) or ())
         direct, carriers, others = self._uses(value)
-        # Joins connect this tensor's layers with those of others.
-        joins = [node for node in carriers if node.op_type in JOINS]
+        # Joins connect this tensor's layers with those of others
+        ends = [end_of(node) for node in carriers if node.op_type in JOINS]
+        joins = tuple(Join(self.makers(end), self.readers(end)) for end in ends)
         # A product that is sampled is a convolution, whose rounding costs no more than
-        # the float32 that it would write.
+        # the float32 that it would write
         rounded = 0 if self._is_product(value) else elements
-        quantize = {"kernel": 1, "quantize": rounded}
         return Border(
-            machine.seconds(quantize),
+            machine.seconds({"kernel": 1, "quantize": rounded}),
             machine.seconds({"kernel": 1, "dequantize": elements}),
             self.makers(value),
             frozenset(direct),
-            tuple(
-                Join(self.makers(end), self.readers(end)) for end in map(end_of, joins)
-            ),
+            joins,
             others + value.is_graph_output(),
         )
 
@@ -212,9 +201,9 @@ class _Surroundings:
         reader, node = sole_reader(value), value.producer()
         if node is None or reader not in self._region.sampled:
             return False
-        before = [each.producer() for each in node.inputs if each is not None]
+        before = map(graph.producer_of, node.inputs)
         products = (node, *before) if node.op_type == "Add" else (node,)
-        return any(each in self._region.layers for each in products)
+        return any(product in self._region.layers for product in products)
 
     def makers(self, value: ir.Value) -> Layers:
         """Return the nearest layers that a tensor comes from."""
@@ -225,8 +214,8 @@ class _Surroundings:
         if value in self._layers and value in self._region.written:
             self._makers[value] = frozenset({self._layers[value]})
         elif node is not None:
-            read = node.inputs if node.op_type in JOINS else node.inputs[:1]
-            sides = [each for each in read if each is not None]
+            inputs = node.inputs if node.op_type in JOINS else node.inputs[:1]
+            sides = [side for side in inputs if side is not None]
             near = frozenset(self._layers[v] for v in sides if v in self._layers)
             self._makers[value] = near or frozenset().union(*map(self.makers, sides))
         return self._makers[value]

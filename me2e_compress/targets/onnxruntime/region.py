@@ -10,7 +10,7 @@ import onnx_ir as ir
 from me2e_compress import graph
 from me2e_compress.calibration.observers import scale_of
 from me2e_compress.graph import bias_of, is_standard, producer_of, rank_of
-from me2e_compress.graph.nodes import scalar_of, sole_reader
+from me2e_compress.graph.nodes import maker, scalar_of, sole_reader
 from me2e_compress.graph.shapes import extent, is_one_matrix, open_shape, static_shape
 from me2e_compress.operators import int8_inputs
 from me2e_compress.targets.weights import is_bias
@@ -42,16 +42,15 @@ def objection(node: ir.Node) -> str | None:
     """
     if not is_standard(node) or node.op_type not in LAYERS:
         return f"there is no int8 kernel for {node.op_type}"
-    # Each operator has its own conditions.
+    # Each operator has its own conditions
     bias = bias_of(node)
     if node.op_type == "Conv":
-        stored = bias is None or graph.array_of(bias) is not None
-        if not stored:
+        if bias is not None and graph.array_of(bias) is None:
             return "the bias is computed"
         reader = None if reads_one_pixel(node) else _magnifier(end_of(node))
         return reader and f"it writes uint8, whose rounding {reader} magnifies"
     if node.op_type == "Gemm":
-        factors = [node.attributes.get_float(each, 1.0) for each in ("alpha", "beta")]
+        factors = [node.attributes.get_float(name, 1.0) for name in ("alpha", "beta")]
         if factors != [1.0, 1.0]:
             return "QGemm takes neither alpha nor beta"
         if node.attributes.get_int("transA", 0):
@@ -74,12 +73,11 @@ def _magnifier(value: ir.Value) -> str | None:
     values keep few steps of it, and a logarithm, a quotient or a square lives on them.
     """
     for use in value.uses():
-        reader, place = use.node, use.idx
+        reader = use.node
         squares = reader.op_type == "Mul" and reader.inputs[0] is reader.inputs[1]
-        divides = reader.op_type == "Div" and place == 1
-        if is_standard(reader) and (
-            reader.op_type in _MAGNIFIERS or squares or divides
-        ):
+        divides = reader.op_type == "Div" and use.idx == 1
+        magnifies = reader.op_type in _MAGNIFIERS or squares or divides
+        if magnifies and is_standard(reader):
             return f"{reader.name} ({reader.op_type})"
     return None
 
@@ -183,7 +181,7 @@ class Region:
     @property
     def ranged(self) -> tuple[str, ...]:
         """The tensors whose range must be known."""
-        return tuple(dict.fromkeys(str(each.name) for each in self.grids.values()))
+        return tuple(dict.fromkeys(str(value.name) for value in self.grids.values()))
 
     def reads(self, node: ir.Node, index: int) -> bool:
         """Return whether a node reads an input as uint8 where that exists."""
@@ -225,11 +223,7 @@ def find_region(graph: ir.Graph, chosen: Collection[str]) -> Region:
     sampling = {n for n in graph if n.outputs[0].name in chosen and int8_inputs(n)}
     wanted = {_sampled(node, ())[0] for node in sampling}
     averages = _averages(graph, layers, wanted)
-    convolutions = {
-        layer
-        for layer in layers
-        if layer.op_type == "Conv" and not reads_one_pixel(layer)
-    }
+    convolutions = {n for n in layers if n.op_type == "Conv" and not reads_one_pixel(n)}
     # One walk in topological order: inputs are decided first.
     for node in graph:
         first = node.inputs[0] if node.inputs else None
@@ -245,8 +239,8 @@ def find_region(graph: ir.Graph, chosen: Collection[str]) -> Region:
         elif (
             node.op_type in JOINS
             and (end in grids or end in wanted)
-            and all(each in grids for each in node.inputs)
-            and any(each in written for each in node.inputs)
+            and all(value in grids for value in node.inputs)
+            and any(value in written for value in node.inputs)
         ):
             grids[end] = end
             written.add(end)
@@ -268,17 +262,17 @@ def _averages(
     """
     inputs = {*layers.values(), *sampled}
     only: set[ir.Node] = set()
-    # Readers are decided before what they read.
+
+    def is_int8(reader: ir.Node, index: int) -> bool:
+        first = index == 0 and (reader in layers or reader in only)
+        return first or (reader.op_type in JOINS and end_of(reader) in inputs)
+
+    # Readers are decided before what they read
     for node in reversed(graph):
         if not (has_average_kernel(node) or is_move(node)):
             continue
         value = node.outputs[0]
-        others = [
-            use
-            for use in value.uses()
-            if not (use.idx == 0 and (use.node in layers or use.node in only))
-            and not (use.node.op_type in JOINS and end_of(use.node) in inputs)
-        ]
+        others = any(not is_int8(use.node, use.idx) for use in value.uses())
         if value in sampled or not (others or value.is_graph_output()):
             only.add(node)
     return {node for node in only if is_average(node)}
@@ -290,10 +284,10 @@ def _sampled(node: ir.Node, written: Collection[ir.Value]) -> tuple[ir.Value, ir
     assert value is not None
     # Look through reshapes with one reader.
     while value not in written and len(value.uses()) == 1:
-        made = value.producer()
-        if made is None or made.op_type != "Reshape" or made.inputs[0] is None:
+        producer = maker(value, "Reshape")
+        if producer is None or producer.inputs[0] is None:
             break
-        value, node = made.inputs[0], made
+        value, node = producer.inputs[0], producer
     return value, node
 
 
@@ -323,6 +317,7 @@ class Grid:
         narrow, wide = sorted((-low, high))
         if wide < LOPSIDED * narrow:
             return cls(scale_of(low, high), MIDDLE)
+        # 255 steps from low to high; low is uint8 0, so 0.0 is -low / step
         step = np.float32((high - low) / 255) or np.float32(1)
         return cls(step, round(-low / float(step)))
 
@@ -330,7 +325,7 @@ class Grid:
 def never_negative(value: ir.Value) -> bool:
     """Prove from its producers, in linear time, that a tensor is never negative."""
     pending: list[ir.Value | None] = [value]
-    seen: set[ir.Value] = {value}
+    visited: set[ir.Value] = {value}
     while pending:
         node = producer_of(pending.pop())
         if node is None:
@@ -342,6 +337,6 @@ def never_negative(value: ir.Value) -> bool:
         if not (joins or is_move(node) or is_average(node)):
             return False
         sources = node.inputs if joins else node.inputs[:1]
-        pending += [each for each in sources if each not in seen]
-        seen.update(each for each in sources if each is not None)
+        pending += [source for source in sources if source not in visited]
+        visited.update(source for source in sources if source is not None)
     return True
