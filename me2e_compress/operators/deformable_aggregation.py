@@ -117,7 +117,13 @@ class DeformableAggregation(Operator):
         places = call.add("Expand", [places, shape])
         places = call.reshape(places, (batch, anchors, 1, maps, points, 2))
         # Positions outside of an image have no weight
-        weights = self._inside(call, at, weights)
+        sides = []
+        for axis in call.split_last(at, 2):
+            above = call.add("Greater", [axis, call.numbers(0.0, axis)])
+            sides += [above, call.add("Less", [axis, call.numbers(1.0, axis)])]
+        both = functools.reduce(lambda one, two: call.add("And", [one, two]), sides)
+        inside = call.unsqueeze(both, (4, 5))  # [N, A, P, V, 1, 1]
+        weights = call.add("Where", [inside, weights, call.numbers(0.0, weights)])
         weights = call.transpose(weights, (0, 1, 5, 3, 4, 2))  # [N, A, G, V, L, P]
         weights = call.reshape(weights, (batch, anchors, groups, maps, points))
         result = sample_levels(
@@ -129,15 +135,6 @@ class DeformableAggregation(Operator):
             weights,
         )
         return call.reshape(result, (batch, anchors, width))
-
-    def _inside(self, call: FusedCall, at: ir.Value, weights: ir.Value) -> ir.Value:
-        sides = []
-        for axis in call.split_last(at, 2):
-            above = call.add("Greater", [axis, call.numbers(0.0, axis)])
-            sides += [above, call.add("Less", [axis, call.numbers(1.0, axis)])]
-        both = functools.reduce(lambda one, two: call.add("And", [one, two]), sides)
-        inside = call.unsqueeze(both, (4, 5))
-        return call.add("Where", [inside, weights, call.numbers(0.0, weights)])
 
     def reference(self, inputs: Arrays, attributes: Attributes) -> NdArray:
         """Compute it in numpy, [N, A, C] float64."""

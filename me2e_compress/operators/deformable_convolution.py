@@ -107,7 +107,16 @@ class DeformableConvolution(Operator):
         count, places = math.prod(elements), down * across
         parts, groups = number(attributes, "deform_groups"), deep // part
         # Sample each kernel element at its moved position: K elements, F * G places
-        grid = kernel_positions((down, across), (elements[0], elements[1]), attributes)
+        options = [numbers(attributes, name) for name in _NAMES]
+        y, x = (  # pixels: [F or G, rows or columns of the kernel]
+            np.arange(size)[:, None] * stride - padding + np.arange(kernel) * dilation
+            for size, kernel, stride, padding, dilation in zip(
+                (down, across), elements, *options, strict=True
+            )
+        )
+        grid = np.zeros((down, across, *elements, 2))
+        grid[..., 0], grid[..., 1] = y[:, None, :, None], x[None, :, None, :]
+        grid = grid.reshape(places, count, 1, 2)
         moved = offset.reshape(batch, parts, count, 2, places).transpose(0, 4, 2, 1, 3)
         at = (moved + grid)[..., ::-1] + 0.5  # [N, F * G, K, parts, 2], (x, y)
         shape = (batch, places * count, parts, 1, 1)
@@ -125,19 +134,3 @@ class DeformableConvolution(Operator):
         result: NdArray = np.einsum("gock,npkgc->ngop", matrix, samples)
         result = result.reshape(batch, out, down, across)
         return np.add(result, bias[0].reshape(-1, 1, 1)) if bias else result
-
-
-def kernel_positions(
-    out: tuple[int, int], kernel: tuple[int, int], attributes: Attributes
-) -> NdArray:
-    """Return y and x in pixels of kernel elements, [rows * columns, elements, 1, 2]."""
-    options = [numbers(attributes, name) for name in _NAMES]
-    axes = [
-        np.arange(out[axis])[:, None] * stride - padding
-        + np.arange(kernel[axis])[None] * dilation
-        for axis, (stride, padding, dilation) in enumerate(zip(*options, strict=True))
-    ]  # fmt: skip
-    grid = np.zeros((out[0], out[1], kernel[0], kernel[1], 2))
-    grid[..., 0] = axes[0][:, None, :, None]
-    grid[..., 1] = axes[1][None, :, None, :]
-    return grid.reshape(out[0] * out[1], kernel[0] * kernel[1], 1, 2)

@@ -191,10 +191,10 @@ class Dialect:
         Raises:
             PreconditionError: an attribute is unknown, or has a value it cannot have.
         """
-        known = {attribute.name: attribute for attribute in self.attributes}
+        known = {known.name: known for known in self.attributes}
         attributes: dict[str, AttributeValue] = {n: a.default for n, a in known.items()}
         # Both name and value must be allowed
-        for name, written in node.attributes.items():
+        for name, attribute in node.attributes.items():
             if name in PLUGIN_ATTRIBUTES:
                 continue
             if name not in known:
@@ -202,7 +202,11 @@ class Dialect:
                 raise PreconditionError(
                     f"{self.call_of(node)}: no attribute {name!r}; there are {has}"
                 )
-            value = _value_of(written)
+            value = attribute.value
+            if isinstance(value, list | tuple):
+                value = tuple(value)
+            elif not isinstance(value, int | float | str):
+                value = str(value)
             kind, choices = type(known[name].default), known[name].choices
             if not isinstance(value, kind) or (choices and value not in choices):
                 among = " or ".join(map(str, choices)) or kind.__name__
@@ -281,10 +285,3 @@ def numbers(attributes: Attributes, name: str) -> tuple[int, ...]:
     value = attributes[name]
     assert not isinstance(value, int | float | str)
     return tuple(value)
-
-
-def _value_of(attribute: ir.Attr) -> AttributeValue:
-    value = attribute.value
-    if isinstance(value, list | tuple):
-        return tuple(value)
-    return value if isinstance(value, int | float | str) else str(value)

@@ -68,7 +68,10 @@ class Inverse(Operator):
         rank = len(matrix.shape) if matrix.shape is not None else 2
         outer = tuple(call.size(matrix, axis) for axis in range(rank - 2))
         flat = call.reshape(matrix, (*outer, size * size))
-        minors = call.add("Gather", [flat, call.constant(_minors(size))], {"axis": -1})
+        others = np.array([[j for j in range(size) if j != i] for i in range(size)])
+        rows, columns = others[None, :, :, None], others[:, None, None, :]
+        index = call.constant(rows * size + columns)  # [n, n, n - 1, n - 1]
+        minors = call.add("Gather", [flat, index], {"axis": -1})
         parity = np.indices((size, size)).sum(axis=0) % 2
         signs = call.numbers(1 - 2 * parity, matrix)
         adjugate = call.add("Mul", [call.add("Det", [minors]), signs])
@@ -87,13 +90,3 @@ class Inverse(Operator):
         """Count n cubed for each matrix, the work of an elimination."""
         shape = shapes[0]
         return None if shape is None else product((*shape, shape[-1]))
-
-
-def _minors(size: int) -> NdArray:
-    """Return the indices of each adjugate element's minor, [n, n, n - 1, n - 1]."""
-    # Rows and columns without the i-th, [n, n - 1]
-    others = np.array([[j for j in range(size) if j != i] for i in range(size)])
-    # Element (i, j) of the adjugate is the minor without row j and column i
-    rows, columns = others[None, :, :, None], others[:, None, None, :]
-    index: NdArray = rows * size + columns
-    return index

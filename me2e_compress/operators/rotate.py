@@ -27,17 +27,14 @@ from me2e_compress.operators.grid_sampler import BILINEAR, grid_sample_array
 _INTERPOLATION = (Attribute("interpolation", 0, choices=(0, 1)),)
 
 
-def _operands(types: tuple[ir.DataType, ...]) -> tuple[Operand, ...]:
-    return (
+def _dialect(name: str, op_type: str, domain: str, source: str) -> Dialect:
+    types = INT8_TOO if source == _DERRYHUB else FLOATS
+    operands = (
         Operand("img", "C H W", types),
         Operand("angle", "1", types, positions=True),
         Operand("center", "2", types, positions=True),
     )
-
-
-def _dialect(name: str, op_type: str, domain: str, source: str) -> Dialect:
-    types = INT8_TOO if source == _DERRYHUB else FLOATS
-    return Dialect(name, op_type, domain, _operands(types), source, _INTERPOLATION)
+    return Dialect(name, op_type, domain, operands, source, _INTERPOLATION)
 
 
 _DERRYHUB = "BEVFormer_tensorrt"

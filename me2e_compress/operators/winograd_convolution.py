@@ -1,7 +1,6 @@
 """3x3 convolution by Winograd's algorithm (Lavin and Gray, arXiv 1509.09308)."""
 
 import dataclasses
-from collections.abc import Sequence
 
 import numpy as np
 import onnx_ir as ir
@@ -71,27 +70,20 @@ class WinogradConvolution(Operator):
         image, weight, bias = present(inputs)
         pads, relu = numbers(attributes, "pads"), number(attributes, "relu")
         if call.compiled and image.dtype in (None, ir.DataType.FLOAT):
-            return self._call_kernel(call, (image, weight, bias), attributes)
+            dims = self.output_shape(list(map(open_shape, inputs)), attributes)
+            # The kernel reads filters beside each other: [3, 3, C, K]
+            order, known = (2, 3, 1, 0), array_of(weight)
+            if known is None:
+                weight = call.transpose(weight, order)
+            else:
+                weight = call.constant(np.ascontiguousarray(known.transpose(order)))
+            operands = [image, weight, bias, call.integers((*pads, relu))]
+            result = call.add(self.own.op_type, operands, domain=DOMAIN)
+            result.shape = None if dims is None else ir.Shape(dims)
+            result.type = ir.TensorType(ir.DataType.FLOAT)
+            return result
         result = call.add("Conv", [image, weight, bias], {"pads": list(pads)})
         return call.add("Relu", [result]) if relu else result
-
-    def _call_kernel(
-        self, call: FusedCall, inputs: Sequence[ir.Value], attributes: Attributes
-    ) -> ir.Value:
-        image, weight, bias = inputs
-        # The kernel reads filters beside each other: [3, 3, C, K]
-        order, known = (2, 3, 1, 0), array_of(weight)
-        if known is None:
-            weight = call.transpose(weight, order)
-        else:
-            weight = call.constant(np.ascontiguousarray(known.transpose(order)))
-        options = (*numbers(attributes, "pads"), number(attributes, "relu"))
-        operands = [image, weight, bias, call.integers(options)]
-        result = call.add(self.own.op_type, operands, domain=DOMAIN)
-        dims = self.output_shape([open_shape(value) for value in inputs], attributes)
-        result.shape = None if dims is None else ir.Shape(dims)
-        result.type = ir.TensorType(ir.DataType.FLOAT)
-        return result
 
     def reference(self, inputs: Arrays, attributes: Attributes) -> NdArray:
         """Compute it in numpy, [N, K, H', W'] float64."""
