@@ -72,12 +72,13 @@ _register = ctypes.CFUNCTYPE(_POINTER, _POINTER, _POINTER)(_add)
 
 
 def _api(base: int) -> Any:
+    """Return the table of `OrtApi`: addresses of its functions, by offset."""
     get = ctypes.cast(base, ctypes.POINTER(_POINTER))[0]
     table = ctypes.CFUNCTYPE(_POINTER, ctypes.c_uint32)(get)(abi.API_VERSION)
     return ctypes.cast(table, ctypes.POINTER(_POINTER))
 
 
-_KEPT: list[object] = []
+_KEPT: list[object] = []  # what onnxruntime has addresses of
 
 
 @functools.cache

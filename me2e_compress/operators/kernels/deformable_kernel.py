@@ -46,30 +46,14 @@ corner_offsets = stack(types.int32, 8 * CAPACITY)
 
 @compiled
 def _whole(address: int, index: int, wide: int) -> Word:
+    """Read an int64 (``wide``) or int32 number of an array."""
     if wide:
         return words(address)[index]
     return np.int64(ints(address)[index])
 
 
 @compiled
-def is_beyond_rows(a: Any) -> Word:
-    """Return whether a level lies outside of the rows of value."""
-    s = a[S]
-    for k in range(a[L]):
-        height = _whole(a[SHAPES], 2 * k, a[WIDE_SHAPES])
-        width = _whole(a[SHAPES], 2 * k + 1, a[WIDE_SHAPES])
-        first = _whole(a[STARTS], k, a[WIDE_STARTS])
-        if height < 0 or width < 0 or first < 0:
-            return 1
-        # Compare each alone first: products of huge numbers would overflow
-        large = height > s or width > s or first > s or first + height * width > s
-        if height > 0 and width > 0 and large:
-            return 1
-    return 0
-
-
-@compiled
-def take_scale(a: Any, x: Any, scale: int) -> Word:
+def _take_scale(a: Any, x: Any, scale: int) -> Word:
     """Read scale and zero point, inputs ``scale`` and the next; return if they fit."""
     a[SCALES] = x[EACH * scale]
     if (a[SCALES] != 1 and a[SCALES] != a[M] * a[D]) or x[EACH * (scale + 1)] != 1:
@@ -246,7 +230,7 @@ def _compute(
         if quantized:
             a[SCALE] = x[EACH * scale + ADDRESS]
             a[ZERO] = x[EACH * (scale + 1) + ADDRESS]
-            if not take_scale(a, x, scale):
+            if not _take_scale(a, x, scale):
                 return error_status(t, SCALE_WRONG)
         # Create the output
         x[0], x[1], x[2], x[3] = a[N], a[Q], a[M], a[D]
@@ -274,7 +258,18 @@ def _message_of_sizes(a: Any, x: Any) -> Word:
         return TOO_LARGE
     if a[L] * a[P] > CAPACITY:
         return TOO_MANY
-    return BEYOND if is_beyond_rows(a) else -1
+    # Every level must lie within the rows of value
+    for k in range(a[L]):
+        height = _whole(a[SHAPES], 2 * k, a[WIDE_SHAPES])
+        width = _whole(a[SHAPES], 2 * k + 1, a[WIDE_SHAPES])
+        first = _whole(a[STARTS], k, a[WIDE_STARTS])
+        if height < 0 or width < 0 or first < 0:
+            return BEYOND
+        # Compare each alone first: products of huge numbers would overflow
+        large = height > s or width > s or first > s or first + height * width > s
+        if height > 0 and width > 0 and large:
+            return BEYOND
+    return -1
 
 
 QUERIES = 128  # queries per block of work, few enough to balance the threads
@@ -289,7 +284,7 @@ def _block(kind: Any) -> Callable[[int, int], Word]:
     quantized = bytes_each == 1
 
     def block(user: int, index: int) -> Word:
-        # The queries of this block
+        # The queries of this block: QUERIES of image n
         a = words(user)
         blocks = (a[Q] + QUERIES - 1) // QUERIES
         n = index // blocks
@@ -298,7 +293,7 @@ def _block(kind: Any) -> Callable[[int, int], Word]:
         points, row = a[L] * a[P], a[M] * a[D]
         at_once = a[M] if points == 0 else min(a[M], CAPACITY // points)
         if a[SHARED]:
-            at_once = 1  # one head after the other looks at the same places
+            at_once = 1  # one head after the other samples the same places
         # Tables are the same for all queries
         w, o = corner_weights(), corner_offsets()
         write_tables(a, w, o, at_once, a[L])
@@ -309,14 +304,15 @@ def _block(kind: Any) -> Callable[[int, int], Word]:
                 # As many heads at once as the tables hold
                 heads = min(at_once, a[M] - m)
                 first = (n * a[Q] + q) * a[M] + m
-                looked_at = n * a[Q] + q if a[SHARED] else first
-                places = floats(a[PLACES] + looked_at * points * 8)
+                sampled = n * a[Q] + q if a[SHARED] else first
+                places = floats(a[PLACES] + sampled * points * 8)
                 shares = floats(a[SHARES] + first * points * 4)
                 write_corners(w, o, places, shares, 0, heads * points, row)
                 rows = a[VALUE] + (n * a[S] * row + m * a[D]) * bytes_each
                 out = a[OUT] + first * a[D] * 4
                 for k in range(heads):
                     begin, end, to = k * points, (k + 1) * points, out + k * a[D] * 4
+                    # out[m + k, :] = sum over points and corners of weight * row
                     sum_rows((rows, offsets, weights, begin, end, to, a[D]))
                     if quantized:
                         dequantize_sums(a, to, m + k, sum_of_weights(w, begin, end))
@@ -330,6 +326,7 @@ def _block(kind: Any) -> Callable[[int, int], Word]:
 def _take(a: Any, x: Any) -> Word:
     """Take positions and weights; return whether their sizes fit."""
     a[PLACES], a[SHARES] = x[3 * EACH + ADDRESS], x[4 * EACH + ADDRESS]
+    # x[30:36] are N, Q, M or 1, L, P, 2 of the positions, x[40:45] those of the weights
     a[Q], a[P], a[SHARED] = x[31], x[34], x[32] == 1 and a[M] != 1
     for k in range(5):
         if x[40 + k] != x[30 + k] and not (k == 2 and x[32] == 1):

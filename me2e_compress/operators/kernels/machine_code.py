@@ -54,13 +54,20 @@ def load_or_compile(kernel: CompiledKernel, folder: Path) -> Mapping[str, int]:
     with _LOCK:
         place, name = private(folder), kernel.op_type
         path = None if place is None else place / f"{name}-{_fingerprint()}.o"
-        code = _read(path)
-        if code is None:
+        # The file begins with the digest of its code
+        content = path.read_bytes() if path is not None and path.is_file() else b""
+        digest, code = content[:_DIGEST], content[_DIGEST:]
+        if not code or hashlib.sha256(code).digest() != digest:
             module = importlib.import_module(f"{__package__}.{kernel.module}")
             code = _compiled(module.functions(name))
             if path is not None:
                 keep(path, hashlib.sha256(code).digest() + code)
-        return _addresses(code)
+        # Load it
+        engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), _machine())
+        engine.add_object_file(llvm.ObjectFileRef.from_data(code))
+        engine.finalize_object()
+        _ENGINES.append(engine)
+        return {n: engine.get_function_address(n) for n in ("compute", "block")}
 
 
 @functools.cache
@@ -75,16 +82,8 @@ def _fingerprint() -> str:
     return known.hexdigest()[:32]
 
 
-def _read(path: Path | None) -> bytes | None:
-    try:
-        content = b"" if path is None else path.read_bytes()
-    except OSError:
-        return None
-    digest, code = content[:_DIGEST], content[_DIGEST:]
-    return code if code and hashlib.sha256(code).digest() == digest else None
-
-
 def _machine() -> Any:
+    """Return LLVM's machine of this processor, with all that it can do."""
     llvm.initialize_native_target()
     llvm.initialize_native_asmprinter()
     target = llvm.Target.from_default_triple()
@@ -110,27 +109,16 @@ def _compiled(functions: Mapping[str, Callable[[int, int], int]]) -> bytes:
         whole.link_in(llvm.parse_assembly(made.inspect_llvm()))
         whole.link_in(llvm.parse_assembly(_WRAPPER.format(inner=inner, name=name)))
     # Only the wrappers stay visible; remove the rest if unused
-    for each in (*whole.functions, *whole.global_variables):
-        if not each.is_declaration and each.name not in functions:
-            each.linkage = "internal"
+    for symbol in (*whole.functions, *whole.global_variables):
+        if not symbol.is_declaration and symbol.name not in functions:
+            symbol.linkage = "internal"
     passes = llvm.create_new_module_pass_manager()
     passes.add_global_dead_code_eliminate_pass()
     options = llvm.create_pipeline_tuning_options()
     passes.run(whole, llvm.create_pass_builder(machine, options))
     # Refuse calls that need Numba at run time
-    foreign = [
-        each.name
-        for each in whole.functions
-        if each.is_declaration and not each.name.startswith("llvm.")
-    ]
-    if unknown := sorted(set(foreign) - _FOREIGN):
+    declared = {f.name for f in whole.functions if f.is_declaration}
+    foreign = {name for name in declared if not name.startswith("llvm.")}
+    if unknown := sorted(foreign - _FOREIGN):
         raise GraphError(f"a kernel calls {unknown[0]}, which only Numba has")
     return bytes(machine.emit_object(whole))
-
-
-def _addresses(code: bytes) -> Mapping[str, int]:
-    engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), _machine())
-    engine.add_object_file(llvm.ObjectFileRef.from_data(code))
-    engine.finalize_object()
-    _ENGINES.append(engine)
-    return {name: engine.get_function_address(name) for name in ("compute", "block")}

@@ -64,6 +64,7 @@ def _softmax_of(size: int) -> Any:
                 x = join(x, simd.choose(x, x, [n ^ step for n in range(LANES)]))
             return x
 
+        # e^(x - max) / sum of e^(x - max), over each row
         x = simd.load(simd.pointer(scores))
         below = simd.subtract(x, over_row(x, simd.at_least))
         power = simd.power_of_2(simd.times(LOG2_E, below))
@@ -74,6 +75,7 @@ def _softmax_of(size: int) -> Any:
 
 
 def _write_power(simd: Vectors, at: Any) -> None:
+    """Replace the number at an address by its exponential, 2^(x log2(e))."""
     place = simd.pointer(at)
     simd.store(simd.power_of_2(simd.times(LOG2_E, simd.load(place))), place)
 
@@ -137,12 +139,14 @@ def _places(a: Any, at: Any, near: Any, away: Any, group: int, heads: int) -> No
     """Add the reference points to the offsets of a group of levels."""
     levels, points = a[REFERENCE + LEVELS], a[REFERENCE + POINTS]
     together = a[OFFSETS + LEVELS]
+    # One reference point for all levels, points and heads
     if levels * points == 1 and a[REFERENCE + STEP_M] == 0:
         x, y = near[0], near[1]
         for j in range(heads * together * a[P]):
             at[2 * j] = away[2 * j] + x
             at[2 * j + 1] = away[2 * j + 1] + y
         return
+    # at[m, k, p] = away[m, k, p] + near[m, level of k, p % points]
     j = 0
     for m in range(heads):
         for k in range(together):
@@ -174,19 +178,20 @@ def _shares(a: Any, w: Any, soft: Any, mask: Any, group: int, heads: int) -> Non
     """Multiply the softmax by the mask, for the points of a group of levels."""
     levels, points = a[MASK + LEVELS], a[MASK + POINTS]
     together = a[OFFSETS + LEVELS]
-    row = a[SCORES + LEVELS] * a[SCORES + POINTS]
-    each = together * a[P]
+    row = a[SCORES + LEVELS] * a[SCORES + POINTS]  # scores of a head
+    size = together * a[P]  # points of a head in a group
     # One factor for the whole group, and one score for each of its points
-    alike = row == each and (a[SCORES + STEP_M] != 0 or heads == 1)
+    alike = row == size and (a[SCORES + STEP_M] != 0 or heads == 1)
     one = points == 1 and a[MASK + STEP_M] == 0
     if alike and one and a[L] // levels % together == 0:
         factor = mask[group * together * levels // a[L]]
-        for j in range(heads * each):
+        for j in range(heads * size):
             w[j] = soft[j] * factor
         return
+    # w[m, k, p] = soft[m, (point of the head) % row] * mask[m, level of k, p % points]
     for m in range(heads):
         own = m * row if a[SCORES + STEP_M] else 0
-        score = group * each % row
+        score = group * size % row
         for k in range(together):
             level = (group * together + k) * levels // a[L]
             first = m * a[MASK + STEP_M] + level * points
@@ -210,8 +215,8 @@ def _block(kind: Any) -> Callable[[int, int], Word]:
         from_query = (index - n * blocks) * QUERIES
         to_query = min(from_query + QUERIES, a[Q])
         row, together = a[M] * a[D], a[OFFSETS + LEVELS]
-        each = together * a[P]
-        groups = a[L] // together if each > 0 else 0
+        size = together * a[P]  # points of a head in a group of levels
+        groups = a[L] // together if size > 0 else 0
         # Tables are the same for all queries
         at_once = min(a[M], CAPACITY // max(a[L] * a[P], 1))
         w, o = corner_weights(), corner_offsets()
@@ -231,6 +236,8 @@ def _block(kind: Any) -> Callable[[int, int], Word]:
                     numbers[d] = F(0)
                 for k in range(heads):
                     total[k] = F(0)
+                # Groups that the mask hides cost nothing; the first other one needs
+                # the softmax of all
                 ready = 0
                 for group in range(groups):
                     if not _seen(a, mask, group, heads):
@@ -242,10 +249,11 @@ def _block(kind: Any) -> Callable[[int, int], Word]:
                         ready = 1
                     _places(a, at, near, away, group, heads)
                     _shares(a, shares, soft, mask, group, heads)
-                    start = group * at_once * each
-                    write_corners(w, o, at, shares, start, heads * each, row)
+                    start = group * at_once * size
+                    write_corners(w, o, at, shares, start, heads * size, row)
+                    # out[m + k, :] += sum over points and corners of weight * row
                     for k in range(heads):
-                        begin, end = k * each, (k + 1) * each
+                        begin, end = k * size, (k + 1) * size
                         to = out + k * a[D] * 4
                         add_rows((rows, offsets, weights, begin, end, to, a[D]))
                         if quantized:
@@ -265,6 +273,7 @@ def _stepped(a: Any, x: Any, operand: int, index: int, pairs: int) -> Word:
     n, q, m, levels, points = x[i], x[i + 1], x[i + 2], x[i + 3], x[i + 4]
     if (n != 1 and n != a[N]) or (q != 1 and q != a[Q]) or (m != 1 and m != a[M]):
         return 0
+    # Steps of 0 repeat what has one batch, query or head
     head = levels * points * (2 if pairs else 1)
     a[operand] = x[i + ADDRESS]
     a[operand + STEP_N] = q * m * head if n > 1 else 0

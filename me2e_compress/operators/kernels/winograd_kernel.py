@@ -129,13 +129,13 @@ def _input_columns(
     for k in range(SIDE):
         first = w.place(rows, builder.mul(row, WORD(k)))
         places = [builder.gep(first, [WORD(LANES * part)]) for part in range(OUT + 1)]
-        taken = list(w.take_apart([w.load(place) for place in places[:OUT]]))
+        columns = list(w.take_apart([w.load(place) for place in places[:OUT]]))
         # The last two of a tile are the first two of the next
         for part in range(SIDE - OUT):
             after = builder.load(builder.gep(places[OUT], [WORD(part)]))
             following = range(1, LANES + 1)
-            taken.append(w.choose(taken[part], w.spread(after), following))
-        for part, vector in enumerate(_input(w, taken)):
+            columns.append(w.choose(columns[part], w.spread(after), following))
+        for part, vector in enumerate(_input(w, columns)):
             at = builder.mul(plane, WORD(k * SIDE + part))
             w.store(vector, w.place(to, at), mask)
 
@@ -148,6 +148,7 @@ def _filters(
         place = w.place(elements, builder.mul(step, WORD(k)))
         read.append(w.load(place, mask))
         w.fetch(builder.gep(place, [ahead]))
+    # g G^T by rows, then G (g G^T) by columns
     across = [_filter(w, read[FILTER * k : FILTER * (k + 1)]) for k in range(FILTER)]
     for part in range(SIDE):
         for k, vector in enumerate(_filter(w, [line[part] for line in across])):
@@ -162,18 +163,19 @@ def _outputs(
 ) -> None:  # fmt: skip
     builder = w.builder
     both = [w.spread(builder.load(w.place(bias, WORD(k)))) for k in range(2)]
-    across = []
-    for part in range(SIDE):
-        parts = (WORD(k * SIDE + part) for k in range(SIDE))
+    across = []  # A^T m, by columns
+    for column in range(SIDE):
+        parts = (WORD(k * SIDE + column) for k in range(SIDE))
         places = [w.place(m, builder.mul(plane, part)) for part in parts]
         across.append(_output(w, [w.load(place) for place in places]))
     for k in range(OUT):
-        made = [w.add(each, both[0]) for each in _output(w, [col[k] for col in across])]
-        made = [w.at_least(node, both[1]) for node in made]
+        # Row k of A^T m A, plus the bias, and at least the least number
+        row = _output(w, [column[k] for column in across])
+        row = [w.at_least(w.add(vector, both[0]), both[1]) for vector in row]
         # Rows below the image have no lanes
         inside = builder.icmp_signed("<", WORD(k), rows)
         limit = builder.select(inside, count, WORD(0))
-        for part, vector in enumerate(w.put_together(made)):
+        for part, vector in enumerate(w.put_together(row)):
             first = WORD(part * LANES)
             place = w.place(to, builder.add(builder.mul(wide, WORD(k)), first))
             w.store(vector, place, w.within(first, limit))
@@ -366,7 +368,7 @@ def _work(a: Any, piece: int, m: int) -> None:
         for k in range(min(PANELS, panels - piece * PANELS)):
             at = own + k * depth * LANES * 4
             transform_filters(a, piece * PANELS + k, at, plane)
-    # Multiply it with all that is shared
+    # Multiply it with all that is shared: 36 products [wide, C] [C, TILES]
     for other in range(others):
         block, group, filters, inputs = other, piece, own, a[SHARED]
         inputs += other * PRODUCTS * input_plane(depth) * 4
