@@ -35,7 +35,7 @@ from me2e_compress.fidelity.compare import (
     common_adapter,
 )
 from me2e_compress.fidelity.compare import compare as measure
-from me2e_compress.fidelity.first_difference import (
+from me2e_compress.fidelity.engine_loss import (
     BorderValue,
     FirstDifference,
     find_first_difference,

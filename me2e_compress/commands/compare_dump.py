@@ -14,10 +14,12 @@ from me2e_compress.commands.checks import model_path, opened
 from me2e_compress.commands.compare import headline_of, stamp_modules
 from me2e_compress.commands.options import CompareOptions
 from me2e_compress.commands.result import SILENT, Listener, Result, View
-from me2e_compress.fidelity.engine_loss import EngineRun, OutputLoss, split_losses
-from me2e_compress.fidelity.first_difference import (
+from me2e_compress.fidelity.engine_loss import (
+    EngineRun,
     FirstDifference,
+    OutputLoss,
     first_difference_of_engine,
+    split_losses,
 )
 from me2e_compress.runtime.session import Session
 from me2e_compress.targets.quantized import describe_quantized

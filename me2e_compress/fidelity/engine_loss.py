@@ -1,19 +1,29 @@
-"""What an engine lost, output by output: to quantization and to compilation."""
+"""What an engine lost, and the first module after which a graph differs.
+
+The loss is split into quantization and compilation, output by output. For the first
+module, both graphs run on one frame, with every tensor that one module passes to
+another as one more output, and those that both name alike are compared, whole.
+"""
 
 import dataclasses
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import TypeAlias
 
 import numpy as np
+import onnx_ir as ir
 
+from me2e_compress import graph
 from me2e_compress.base.errors import EvaluationError
 from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.calibration.engine_dump import EngineDump
-from me2e_compress.fidelity import ALIVE
+from me2e_compress.fidelity import ALIVE, SQNR_FLOOR_DB
 from me2e_compress.fidelity.compare import Tally
 from me2e_compress.fidelity.liveness import OutputTally
+from me2e_compress.graph.nodes import constant_values, nodes_of, reads_of
+from me2e_compress.graph.provenance import module_of
 from me2e_compress.runtime.frames import Array, Frame
-from me2e_compress.runtime.session import DTYPES, Session
+from me2e_compress.runtime.providers import CPU, Provider
+from me2e_compress.runtime.session import DTYPES, Session, detached, feed_forward
 
 Arrays: TypeAlias = Mapping[str, Array]
 Frames: TypeAlias = CalibrationSet | Sequence[Frame]
@@ -150,3 +160,187 @@ def split_losses(
         )
         for name in names
     )
+
+
+# SQNR of two float32 values that differ by rounding alone: two runtimes are 3e-5 to
+# 6e-5 apart on UniAD-tiny (models/README.md)
+ROUNDING_DB = 80.0
+NARROW = (ir.DataType.FLOAT16, ir.DataType.BFLOAT16)
+
+
+@dataclasses.dataclass(frozen=True)
+class BorderValue:
+    """A tensor that a module hands on: the node that makes it, and its SQNR."""
+
+    module: str
+    value: str
+    node: str
+    sqnr_db: float
+
+    def __str__(self) -> str:
+        module = f"module {self.module}, " if self.module else ""
+        return f"{module}{self.value} of {self.node} is at {self.sqnr_db:.1f} dB"
+
+
+@dataclasses.dataclass(frozen=True)
+class FirstDifference:
+    """Where a graph begins to differ from its source.
+
+    Attributes:
+        values: what was compared, in the order in which it is computed.
+        floor_db: the SQNR below which a value counts as another.
+        unknown: how many borders of either graph have no namesake in the other.
+        outputs_differ: whether an output is below the floor.
+    """
+
+    values: tuple[BorderValue, ...]
+    floor_db: float
+    unknown: int
+    outputs_differ: bool
+
+    @property
+    def first(self) -> BorderValue | None:
+        """The first value below the floor, of a graph whose outputs differ."""
+        below = (each for each in self.values if each.sqnr_db < self.floor_db)
+        return next(below, None) if self.outputs_differ else None
+
+
+def find_first_difference(
+    source: ir.Model,
+    candidate: ir.Model,
+    frames: Sequence[Frame],
+    provider: Provider = CPU,
+) -> FirstDifference:
+    """Find the first module of a graph that gives something else than its source does.
+
+    The last of the frames is compared; the state of both graphs is what the source gave
+    on those before. The floor is :data:`ROUNDING_DB`, or
+    :data:`me2e_compress.fidelity.SQNR_FLOOR_DB` where a graph holds int8 or
+    mostly narrow floats.
+
+    Raises:
+        EvaluationError: there is no frame, or the graphs share no value.
+        FramesError: a frame does not fit one of the graphs.
+        GraphError: onnxruntime cannot run one.
+    """
+    if not frames:
+        raise EvaluationError("no frames to compare on")
+    borders = dict.fromkeys([*_border_values(candidate), *_border_values(source)])
+    known = [set(_values_by_name(each)) for each in (source, candidate)]
+    shared = [name for name in borders if name in known[0] & known[1]]
+    if not shared:
+        raise EvaluationError("the graphs share no value at the border of a module")
+    feeds = _last_feeds(source, frames, provider)
+    expected = _compute(source, shared, feeds, provider)
+    values = _compute(candidate, shared, feeds, provider)
+    # A few casts to float16 in a float32 graph are what is looked for; not so where a
+    # graph holds int8, or narrow floats more than others.
+    floor_db = ROUNDING_DB
+    for each in (source, candidate):
+        wide = narrow = 0
+        for node in nodes_of(each):
+            if node.op_type in ("QuantizeLinear", "DynamicQuantizeLinear"):
+                floor_db = SQNR_FLOOR_DB
+            narrow += sum(value.dtype in NARROW for value in node.outputs)
+            wide += sum(value.dtype == ir.DataType.FLOAT for value in node.outputs)
+        if narrow > wide:
+            floor_db = SQNR_FLOOR_DB
+    return _compare_values(
+        candidate, expected, values, floor_db, len(borders) - len(shared)
+    )
+
+
+def first_difference_of_engine(
+    model: ir.Model, run: EngineRun, provider: Provider = CPU
+) -> FirstDifference:
+    """Find where the tensors that an engine dumped begin to differ from its graph's.
+
+    Every dumped tensor of the first frame is compared, inner ones too, with the floor
+    :data:`me2e_compress.fidelity.SQNR_FLOOR_DB`.
+    """
+    feeds, _ = next(run.run_graph(run.session, run.names))
+    known, dumped = _values_by_name(model), run.dump[0]
+    names = [name for name in dumped if name in known]
+    expected = _compute(model, names, feeds, provider)
+    return _compare_values(model, expected, dumped, SQNR_FLOOR_DB, unknown=0)
+
+
+def _compare_values(
+    model: ir.Model,
+    expected: Mapping[str, Array],
+    values: Mapping[str, Array],
+    floor_db: float,
+    unknown: int,
+) -> FirstDifference:
+    """Compare arrays by name, in a graph's order; another shape is at -infinity dB."""
+
+    def sqnr(name: str) -> float:
+        if expected[name].shape != values[name].shape:
+            return -np.inf
+        tally = Tally(name)
+        tally.add(expected[name], values[name], 0)
+        return tally.sqnr_db
+
+    outputs = {value.name for value in model.graph.outputs}
+    compared = tuple(
+        BorderValue(
+            module_of(node),
+            name,
+            f"{node.name or 'a node'} ({node.op_type})",
+            sqnr(name),
+        )
+        for name, node in _values_by_name(model).items()
+        if name in expected
+    )
+    differ = any(each.sqnr_db < floor_db for each in compared if each.value in outputs)
+    return FirstDifference(compared, floor_db, unknown, differ)
+
+
+def _border_values(model: ir.Model) -> Iterator[str]:
+    """Yield outputs, and what depends on inputs and is read by another module."""
+    constant = constant_values(model)
+    readers: dict[ir.Value, set[str]] = {}
+    for node in model.graph:
+        for value in reads_of(node):
+            readers.setdefault(value, set()).add(module_of(node))
+    for node in model.graph:
+        for value in node.outputs:
+            others = readers.get(value, set()) - {module_of(node)}
+            leaves_module = others or value.is_graph_output()
+            if value.name and value not in constant and leaves_module:
+                yield value.name
+
+
+def _values_by_name(model: ir.Model) -> dict[str, ir.Node]:
+    """Map every named value to its node, in order."""
+    made = ((each.name, node) for node in model.graph for each in node.outputs)
+    return {name: node for name, node in made if name}
+
+
+def _last_feeds(
+    model: ir.Model, frames: Sequence[Frame], provider: Provider
+) -> Mapping[str, Array]:
+    """Return a graph's inputs at the last frame, its own state included."""
+    session = Session(model, optimize=False, release=True, provider=provider)
+    *before, last = frames if session.recurrent else frames[-1:]
+    state = session.first_state(frames[0].arrays)
+    for _, _, after in feed_forward(session, before, (), state):
+        state = detached(after)
+    fresh = session.first_state(last.arrays) if last.starts_scene else state
+    return {**last.arrays, **fresh}
+
+
+def _compute(
+    model: ir.Model,
+    names: Iterable[str],
+    feeds: Mapping[str, Array],
+    provider: Provider,
+) -> dict[str, Array]:
+    """Run a graph without optimization, and return values anywhere in it."""
+    probed, wanted = model.clone(), list(names)
+    graph.infer_shapes(probed)
+    made = {value.name: value for node in probed.graph for value in node.outputs}
+    missing = [made[name] for name in wanted if not made[name].is_graph_output()]
+    probed.graph.outputs.extend(missing)
+    session = Session(probed, optimize=False, release=True, provider=provider)
+    return detached(session.run(feeds, wanted))

@@ -12,7 +12,7 @@ import onnx_ir as ir
 
 from me2e_compress.base.display import plural
 from me2e_compress.base.errors import FramesError, GraphError, Me2eError
-from me2e_compress.fidelity.first_difference import find_first_difference
+from me2e_compress.fidelity.engine_loss import find_first_difference
 from me2e_compress.graph.nodes import bodies_of, draws, reads_of
 from me2e_compress.manager import pieces
 from me2e_compress.manager.report import Verification

@@ -7,7 +7,6 @@ import numpy as np
 import onnx_ir as ir
 
 from me2e_compress.operators.base import Operator
-from me2e_compress.operators.bilinear import sample_levels, sample_levels_array
 from me2e_compress.operators.call import Attributes, FusedCall
 from me2e_compress.operators.dialect import (
     FLOAT32,
@@ -24,6 +23,7 @@ from me2e_compress.operators.dialect import (
     Values,
     present,
 )
+from me2e_compress.operators.grid_sampler import sample_levels, sample_levels_array
 
 
 def _operands(

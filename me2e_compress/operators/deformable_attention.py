@@ -12,7 +12,6 @@ from me2e_compress.graph import array_of
 from me2e_compress.graph.nodes import maker, permutation_of
 from me2e_compress.graph.shapes import Dims, product, static_shape
 from me2e_compress.operators.base import Operator
-from me2e_compress.operators.bilinear import sample_levels, sample_levels_array
 from me2e_compress.operators.call import Attributes, FusedCall, Size
 from me2e_compress.operators.dialect import (
     FLOATS,
@@ -29,6 +28,7 @@ from me2e_compress.operators.dialect import (
     Values,
     present,
 )
+from me2e_compress.operators.grid_sampler import sample_levels, sample_levels_array
 from me2e_compress.operators.kernels.kernel import DOMAIN
 
 

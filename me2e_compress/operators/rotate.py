@@ -7,7 +7,6 @@ import numpy as np
 import onnx_ir as ir
 
 from me2e_compress.operators.base import Operator
-from me2e_compress.operators.bilinear import sample_levels
 from me2e_compress.operators.call import Attributes, FusedCall
 from me2e_compress.operators.dialect import (
     FLOATS,
@@ -22,7 +21,11 @@ from me2e_compress.operators.dialect import (
     Values,
     present,
 )
-from me2e_compress.operators.grid_sampler import BILINEAR, grid_sample_array
+from me2e_compress.operators.grid_sampler import (
+    BILINEAR,
+    grid_sample_array,
+    sample_levels,
+)
 
 _INTERPOLATION = (Attribute("interpolation", 0, choices=(0, 1)),)
 

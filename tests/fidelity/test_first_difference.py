@@ -8,8 +8,8 @@ import onnx_ir as ir
 import pytest
 
 from me2e_compress.base.errors import EvaluationError, FramesError, GraphError
-from me2e_compress.fidelity.engine_loss import EngineRun
-from me2e_compress.fidelity.first_difference import (
+from me2e_compress.fidelity.engine_loss import (
+    EngineRun,
     FirstDifference,
     find_first_difference,
     first_difference_of_engine,

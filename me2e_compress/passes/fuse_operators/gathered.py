@@ -25,7 +25,7 @@ from me2e_compress.graph.nodes import (
     sole_reader,
 )
 from me2e_compress.operators import FusedCall
-from me2e_compress.operators.bilinear import GRID_SAMPLE_OPSET
+from me2e_compress.operators.grid_sampler import GRID_SAMPLE_OPSET
 from me2e_compress.passes.digits import Digit, flat, regrouped, sizes, whole
 from me2e_compress.passes.fuse_operators.fused_form import laid_out
 from me2e_compress.passes.fuse_operators.views import Selection, View, joined, sources

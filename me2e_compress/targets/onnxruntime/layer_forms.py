@@ -19,7 +19,7 @@ from me2e_compress.graph.nodes import sole_reader
 from me2e_compress.operators import FusedCall
 from me2e_compress.operators.call import Size
 from me2e_compress.targets.onnxruntime.region import end_of, reads_one_pixel
-from me2e_compress.targets.quantized import QUANTIZE
+from me2e_compress.targets.quantized import QUANTIZE, Writer
 from me2e_compress.targets.weights import (
     Floats,
     QuantizedWeight,
@@ -28,7 +28,6 @@ from me2e_compress.targets.weights import (
     least_scales,
     with_room,
 )
-from me2e_compress.targets.writer import Writer
 
 CHANNELS_SECOND, CHANNELS_LAST = (0, 3, 1, 2), (0, 2, 3, 1)
 

@@ -34,9 +34,8 @@ from me2e_compress.targets.onnxruntime.region import (
     is_average,
     is_move,
 )
-from me2e_compress.targets.quantized import QUANTIZE, is_dequantized
+from me2e_compress.targets.quantized import BY, QUANTIZE, Writer, is_dequantized
 from me2e_compress.targets.weights import QuantizedWeight
-from me2e_compress.targets.writer import BY, Writer
 
 PACKED = 4  # channels that onnxruntime's kernel reads at once
 

@@ -22,7 +22,7 @@ from me2e_compress.operators import find, int8_inputs
 from me2e_compress.quantization.decision import Decision, QuantPlan
 from me2e_compress.quantization.plan import share_scales, tensors_of
 from me2e_compress.targets import LintFinding, LintRule, Target
-from me2e_compress.targets.quantized import is_in_a_pair
+from me2e_compress.targets.quantized import Writer, is_in_a_pair
 from me2e_compress.targets.tensorrt.lint.support import rules, version_of
 from me2e_compress.targets.weights import (
     QuantizedWeight,
@@ -33,7 +33,6 @@ from me2e_compress.targets.weights import (
     weights_of,
     with_room,
 )
-from me2e_compress.targets.writer import Writer
 
 
 @dataclasses.dataclass(frozen=True)

@@ -68,25 +68,25 @@ def test_a_cache_mounted_noexec(
 def test_code_is_compiled_once_and_read_afterwards(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from me2e_compress.operators.kernels import machine_code
+    from me2e_compress.operators.kernels import custom_ops
 
     code = kernels.KERNELS[0]
     folder = trampoline.default_folder()
-    machine_code.load_or_compile(code, folder)
-    file = folder / f"{code.op_type}-{machine_code._fingerprint()}.o"
+    custom_ops.load_or_compile(code, folder)
+    file = folder / f"{code.op_type}-{custom_ops._fingerprint()}.o"
     if not file.is_file():
         pytest.skip("the user's cache folder keeps nothing")
-    made = file.read_bytes()[machine_code._DIGEST :]
+    made = file.read_bytes()[custom_ops._DIGEST :]
     compiled: list[object] = []
 
     def counted(functions: object) -> bytes:
         compiled.append(functions)
         return made
 
-    monkeypatch.setattr(machine_code, "_compiled", counted)
+    monkeypatch.setattr(custom_ops, "_compiled", counted)
 
     def load() -> int:
-        machine_code.load_or_compile(code, tmp_path)
+        custom_ops.load_or_compile(code, tmp_path)
         return len(compiled)
 
     assert load() == 1
@@ -96,7 +96,7 @@ def test_code_is_compiled_once_and_read_afterwards(
     blocked = tmp_path / "file"
     blocked.write_text("in the way")
     assert load() == 1
-    machine_code.load_or_compile(code, blocked)
+    custom_ops.load_or_compile(code, blocked)
     assert len(compiled) == 2  # nowhere to keep it: compiled in every process
     os.truncate(kept, kept.stat().st_size // 2)  # a disk that was full
     assert load() == 3

@@ -21,8 +21,8 @@ from me2e_compress.commands.result import SILENT
 from me2e_compress.operators import dialect_of, kernels
 from me2e_compress.operators.deformable_attention import DeformableAttention
 from me2e_compress.operators.kernels import custom_ops, trampoline
+from me2e_compress.operators.kernels.custom_ops import load_or_compile
 from me2e_compress.operators.kernels.kernel import CompiledKernel
-from me2e_compress.operators.kernels.machine_code import load_or_compile
 from me2e_compress.runtime.frames import Frame
 from me2e_compress.runtime.providers import CpuProvider
 from me2e_compress.runtime.runnable import replace_fused

@@ -15,8 +15,8 @@ from me2e_compress.targets.onnxruntime.lower import (
     filter_of_blocks,
     read_blocks,
 )
+from me2e_compress.targets.quantized import Writer
 from me2e_compress.targets.weights import QuantizedWeight
-from me2e_compress.targets.writer import Writer
 from tests.support.nets import FULL, drawn, net
 from tests.support.profiles import scaled
 from tests.targets.onnxruntime.lowered import (
