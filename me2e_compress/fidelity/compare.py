@@ -103,9 +103,9 @@ class Fidelity:
     def stray_texts(self) -> tuple[str, ...]:
         """A sentence for each output that is a number in one model alone."""
         return tuple(
-            f"{each.name}: {each.stray:.2g} of it is a number in one graph alone"
-            for each in self.outputs
-            if each.stray
+            f"{output.name}: {output.stray:.2g} of it is a number in one graph alone"
+            for output in self.outputs
+            if output.stray
         )
 
 
@@ -123,7 +123,7 @@ class Reference:
     @classmethod
     def of(cls, session: Session, frames: Frames) -> Self:
         """Run a model once over the frames; raises as :func:`compare` does."""
-        answers = tuple(detached(each) for each in replay(session, frames))
+        answers = tuple(map(detached, replay(session, frames)))
         return cls(session, frames, answers)
 
     def compare(self, other: Session, watchers: Sequence[Watch] = ()) -> Fidelity:
@@ -157,12 +157,12 @@ def compare(
         raise EvaluationError(
             f"no tensor in common: {', '.join(a.outputs)} and {', '.join(b.outputs)}"
         )
-    # what can be compared: single outputs, and the plan
+    # What can be compared: single outputs, and the plan
     tallies = {name: Tally(name) for name in shared}
     adapter, reason = common_adapter(a, b)
     displacements, same_modes = list[Float64](), list[bool]()
     count = 0
-    # frame by frame, with one frame in memory
+    # Frame by frame, with one frame in memory
     for_a, for_b, for_plans = itertools.tee(frames, 3)
     if answers is None:
         answers = replay(a, for_a)
@@ -173,11 +173,10 @@ def compare(
         for name, tally in tallies.items():
             tally.add(left[name], right[name], count)
         if adapter is not None:
-            plans = [adapter.plan(each, frame.arrays) for each in (left, right)]
+            plans = [adapter.plan(side, frame.arrays) for side in (left, right)]
             gap = np.where(np.isnan(plans).all(axis=0), 0.0, plans[0] - plans[1])
-            displacements.append(
-                np.nan_to_num(np.linalg.norm(gap, axis=1), nan=math.inf)
-            )
+            lengths = np.linalg.norm(gap, axis=1)  # (waypoints,)
+            displacements.append(np.nan_to_num(lengths, nan=math.inf))
             if adapter.scores is not None:
                 same_modes.append(adapter.choice(left) == adapter.choice(right))
         for watch in watchers:
@@ -185,12 +184,13 @@ def compare(
         count += 1
     if not count:
         raise EvaluationError("no frames to compare on")
+    plan = None
+    if displacements:
+        plan = Displacement(float(np.mean(displacements)), float(np.max(displacements)))
     return Fidelity(
         tuple(tally.result() for tally in tallies.values()),
         tuple(name for name in a.outputs if name not in b.outputs),
-        Displacement(float(np.mean(displacements)), float(np.max(displacements)))
-        if displacements
-        else None,
+        plan,
         reason,
         count,
         adapter.output if adapter is not None and displacements else "",
@@ -203,14 +203,14 @@ def common_adapter(a: Session, b: Session) -> tuple[PlanAdapter | None, str]:
     adapter = PlanAdapter.of(a.metadata, list(a.outputs))
     if adapter is None:
         return None, "the model does not say which output is its plan"
-    # an output called plan that has no plan's shape
+    # An output called plan may lack a plan's shape
     shape = a.outputs[adapter.output].shape
     if PLAN not in a.metadata and (len(shape) not in (3, 4) or shape[-1] != 2):
         return None, f"{adapter.output} is {list(shape)}, a plan is [1, n, 2]"
     for needed in (adapter.output, adapter.scores):
         if needed is not None and needed not in b.outputs:
             return None, f"the second model has no output {needed}"
-    # several modes need something that picks one
+    # Several modes need something that picks one
     sides = shape if adapter.shape is None else (1, *adapter.shape)
     if len(sides) == MODES_RANK and isinstance(modes := sides[1], int):
         adapter.check_modes(modes)
@@ -231,10 +231,9 @@ class Tally:
     def __init__(self, name: str) -> None:
         self.name = name
         self.signal = self.noise = self.gap = self.reach = 0.0
-        self.noises = list[float]()
-        self.discrete = False
-        self.count = self.stray_texts = 0
-        # by axis: signal, noise and largest value of each channel
+        self.noises = list[float]()  # by frame
+        self.discrete, self.count, self.strays = False, 0, 0
+        # By axis: signal, noise and largest value of each channel, (3, channels)
         self._channels = dict[int, Float64]()
 
     def add(self, a: Array, b: Array, frame: int) -> None:
@@ -254,8 +253,8 @@ class Tally:
         strays = int(np.count_nonzero(~same))
         if not numbers.all():
             x, y = np.where(numbers, x, 0.0), np.where(numbers, y, 0.0)
-        self.count, self.stray_texts = self.count + x.size, self.stray_texts + strays
-        # sums for the SQNR, largest values for the error
+        self.count, self.strays = self.count + x.size, self.strays + strays
+        # Sums for the SQNR, largest values for the error
         gap = np.abs(x - y)
         signal = float(np.vdot(x, x))
         noise = math.inf if strays else float(np.vdot(gap, gap))
@@ -264,12 +263,9 @@ class Tally:
         self.noise += noise
         self.reach = max(self.reach, float(np.abs(x).max()))
         self.gap = math.inf if strays else max(self.gap, float(gap.max()))
-        self._add_channels(x, gap)
-
-    def _add_channels(self, x: Float64, gap: Float64) -> None:
-        axes = () if self.discrete else channel_axes(x.shape)
-        for axis in axes:
-            others = tuple(each for each in range(x.ndim) if each != axis)
+        # The same by channel
+        for axis in () if self.discrete else channel_axes(x.shape):
+            others = tuple(other for other in range(x.ndim) if other != axis)
             sums = self._channels.get(axis)
             if sums is None or x.shape[axis] != sums.shape[1]:
                 sums = self._channels[axis] = np.zeros((3, x.shape[axis]))
@@ -285,20 +281,19 @@ class Tally:
     def result(self) -> OutputFidelity:
         """Return the output's fidelity over the frames so far."""
         error = self.gap / self.reach if self.reach else math.inf if self.gap else 0.0
+        # The noisiest and the quietest frame, against the mean signal
         noises = self.noises or [0.0]
         ends = max(noises), min(noises)
         least, most = (decibels(self.signal / len(noises), noise) for noise in ends)
-        sqnr = self.sqnr_db
-        stray = self.stray_texts / self.count if self.count else 0.0
-        small, small_db = self._small_channels()
-        return OutputFidelity(
-            self.name, sqnr, error, self.discrete, least, most, stray, small, small_db
-        )
+        stray = self.strays / self.count if self.count else 0.0
+        figures = self.sqnr_db, error, self.discrete, least, most, stray
+        return OutputFidelity(self.name, *figures, *self._small_channels())
 
     def _small_channels(self) -> tuple[str, float | None]:
         """Return the small channels of the worst axis and their SQNR; "" and None."""
         candidates = list[tuple[float, str]]()
         for axis, (signal, noise, largest) in self._channels.items():
+            # Channels by size, and the first gap behind which they are small
             order = np.argsort(-largest)
             sizes = largest[order]
             lower = GAP_RATIO * sizes[1:] < sizes[:-1]
@@ -306,9 +301,8 @@ class Tally:
             if gaps.size and sizes[gaps[0] + 1]:
                 small = np.sort(order[gaps[0] + 1 :])
                 name = f"[{':, ' * axis}{_index_ranges(small.tolist())}]"
-                candidates.append(
-                    (decibels(signal[small].sum(), noise[small].sum()), name)
-                )
+                sqnr_db = decibels(signal[small].sum(), noise[small].sum())
+                candidates.append((sqnr_db, name))
         value, name = min(candidates, default=(None, ""))
         return name, value
 
@@ -334,8 +328,8 @@ def channel_axes(shape: tuple[int, ...]) -> tuple[int, ...]:
 
 def _index_ranges(indices: list[int]) -> str:
     """Write sorted indices as ``0, 4:84``, ends exclusive."""
-    starts = [each for each in indices if each - 1 not in indices]
-    ends = [each + 1 for each in indices if each + 1 not in indices]
+    starts = [index for index in indices if index - 1 not in indices]
+    ends = [index + 1 for index in indices if index + 1 not in indices]
     pairs = zip(starts, ends, strict=True)
     return ", ".join(f"{a}:{b}" if b > a + 1 else f"{a}" for a, b in pairs)
 
@@ -386,8 +380,7 @@ class SetOutputs(pydantic.BaseModel):
         Raises:
             GraphError: it is malformed, or an output lacks a row for every agent.
         """
-        text = metadata.get(SETS)
-        if text is None:
+        if (text := metadata.get(SETS)) is None:
             return None
         try:
             outputs = cls.model_validate(documents.from_json(text))
@@ -441,7 +434,8 @@ class SetTally:
         from scipy.optimize import linear_sum_assignment  # takes long to import
 
         outputs = self.outputs
-        places, others = (each[outputs.boxes][0, :, :2] for each in (left, right))
+        # Pairs of the smallest sum of distances, those farther apart than MATCH_M none
+        places, others = (side[outputs.boxes][0, :, :2] for side in (left, right))
         rows = np.flatnonzero(left[outputs.scores][0] >= PRESENCE_SCORE)
         gaps = places[rows, None].astype(np.float64) - others.astype(np.float64)
         distances = np.linalg.norm(gaps, axis=2)
@@ -450,12 +444,12 @@ class SetTally:
         mine, theirs = rows[picked][near], columns[near]
         self.agents += len(rows)
         self.matched += len(mine)
-        # signal and noise of matched rows
+        # Signal and noise of matched rows
         for name in outputs.names:
             tally = self.tallies.setdefault(name, Tally(name))
             tally.add(left[name][0][mine], right[name][0][theirs], frame.index)
 
     def result(self) -> SetFidelity:
         """Return the figures over the frames so far."""
-        sqnr_db = {name: each.sqnr_db for name, each in self.tallies.items()}
+        sqnr_db = {name: tally.sqnr_db for name, tally in self.tallies.items()}
         return SetFidelity(self.agents, self.matched, sqnr_db if self.matched else {})

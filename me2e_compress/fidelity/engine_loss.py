@@ -6,6 +6,7 @@ another as one more output, and those that both name alike are compared, whole.
 """
 
 import dataclasses
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import TypeAlias
 
@@ -55,18 +56,18 @@ class EngineRun:
         State is that of the dump, or of this run's last frame where the dump lacks it,
         and is reset where a scene begins.
         """
-        own = [each for each in session.recurrent.values() if each not in self.dump[0]]
-        asked = list(dict.fromkeys([*names, *own]))
+        own = [name for name in session.recurrent.values() if name not in self.dump[0]]
+        computed = list(dict.fromkeys([*names, *own]))
         state = dict[str, Array]()
         for index in range(len(self)):
             frame = self.frames[index]
             if index == 0 or frame.starts_scene:
                 state = session.first_state(frame.arrays)
             inputs = {**frame.arrays, **state}
-            answers = session.run(inputs, asked)
+            answers = session.run(inputs, computed)
             yield inputs, {name: answers[name] for name in names}
             after = {**answers, **self.dump[index]}
-            # a copy: the session may write its next answers into the same memory
+            # A copy: the session may write its next answers into the same memory
             state = {
                 name: np.array(after[output], DTYPES[session.inputs[name].type])
                 for name, output in session.recurrent.items()
@@ -79,11 +80,11 @@ class EngineRun:
             EvaluationError: an output has another shape, or is not finite.
         """
         for name in self.names:
-            value, right = self.dump[index][name], truth[name]
-            if value.shape != right.shape:
+            value, shape = self.dump[index][name], truth[name].shape
+            if value.shape != shape:
                 raise EvaluationError(
                     f"output {name} is {list(value.shape)} in the dump at frame"
-                    f" {index}, {list(right.shape)} in the graph"
+                    f" {index}, {list(shape)} in the graph"
                 )
             if value.dtype.kind == "f" and not np.isfinite(value).all():
                 kind = "NaN" if np.isnan(value).any() else "infinite"
@@ -134,9 +135,10 @@ def split_losses(
     names = run.names
     movements = {name: OutputTally(name) for name in names}
     compiled, whole = ({name: Tally(name) for name in names} for _ in range(2))
-    known = [] if source is None else [each for each in names if each in source.outputs]
+    known = [] if source is None else [name for name in names if name in source.outputs]
     quantized = {name: Tally(name) for name in known}
     floats = iter(()) if source is None else run.run_graph(source, known)
+    # Float source, graph and engine, frame by frame
     for index, (_, truth) in enumerate(run.run_graph(run.session, names)):
         on_frame(index)
         run.check(index, truth)
@@ -148,24 +150,20 @@ def split_losses(
             compiled[name].add(truth[name], dumped[name], index)
             whole[name].add(right, dumped[name], index)
             movements[name].add(right, dumped[name])
-    moved = {name: movement.result(alive) for name, movement in movements.items()}
-    return tuple(
-        OutputLoss(
-            name,
-            quantized[name].sqnr_db if name in quantized else None,
-            compiled[name].sqnr_db,
-            whole[name].sqnr_db,
-            moved[name].moves,
-            str(moved[name]) if moved[name].is_dead else "",
-        )
-        for name in names
-    )
+    losses = list[OutputLoss]()
+    for name in names:
+        moved = movements[name].result(alive)
+        dead = str(moved) if moved.is_dead else ""
+        own = quantized[name].sqnr_db if name in quantized else None
+        parts = own, compiled[name].sqnr_db, whole[name].sqnr_db
+        losses.append(OutputLoss(name, *parts, moved.moves, dead))
+    return tuple(losses)
 
 
 # SQNR of two float32 values that differ by rounding alone: two runtimes are 3e-5 to
 # 6e-5 apart on UniAD-tiny (models/README.md)
 ROUNDING_DB = 80.0
-NARROW = (ir.DataType.FLOAT16, ir.DataType.BFLOAT16)
+_QUANTIZERS = ("QuantizeLinear", "DynamicQuantizeLinear")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -201,7 +199,7 @@ class FirstDifference:
     @property
     def first(self) -> BorderValue | None:
         """The first value below the floor, of a graph whose outputs differ."""
-        below = (each for each in self.values if each.sqnr_db < self.floor_db)
+        below = (value for value in self.values if value.sqnr_db < self.floor_db)
         return next(below, None) if self.outputs_differ else None
 
 
@@ -226,8 +224,8 @@ def find_first_difference(
     if not frames:
         raise EvaluationError("no frames to compare on")
     borders = dict.fromkeys([*_border_values(candidate), *_border_values(source)])
-    known = [set(_values_by_name(each)) for each in (source, candidate)]
-    shared = [name for name in borders if name in known[0] & known[1]]
+    known = _values_by_name(source).keys() & _values_by_name(candidate).keys()
+    shared = [name for name in borders if name in known]
     if not shared:
         raise EvaluationError("the graphs share no value at the border of a module")
     feeds = _last_feeds(source, frames, provider)
@@ -236,18 +234,15 @@ def find_first_difference(
     # A few casts to float16 in a float32 graph are what is looked for; not so where a
     # graph holds int8, or narrow floats more than others.
     floor_db = ROUNDING_DB
-    for each in (source, candidate):
-        wide = narrow = 0
-        for node in nodes_of(each):
-            if node.op_type in ("QuantizeLinear", "DynamicQuantizeLinear"):
-                floor_db = SQNR_FLOOR_DB
-            narrow += sum(value.dtype in NARROW for value in node.outputs)
-            wide += sum(value.dtype == ir.DataType.FLOAT for value in node.outputs)
-        if narrow > wide:
+    for model in (source, candidate):
+        nodes = list(nodes_of(model))
+        kinds = Counter(value.dtype for node in nodes for value in node.outputs)
+        narrow = kinds[ir.DataType.FLOAT16] + kinds[ir.DataType.BFLOAT16]
+        int8 = any(node.op_type in _QUANTIZERS for node in nodes)
+        if int8 or narrow > kinds[ir.DataType.FLOAT]:
             floor_db = SQNR_FLOOR_DB
-    return _compare_values(
-        candidate, expected, values, floor_db, len(borders) - len(shared)
-    )
+    unknown = len(borders) - len(shared)
+    return _compare_values(candidate, expected, values, floor_db, unknown)
 
 
 def first_difference_of_engine(
@@ -281,19 +276,14 @@ def _compare_values(
         tally.add(expected[name], values[name], 0)
         return tally.sqnr_db
 
+    compared = list[BorderValue]()
+    for name, node in _values_by_name(model).items():
+        if name in expected:
+            called = f"{node.name or 'a node'} ({node.op_type})"
+            compared.append(BorderValue(module_of(node), name, called, sqnr(name)))
     outputs = {value.name for value in model.graph.outputs}
-    compared = tuple(
-        BorderValue(
-            module_of(node),
-            name,
-            f"{node.name or 'a node'} ({node.op_type})",
-            sqnr(name),
-        )
-        for name, node in _values_by_name(model).items()
-        if name in expected
-    )
-    differ = any(each.sqnr_db < floor_db for each in compared if each.value in outputs)
-    return FirstDifference(compared, floor_db, unknown, differ)
+    differ = any(v.sqnr_db < floor_db for v in compared if v.value in outputs)
+    return FirstDifference(tuple(compared), floor_db, unknown, differ)
 
 
 def _border_values(model: ir.Model) -> Iterator[str]:
@@ -313,8 +303,8 @@ def _border_values(model: ir.Model) -> Iterator[str]:
 
 def _values_by_name(model: ir.Model) -> dict[str, ir.Node]:
     """Map every named value to its node, in order."""
-    made = ((each.name, node) for node in model.graph for each in node.outputs)
-    return {name: node for name, node in made if name}
+    pairs = ((value.name, node) for node in model.graph for value in node.outputs)
+    return {name: node for name, node in pairs if name}
 
 
 def _last_feeds(
@@ -339,8 +329,8 @@ def _compute(
     """Run a graph without optimization, and return values anywhere in it."""
     probed, wanted = model.clone(), list(names)
     graph.infer_shapes(probed)
-    made = {value.name: value for node in probed.graph for value in node.outputs}
-    missing = [made[name] for name in wanted if not made[name].is_graph_output()]
+    values = {value.name: value for node in probed.graph for value in node.outputs}
+    missing = [values[name] for name in wanted if not values[name].is_graph_output()]
     probed.graph.outputs.extend(missing)
     session = Session(probed, optimize=False, release=True, provider=provider)
     return detached(session.run(feeds, wanted))

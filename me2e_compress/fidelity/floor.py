@@ -55,24 +55,25 @@ class Floor:
         """
         below = list[Shortfall]()
         matched = {} if agents is None else agents.sqnr_db
-        for each in fidelity.outputs:
+        for output in fidelity.outputs:
             # The noise over what is allowed: above 1 is too much
             part = ""
-            if fidelity.plan is not None and each.name == fidelity.plan_output:
+            if fidelity.plan is not None and output.name == fidelity.plan_output:
                 value, unit = fidelity.plan.mean_m, "m"
                 excess = value / self.plan_m
             else:
-                value, unit = matched.get(each.name, each.sqnr_db), "dB"
-                if each.name in matched:
+                value, unit = matched.get(output.name, output.sqnr_db), "dB"
+                if output.name in matched:
                     part = " of matched agents"
-                elif each.small_db is not None and each.small_db < value:
-                    value, part = each.small_db, each.small
-                elif each.least_db < self.sqnr_db <= value:
-                    value, part = each.least_db, " in its noisiest frame"
+                elif output.small_db is not None and output.small_db < value:
+                    value, part = output.small_db, output.small
+                elif output.least_db < self.sqnr_db <= value:
+                    value, part = output.least_db, " in its noisiest frame"
+                # 10^(dB / 20): the ratio of amplitudes
                 excess = min(float(10 ** ((self.sqnr_db - value) / 20)), LARGEST_EXCESS)
-            if excess > 1 and not each.discrete:
-                below.append(Shortfall(each.name, value, unit, excess, part))
-        return tuple(sorted(below, key=lambda each: -each.excess))
+            if excess > 1 and not output.discrete:
+                below.append(Shortfall(output.name, value, unit, excess, part))
+        return tuple(sorted(below, key=lambda shortfall: -shortfall.excess))
 
     def __str__(self) -> str:
         return f"{self.sqnr_db:g} dB, {self.plan_m:g} m of plan"
