@@ -38,20 +38,6 @@ from me2e_compress.runtime.providers import CPU, Provider
 from me2e_compress.runtime.session import Session
 from me2e_compress.targets import Target
 
-__all__ = [
-    "Budget",
-    "Candidate",
-    "Int8Choice",
-    "ModuleSensitivity",
-    "Score",
-    "Sensitivity",
-    "Trials",
-    "advise",
-    "analyse",
-    "search",
-    "write_recipe",
-]
-
 
 @dataclasses.dataclass(frozen=True)
 class Int8Choice:
@@ -62,9 +48,8 @@ class Int8Choice:
 
     def overrides(self) -> Overrides:
         """Build the overrides that keep the nodes in float."""
-        return Overrides(
-            override=tuple(keep_float(name, "sensitive") for name in self.floats)
-        )
+        pins = (keep_float(name, "sensitive") for name in self.floats)
+        return Overrides(override=tuple(pins))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -88,9 +73,7 @@ class Score:
     @property
     def worst(self) -> OutputFidelity:
         """The noisiest output; whole numbers count where there is nothing else."""
-        return min(
-            self.fidelity.outputs, key=lambda each: (each.discrete, each.sqnr_db)
-        )
+        return min(self.fidelity.outputs, key=lambda o: (o.discrete, o.sqnr_db))
 
     @property
     def unit(self) -> str:
@@ -99,11 +82,11 @@ class Score:
 
 
 class Trials:
-    """Makes int8 variants of a model and judges them, sets by agents; each choice once.
+    """Makes int8 variants of a model and scores them, sets by agents; each choice once.
 
     ``model`` is the float graph after the exact passes, shapes inferred; fidelity is
-    judged on the graph as ``target`` writes it; ``ranges`` cover every tensor that any
-    variant needs; ``frames`` are read once for every variant. ``reference`` holds the
+    that of the graph as ``target`` writes it; ``ranges`` cover every tensor that any
+    variant needs; ``frames`` are read once for every variant. ``reference`` has the
     float model's answers, ``done`` counts the variants that were built and run.
     """
 
@@ -118,14 +101,9 @@ class Trials:
         *,
         provider: Provider = CPU,
     ) -> None:
-        self.model = model
-        self.modules = modules
-        self.done = 0
-        self._rules = rules
-        self._target = target
-        self.ranges = ranges
+        self.model, self.modules, self.ranges, self.done = model, modules, ranges, 0
+        self._rules, self._target = rules, target
         self._session = partial(Session, release=True, provider=provider)
-        # every choice is judged once
         self._known: dict[Int8Choice, Score] = {}
         self.reference = Reference.of(self._session(model), frames)
 
@@ -144,18 +122,18 @@ class Trials:
         return self._target.place(self.model, self.plan(choice), self.ranges)
 
     def score(self, choice: Int8Choice) -> Score:
-        """Build a choice, run it and judge it; each choice is run once."""
+        """Build a choice, run it and compare it with the float model, once."""
         if choice not in self._known:
             variant = self.variant(choice)
             session, float_session = self._session(variant), self.reference.session
             sets = SetTally.of(float_session, session)
             watching = () if sets is None else (sets.add,)
             fidelity = self.reference.compare(session, watching)
-            # agents in another order are no noise: those that match are compared
+            # Agents in another order are no noise: those that match are compared
             matched = {} if sets is None else sets.result().sqnr_db
             outputs = tuple(
-                dataclasses.replace(e, sqnr_db=matched.get(e.name, e.sqnr_db))
-                for e in fidelity.outputs
+                dataclasses.replace(o, sqnr_db=matched.get(o.name, o.sqnr_db))
+                for o in fidelity.outputs
             )
             fidelity = dataclasses.replace(fidelity, outputs=outputs)
             self._known[choice] = Score(fidelity, graph.size(variant).weight_bytes)
@@ -210,7 +188,7 @@ def analyse(
     ``progress(steps done, steps, module)``.
     """
     active = [name for name in modules if int8_names(trials, name)]
-    # every module alone
+    # Every module alone
     findings = []
     for done, module in enumerate(active):
         if progress:
@@ -218,15 +196,15 @@ def analyse(
         score = trials.score(Int8Choice((module,)))
         nodes = len(int8_names(trials, module))
         findings.append(ModuleSensitivity(module, nodes, score))
-    findings.sort(key=lambda each: -each.score.loss)
-    # halves of the worst
+    findings.sort(key=lambda finding: -finding.score.loss)
+    # Halves of the worst
     worst = findings[0] if findings else None
     if worst is not None and worst.score.loss > 0 and worst.nodes > 1:
         if progress:
             progress(len(active), len(active) + 1, f"nodes of {worst.module}")
         blamed = _costly_nodes(trials, worst.module, worst.score.loss, node_trials)
         findings[0] = dataclasses.replace(worst, blamed=blamed)
-    # all modules together
+    # All modules together
     together = trials.score(Int8Choice(tuple(active)))
     return Sensitivity(tuple(findings), together, trials.done)
 
@@ -237,7 +215,7 @@ def int8_names(trials: Trials, module: str) -> tuple[str, ...]:
     Residual Adds are left out: they follow their convolution.
     """
     chosen = trials.plan(Int8Choice((module,))).chosen
-    return tuple(dict.fromkeys(each.node for each in chosen if each.rule != RESIDUAL))
+    return tuple(dict.fromkeys(d.node for d in chosen if d.rule != RESIDUAL))
 
 
 def _costly_nodes(
@@ -245,20 +223,20 @@ def _costly_nodes(
 ) -> tuple[tuple[str, float], ...]:
     """Halve a module's nodes until those that cost much stand alone, worst first.
 
-    The costliest part is halved next, each half int8 with the rest of the module in
-    float; parts that cost less than `BLAME` of the module are left. Two costly nodes in
-    one half are found one by one, nodes that cost little each never. At most ``most``
-    variants are run.
+    The costliest part is halved next, either half int8 with the rest of the module in
+    float; parts that cost less than `BLAME_SHARE` of the module are left. Two costly
+    nodes in one half are found one by one, nodes that cost little never. At most
+    ``most`` variants are run.
     """
     names = int8_names(trials, module)
     parts, blamed = [(loss, names)], list[tuple[str, float]]()
     while parts:
-        parts.sort(key=lambda each: each[0])
+        parts.sort(key=lambda part: part[0])  # the costliest last
         own, part = parts.pop()
         if len(part) == 1:
             blamed.append((part[0], own))
             continue
-        if most < 2:  # no two halves more
+        if most < 2:  # too few trials for two halves
             break
         most -= 2
         middle = len(part) // 2
@@ -267,7 +245,7 @@ def _costly_nodes(
             cost = trials.score(Int8Choice((module,), rest)).loss
             if cost >= BLAME_SHARE * loss:
                 parts.append((cost, half))
-    return tuple(sorted(blamed, key=lambda each: -each[1]))
+    return tuple(sorted(blamed, key=lambda pair: -pair[1]))
 
 
 # Choose what stays float, and write the choice as a recipe.
@@ -278,24 +256,24 @@ def advise(trials: Trials, sensitivity: Sensitivity, limit: float) -> Int8Choice
 
     It starts with all modules in int8. Until the measured loss is within the limit, the
     costliest module first gives up the blamed nodes, the worst first, then all of its
-    nodes. Then each that was given up, the last first, returns to int8 if the loss
-    stays within the limit: errors may cancel, or one costly node hide another.
-    The choice has no module if nothing keeps the limit.
+    nodes. Then those, the last first, return to int8 if the loss stays within the
+    limit: errors may cancel, or one costly node hide another. The choice has no module
+    if nothing keeps the limit.
     """
 
     def fits(sacrifices: Sequence[_Sacrifice]) -> bool:
         choice = _choice_without(trials, sensitivity, sacrifices)
         return not choice.modules or trials.score(choice).loss <= limit
 
-    # give up nodes and modules until the limit is kept
+    # Give up nodes and modules until the loss is within the limit
     order, sacrifices = list[_Sacrifice](), list[_Sacrifice]()
-    for each in sensitivity.findings:
-        name, own = each.module, each.score.loss
-        order += [_Sacrifice(name, (node,), loss) for node, loss in each.blamed]
+    for finding in sensitivity.findings:
+        name, own = finding.module, finding.score.loss
+        order += [_Sacrifice(name, (node,), loss) for node, loss in finding.blamed]
         order.append(_Sacrifice(name, None, own))
     while not fits(sacrifices):
         sacrifices.append(order[len(sacrifices)])
-    # take back what turns out not to matter
+    # Take back what turns out not to matter
     for last in reversed(sacrifices):
         rest = [other for other in sacrifices if other is not last]
         if last.loss <= limit and fits(rest):
@@ -316,18 +294,15 @@ def _choice_without(
     trials: Trials, sensitivity: Sensitivity, sacrifices: Sequence[_Sacrifice]
 ) -> Int8Choice:
     """Return the choice of all modules but what was given up."""
-    dropped = {each.module for each in sacrifices if each.nodes is None}
+    dropped = {s.module for s in sacrifices if s.nodes is None}
     names = dict[str, list[str]]()
-    for each in sacrifices:
-        if each.module not in dropped:
-            names.setdefault(each.module, []).extend(each.nodes or ())
-    # A module that gave up each of its nodes is given up.
-    dropped |= {
-        each.module
-        for each in sensitivity.findings
-        if len(set(names.get(each.module, ()))) >= each.nodes
-    }
-    chosen = {each.module for each in sensitivity.findings} - dropped
+    for sacrifice in sacrifices:
+        if sacrifice.module not in dropped:
+            names.setdefault(sacrifice.module, []).extend(sacrifice.nodes or ())
+    # A module that gave up each of its nodes is given up
+    nodes = {finding.module: finding.nodes for finding in sensitivity.findings}
+    dropped |= {m for m in nodes if len(set(names.get(m, ()))) >= nodes[m]}
+    chosen = nodes.keys() - dropped
     floats = [name for module in names if module in chosen for name in names[module]]
     modules = (name for name in trials.modules.names() if name in chosen)
     return Int8Choice(tuple(modules), tuple(floats))
@@ -341,7 +316,7 @@ def write_recipe(
     ``passes`` are the names of those before int8. Returns the file of overrides, None
     if none is needed.
     """
-    # the exact passes, then int8
+    # The exact passes, then int8
     lines = [f"[[pass]]\nname = {toml_string(name)}\n" for name in passes]
     overrides = path.with_name(path.stem + ".overrides.toml")
     if choice.modules:
@@ -355,7 +330,7 @@ def write_recipe(
         if choice.floats:
             options.append(f"overrides = {toml_string(overrides.name)}")
         lines.append("\n".join(options) + "\n")
-    # recipe and overrides together, or neither
+    # Recipe and overrides together, or neither
     with atomic.all_or_none():
         write_bytes(path, (atomic.IN_TOML + "\n".join(lines)).encode())
         if not choice.floats or not choice.modules:
@@ -425,14 +400,14 @@ def search(
     """
 
     def costs_of(variant: ir.Model) -> tuple[float, ...]:
-        return tuple(each.cost(variant) for each in budgets)
+        return tuple(budget.cost(variant) for budget in budgets)
 
     active = [name for name in modules if int8_names(trials, name)]
     if len(active) > MOST_MODULES:
         raise EvaluationError(
             f"{len(active)} modules are more than {MOST_MODULES}: use a coarser map"
         )
-    # 1. every module alone: what it loses, what it saves
+    # 1. Every module alone: what it loses, what it saves
     float_costs = costs_of(trials.model)
     losses, savings = dict[str, float](), dict[str, tuple[float, ...]]()
     for done, name in enumerate(active):
@@ -441,7 +416,8 @@ def search(
         losses[name] = trials.score(Int8Choice((name,))).loss
         alone = costs_of(trials.variant(Int8Choice((name,))))
         savings[name] = tuple(a - b for a, b in zip(float_costs, alone, strict=True))
-    # 2. every assignment, predicted from that; the least loss first, then the cheapest
+    # 2. Every assignment, predicted from that: losses add as independent errors,
+    # savings add up; the least loss first, then the cheapest
     ranked = [
         Candidate(
             subset,
@@ -454,10 +430,10 @@ def search(
         for size in range(len(active) + 1)
         for subset in itertools.combinations(active, size)
     ]
-    ranked.sort(key=lambda each: (each.loss, each.costs, each.modules))
-    # 3. the best that should fit, and the cheapest, measured until one does
-    fitting = [each for each in ranked if _largest_share(budgets, each.costs) <= 1]
-    cheapest = min(ranked, key=lambda each: _largest_share(budgets, each.costs))
+    ranked.sort(key=lambda c: (c.loss, c.costs, c.modules))
+    # 3. The best that should fit, and the cheapest, measured until one does
+    fitting = [c for c in ranked if _largest_share(budgets, c.costs) <= 1]
+    cheapest = min(ranked, key=lambda c: _largest_share(budgets, c.costs))
     tried: list[Candidate] = []
     for candidate in dict.fromkeys((*fitting[: most_tried - 1], cheapest)):
         if not fitting:
@@ -468,8 +444,8 @@ def search(
         tried.append(dataclasses.replace(candidate, score=score, measured_costs=costs))
         if _largest_share(budgets, costs) <= 1:
             return tuple(tried)
-    least = [each.costs for each in ranked]
-    least += [each.measured_costs for each in tried if each.measured_costs]
+    least = [c.costs for c in ranked]
+    least += [c.measured_costs for c in tried if c.measured_costs]
     raise EvaluationError(budget_message(budgets, float_costs, least))
 
 
@@ -480,13 +456,11 @@ def budget_message(
 
     def amounts(numbers: Iterable[float]) -> str:
         pairs = zip(numbers, budgets, strict=True)
-        return " and ".join(
-            f"{format_significant(number, 6)} {budget.unit}" for number, budget in pairs
-        )
+        return " and ".join(f"{format_significant(n, 6)} {b.unit}" for n, b in pairs)
 
     ending = "; each alone" if len(budgets) > 1 else ""
     return (
-        f"nothing fits {amounts(each.limit for each in budgets)}: the float model costs"
+        f"nothing fits {amounts(b.limit for b in budgets)}: the float model costs"
         f" {amounts(whole)}, the least found is about"
         f" {amounts(map(min, zip(*costs, strict=True)))}{ending}"
     )
