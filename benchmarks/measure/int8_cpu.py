@@ -45,7 +45,7 @@ from me2e_compress.passes.convert_float32 import ConvertFloat32
 from me2e_compress.passes.lower_int8 import LowerInt8
 from me2e_compress.passes.quantize_int8 import QuantizeInt8
 from me2e_compress.runtime.session import Session
-from me2e_compress.targets.onnxruntime import int8_layers
+from me2e_compress.targets.onnxruntime.convert import int8_layers
 
 FLOAT = "float"
 PEERS = {

@@ -61,7 +61,7 @@ from me2e_compress import graph
 from me2e_compress.manager.report import versions
 from me2e_compress.runtime.profile import processor
 from me2e_compress.runtime.session import run_once
-from me2e_compress.targets.onnxruntime import int8_layers
+from me2e_compress.targets.onnxruntime.convert import int8_layers
 
 
 @dataclasses.dataclass

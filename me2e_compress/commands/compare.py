@@ -46,7 +46,7 @@ from me2e_compress.graph.modules.assign import assign, map_of
 from me2e_compress.graph.modules.module_map import ModuleMap
 from me2e_compress.runtime.frames import Array, Frame
 from me2e_compress.runtime.session import Session
-from me2e_compress.targets.onnxruntime import slow_here
+from me2e_compress.targets.onnxruntime.convert import slow_here
 
 
 @dataclasses.dataclass(frozen=True, repr=False)

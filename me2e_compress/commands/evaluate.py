@@ -30,7 +30,7 @@ from me2e_compress.runtime.providers import CPU
 from me2e_compress.runtime.session import Session
 from me2e_compress.shipped.drivers import SHIPPED
 from me2e_compress.simulator.routes import Route, pick_routes
-from me2e_compress.targets.onnxruntime import slow_here
+from me2e_compress.targets.onnxruntime.convert import slow_here
 
 _FLAGS = {"module_map": "map"}
 """Command-line names of options that differ from their Python names."""

@@ -27,7 +27,7 @@ from me2e_compress.runtime.latency_trace import (
 )
 from me2e_compress.runtime.profile import WARM_UP
 from me2e_compress.runtime.profile import profile as measure
-from me2e_compress.targets.onnxruntime import slow_here
+from me2e_compress.targets.onnxruntime.convert import slow_here
 
 _SHOWN = 12
 """Number of operators in a table."""

@@ -11,7 +11,7 @@ from me2e_compress.runtime.frames import Array, Frame
 from me2e_compress.runtime.providers import CPU, Provider
 from me2e_compress.runtime.runnable import int8_entry
 from me2e_compress.runtime.session import Session, replay
-from me2e_compress.targets.onnxruntime import int8_rewrites
+from me2e_compress.targets.onnxruntime.lint_rules import int8_rewrites
 from me2e_compress.targets.quantized import describe_quantized
 
 NOISIER_DB = 6.0

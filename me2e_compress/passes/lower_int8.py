@@ -12,7 +12,7 @@ from me2e_compress.graph import provenance
 from me2e_compress.passes.base import Context, PassResult
 from me2e_compress.passes.quantizer import Quantizer
 from me2e_compress.quantization.decision import plan_of, stamp_plan
-from me2e_compress.targets import onnxruntime
+from me2e_compress.targets.onnxruntime.convert import convert, int8_layers, unranged
 
 
 @dataclasses.dataclass(frozen=True)
@@ -50,11 +50,11 @@ class LowerInt8(Quantizer):
         missing, ranges = self.ranged_tensors(model, context), None
         if missing:
             ranges = self.read_ranges(model, missing, context, self.ranges)
-        lowered = onnxruntime.convert(model, ranges)
+        lowered = convert(model, ranges)
         provenance.sign(model, lowered, self.name)
         if plan := plan_of(model):
             stamp_plan(lowered, dataclasses.replace(plan, target="onnxruntime"))
-        layers = onnxruntime.int8_layers(lowered)
+        layers = int8_layers(lowered)
         changes = len(layers) or int(graph.digest(lowered) != graph.digest(model))
         notes = (
             f"{plural(len(layers), 'layer')} in int8 for onnxruntime",
@@ -69,4 +69,4 @@ class LowerInt8(Quantizer):
 
     def ranged_tensors(self, model: ir.Model, context: Context) -> tuple[str, ...]:
         """Return the names of the tensors whose range is not in the graph."""
-        return onnxruntime.unranged(model)
+        return unranged(model)

@@ -21,7 +21,8 @@ from me2e_compress.quantization.decision import (
 from me2e_compress.quantization.plan import make_plan
 from me2e_compress.quantization.rules import DEFAULT_RULES, RULE_SETS, RuleSet
 from me2e_compress.quantization.scheme import QuantScheme
-from me2e_compress.targets import DEFAULT_TARGET, TARGETS, Target, onnxruntime
+from me2e_compress.targets import DEFAULT_TARGET, TARGETS, Target
+from me2e_compress.targets.onnxruntime.convert import unranged
 from me2e_compress.targets.quantized import describe_quantized
 
 
@@ -131,7 +132,7 @@ def refuse_quantized(model: ir.Model) -> None:
     if already := describe_quantized(model):
         rewrite = ", or let lower-int8 rewrite this one for onnxruntime"
         try:  # only symmetric pairs of int8 have ranges that it could write down
-            onnxruntime.unranged(model)
+            unranged(model)
         except PreconditionError:
             rewrite = ""
         raise PreconditionError(

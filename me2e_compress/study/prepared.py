@@ -27,7 +27,7 @@ from me2e_compress.metrics.measure import Measure
 from me2e_compress.runtime.providers import CPU, PROVIDERS
 from me2e_compress.study.definition import Study, Variant
 from me2e_compress.study.workspace import Workspace
-from me2e_compress.targets.onnxruntime import slow_here
+from me2e_compress.targets.onnxruntime.convert import slow_here
 from me2e_compress.version import __version__
 
 

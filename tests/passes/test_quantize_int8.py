@@ -27,7 +27,7 @@ from me2e_compress.passes.lower_int8 import LowerInt8
 from me2e_compress.passes.quantize_int8 import QuantizeInt8
 from me2e_compress.quantization.decision import plan_of
 from me2e_compress.runtime.session import Session
-from me2e_compress.targets.onnxruntime import int8_layers, unranged
+from me2e_compress.targets.onnxruntime.convert import int8_layers, unranged
 from me2e_compress.targets.tensorrt import TensorRT
 from me2e_compress.testing import check_pass
 from tests.support.frames import record

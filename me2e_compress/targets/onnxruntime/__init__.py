@@ -6,35 +6,21 @@ from typing import ClassVar
 
 import onnx_ir as ir
 
-from me2e_compress import graph
 from me2e_compress.base.errors import GraphError
 from me2e_compress.calibration.ranges import Ranges
+from me2e_compress.graph.nodes import maker
 from me2e_compress.operators import int8_inputs, int8_op_types
 from me2e_compress.quantization.costs import Costs
 from me2e_compress.quantization.decision import Decision, KeptFloat, QuantPlan
 from me2e_compress.runtime.optimized import optimize, origins, with_unique_names
 from me2e_compress.runtime.providers import CPU, Provider
 from me2e_compress.targets import LintFinding, LintRule, Target, error, warning
-from me2e_compress.targets.onnxruntime.convert import (
-    convert,
-    int8_layers,
-    slow_here,
-    unranged,
-)
+from me2e_compress.targets.onnxruntime.convert import int8_layers
 from me2e_compress.targets.onnxruntime.costs import costs_of
-from me2e_compress.targets.onnxruntime.lint_rules import RULES, int8_rewrites
+from me2e_compress.targets.onnxruntime.lint_rules import RULES
 from me2e_compress.targets.onnxruntime.lower import Draft, lower, symmetric
 from me2e_compress.targets.onnxruntime.region import find_region, objection
 from me2e_compress.targets.weights import weights_of
-
-__all__ = [
-    "OnnxRuntime",
-    "convert",
-    "int8_layers",
-    "int8_rewrites",
-    "slow_here",
-    "unranged",
-]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -45,7 +31,7 @@ class OnnxRuntime(Target):
     opens: ClassVar[bool] = True
 
     def tensors(self, plan: QuantPlan, model: ir.Model) -> tuple[str, ...]:
-        """Return the activations whose range is needed: inputs, outputs of layers."""
+        """List the activations whose range is needed: inputs, outputs of layers."""
         layers, sampling = _int8_of(plan)
         return find_region(model.graph, {*layers, *sampling}).ranged
 
@@ -66,21 +52,21 @@ class OnnxRuntime(Target):
         layers, sampling = _int8_of(plan)
         region = find_region(model.graph, {*layers, *sampling})
         nodes = {str(node.outputs[0].name): node for node in model.graph}
-        kept = list[KeptFloat]()
-        for each in plan.chosen:
-            node = nodes[each.output]
+        floats = list[KeptFloat]()
+        for decision in plan.chosen:
+            node = nodes[decision.output]
             if node in region.layers or node in region.readers or int8_inputs(node):
                 continue
             reason: str | None = "products of two activations are slower in int8"
-            if each.weight is not None:
+            if decision.weight is not None:
                 reason = objection(node)
             elif node.op_type == "Add":
                 reason = (
                     "a sum that no int8 kernel reads, or of which none gives a side"
                 )
             if reason:
-                kept.append(KeptFloat(each.node, each.output, reason))
-        return tuple(kept)
+                floats.append(KeptFloat(decision.node, decision.output, reason))
+        return tuple(floats)
 
     def fused_objection(self, node: ir.Node) -> str | None:
         """Return None: compiled kernels read uint8 directly."""
@@ -110,12 +96,12 @@ class OnnxRuntime(Target):
         known = origins(source, running)
         findings = list[LintFinding]()
         for node in int8_layers(running, _FLOAT_KERNELS):
-            # The layer of a fused node: itself, or the input of its ReLU or bias.
+            # The layer of a fused node: itself, or the input of its ReLU or bias
             layer = known.get(str(node.name), node)
-            maker = graph.producer_of(layer.inputs[0])
-            if maker is not None and layer.op_type not in _FLOAT_KERNELS:
-                layer = maker if maker.op_type in _FLOAT_KERNELS else layer
-            # The readers of its output are often the reason.
+            producer = maker(layer.inputs[0], *_FLOAT_KERNELS)
+            if producer is not None and layer.op_type not in _FLOAT_KERNELS:
+                layer = producer
+            # The readers of its output are often the reason
             readers = dict.fromkeys(n.op_type for n in layer.outputs[0].consumers())
             read = f"; {' and '.join(readers)} reads it" if readers else ""
             message = f"reads int8, and runs in float, as {node.op_type}{read}"
@@ -139,5 +125,5 @@ def _int8_of(plan: QuantPlan) -> tuple[dict[str, Decision], dict[str, Decision]]
     0.55 to 0.9 times the speed of float.
     """
     names = int8_op_types()
-    layers = {each.output: each for each in plan.chosen if each.weight is not None}
-    return layers, {each.output: each for each in plan.chosen if each.op in names}
+    layers = {d.output: d for d in plan.chosen if d.weight is not None}
+    return layers, {d.output: d for d in plan.chosen if d.op in names}

@@ -103,8 +103,14 @@ def _draft_of_qdq(model: ir.Model) -> Draft:
     """
     copy = model.clone()
     graph.infer_shapes(copy)
-    # Find the pairs of activations, and their ranges.
-    pairs = {node: value for node in copy.graph if (value := _activation(node))}
+    # Find the pairs of activations, and their ranges
+    pairs = dict[ir.Node, ir.Value]()
+    for node in copy.graph:
+        is_second = node.op_type == DEQUANTIZE
+        quantize = maker(node.inputs[0], QUANTIZE) if is_second else None
+        value = None if quantize is None else quantize.inputs[0]
+        if value is not None and array_of(value) is None:
+            pairs[node] = value
     if not pairs:
         raise PreconditionError(
             "the graph has no quantized activation; lower a graph with int8 pairs, or"
@@ -114,17 +120,12 @@ def _draft_of_qdq(model: ir.Model) -> Draft:
     for node, value in pairs.items():
         step = _step_of(node)
         if step.size != 1:
-            raise PreconditionError(
-                f"{node.name} has {step.size} scales: onnxruntime's kernels take one"
-                " for an activation"
-            )
+            message = "onnxruntime's kernels take one for an activation"
+            raise PreconditionError(f"{node.name} has {step.size} scales: {message}")
         reach[value] = float(step.reshape(())) * QUANT_MAX
     # Read biases and weights before the pairs go.
-    layers = [
-        node
-        for node in copy.graph
-        if node.op_type in LAYERS and producer_of(node.inputs[0]) in pairs
-    ]
+    candidates = [node for node in copy.graph if node.op_type in LAYERS]
+    layers = [node for node in candidates if producer_of(node.inputs[0]) in pairs]
     for node in layers:
         bias = bias_numbers(producer_of(graph.bias_of(node)))
         if bias is not None:
@@ -142,20 +143,9 @@ def _draft_of_qdq(model: ir.Model) -> Draft:
         value = node.inputs[0] if maker(node.outputs[0], *LAYOUT_OPERATORS) else None
         if value is not None and node.outputs[0] in reach:
             reach.setdefault(value, reach[node.outputs[0]])
-    return Draft(
-        copy,
-        {str(n.outputs[0].name): w for n, w in weights.items() if w is not None},
-        {str(value.name): (-most, most) for value, most in reach.items()},
-    )
-
-
-def _activation(node: ir.Node) -> ir.Value | None:
-    """Return the tensor that a DequantizeLinear stands for, unless it is constant."""
-    quantize = producer_of(node.inputs[0]) if node.op_type == DEQUANTIZE else None
-    if quantize is None or quantize.op_type != QUANTIZE:
-        return None
-    value = quantize.inputs[0]
-    return value if graph.array_of(value) is None else None
+    by_name = {str(n.outputs[0].name): w for n, w in weights.items() if w is not None}
+    ranges = {str(value.name): (-most, most) for value, most in reach.items()}
+    return Draft(copy, by_name, ranges)
 
 
 def _step_of(node: ir.Node) -> Floats:
@@ -168,16 +158,13 @@ def _step_of(node: ir.Node) -> Floats:
         kind = "computed" if scale is None else scale.dtype
         way = ": convert-float32 makes it so" if kind == np.float16 else ""
         raise PreconditionError(f"{name} has a {kind} scale, expected float32{way}")
-    if zero is None or zero.dtype != np.int8:
-        kind = "uint8" if zero is None else zero.dtype
+    kind = "uint8" if zero is None else zero.dtype
+    grid = "" if kind == np.int8 else f"quantizes to {kind}"
+    if zero is not None and not grid and zero.any():
+        grid = f"has zero point {int(zero.flat[np.flatnonzero(zero)[0]])}"
+    if grid:
         raise PreconditionError(
-            f"{name} quantizes to {kind}: only symmetric int8, as TensorRT takes it,"
-            " can be lowered"
-        )
-    if zero.any():
-        raise PreconditionError(
-            f"{name} has zero point {int(zero.flat[np.flatnonzero(zero)[0]])}: only"
-            " symmetric int8, as TensorRT takes it, can be lowered"
+            f"{name} {grid}: only symmetric int8, as TensorRT takes it, can be lowered"
         )
     return scale.astype(np.float32)
 
@@ -289,24 +276,24 @@ def _is_fast(layer: ir.Node) -> bool:
     left, right = (dequantizer_of(value) for value in layer.inputs[:2])
     if layer.op_type == "ConvTranspose" or left is None:
         return False
-    # sessions take a pair in that is of uint8, or of int8 with a zero point
+    # Sessions take a pair in that is of uint8, or of int8 with a zero point
     kind = stored_type(left)
     if kind not in _LEAST or (kind != ir.DataType.UINT8 and len(left.inputs) <= 2):
         return False
-    # products of two activations, as an attention's, take 1.1 to 1.8 of float's time
+    # Products of two activations, as an attention's, take 1.1 to 1.8 of float's time
     quantize = None if right is None else maker(right.inputs[0], QUANTIZE)
     if quantize is not None and array_of(quantize.inputs[0]) is None:
         return False
-    # a MatMul and its bias become one Gemm before pairs are looked for
+    # A MatMul and its bias become one Gemm before pairs are looked for
     merged, readers = False, list(end.consumers())
-    if layer.op_type == "MatMul" and [each.op_type for each in readers] == ["Add"]:
+    if layer.op_type == "MatMul" and [r.op_type for r in readers] == ["Add"]:
         merged = any(array_of(value) is not None for value in readers[0].inputs)
         end = readers[0].outputs[0] if merged else end
     ends = _ends(end, takes_relu=not merged)
-    pairs = [each for each in ends if each.op_type == QUANTIZE]
+    pairs = [node for node in ends if node.op_type == QUANTIZE]
     if ends and len(pairs) == len(ends):
         return True
-    # a product may answer in float, unless a ReLU or a pair was to be taken in
+    # A product may write float, unless a ReLU or a pair was to be taken in
     biased = merged or (bias is not None and not is_dequantized(bias))
     return layer.op_type not in CONVOLUTIONS and not biased and not pairs
 

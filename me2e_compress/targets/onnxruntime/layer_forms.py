@@ -10,7 +10,6 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
-import numpy.typing as npt
 import onnx_ir as ir
 
 from me2e_compress.base.errors import PreconditionError
@@ -21,7 +20,6 @@ from me2e_compress.operators.call import Size
 from me2e_compress.targets.onnxruntime.region import end_of, reads_one_pixel
 from me2e_compress.targets.quantized import QUANTIZE, Writer
 from me2e_compress.targets.weights import (
-    Floats,
     QuantizedWeight,
     bias_by_channel,
     biased_end,
@@ -49,10 +47,16 @@ def write_layer(
 
     ``step`` is the scale of the uint8 tensor that the layer reads.
     """
-    bias = bias_by_channel(node, len(weight.scales))
-    integers = None
+    # Round the bias to int32 in units of step * scale: a channel whose weights are so
+    # small that its bias does not fit gets a coarser scale, and its products are then
+    # below the bias's own rounding
+    bias, integers = bias_by_channel(node, len(weight.scales)), None
     if bias is not None:
-        weight, integers = with_bias(weight, bias, step)
+        roomy = with_room(weight, least_scales(bias, step))
+        if roomy is not weight:
+            weight = dataclasses.replace(roomy, name=f"{weight.name}_coarse")
+        rounded = np.rint(bias / (weight.scales.astype(np.float64) * step))
+        integers = rounded.astype(np.int32)
     # Does a QuantizeLinear alone read it, behind bias and ReLU?
     left = node.inputs[0]
     reader = sole_reader(end_of(_last_of(node)))
@@ -88,21 +92,6 @@ def write_layer(
         node.replace_input_with(2, fresh)
 
 
-def with_bias(
-    weight: QuantizedWeight, bias: Floats, step: np.float32
-) -> tuple[QuantizedWeight, npt.NDArray[np.int32]]:
-    """Round a bias to int32 in units of ``step * weight.scales``.
-
-    If a channel's weights are so small that its bias does not fit, the channel gets a
-    coarser scale: its products are then below the bias's own rounding.
-    """
-    roomy = with_room(weight, least_scales(bias, step))
-    if roomy is not weight:
-        weight = dataclasses.replace(roomy, name=f"{weight.name}_coarse")
-    integers = np.rint(bias / (weight.scales.astype(np.float64) * step))
-    return weight, integers.astype(np.int32)
-
-
 def _write_gemm(writer: Writer, product: ir.Node, size: Sequence[int]) -> ir.Node:
     """Replace a MatMul and the Add after it by a Gemm of two dimensions.
 
@@ -118,7 +107,7 @@ def _write_gemm(writer: Writer, product: ir.Node, size: Sequence[int]) -> ir.Nod
         raise PreconditionError(f"{product.name} is not a MatMul with a bias")
     old = addition.outputs[0]
     call = writer.call(addition, [product, addition])
-    # Flatten the leading dimensions, and restore them afterwards.
+    # Flatten the leading dimensions, and restore them afterwards
     ranked = len(left.shape) > 2
     rows = call.reshape(left, [-1, size[0]]) if ranked else left
     gemm = _layer(call, "Gemm", [rows, right, right])
@@ -190,7 +179,7 @@ def _write_convolution(
     assert weight is not None
     dequantize = left.producer()
     assert dequantize is not None
-    integers, *grid = [each for each in dequantize.inputs if each is not None]
+    integers, *grid = [value for value in dequantize.inputs if value is not None]
     old, leading = last.outputs[0], list(left.shape)[:-1]
     columns, depth = size[:2]
     # Every row becomes a pixel, while it is uint8.

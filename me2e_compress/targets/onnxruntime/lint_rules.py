@@ -42,6 +42,7 @@ from me2e_compress.targets import (
     error,
     name_of,
     of_opset,
+    rule_of_nodes,
     valid,
 )
 from me2e_compress.targets.onnxruntime.region import never_negative
@@ -69,23 +70,16 @@ Constants = Mapping[str, Array]
 
 @dataclasses.dataclass(frozen=True)
 class _Layer:
-    """A layer that reads a dequantized activation.
+    """A layer that reads a dequantized activation."""
 
-    Attributes:
-        node: Conv, ConvTranspose, Gemm or MatMul.
-        end: what it makes, behind the Add of a MatMul's bias.
-        pair: the DequantizeLinear that it reads.
-        bias: its third operand, or the other one of that Add.
-    """
-
-    node: ir.Node
-    end: ir.Value
-    pair: ir.Node
-    bias: ir.Value | None
+    node: ir.Node  # Conv, ConvTranspose, Gemm or MatMul
+    end: ir.Value  # its output, behind the Add of a MatMul's bias
+    pair: ir.Node  # the DequantizeLinear that it reads
+    bias: ir.Value | None  # its third operand, or the other one of that Add
 
     @property
     def is_reshaped(self) -> bool:
-        """Whether the rows of a MatMul are flattened first, and its answer is not."""
+        """Whether a MatMul's rows are flattened before the product, and not after."""
         return self.node.op_type == "MatMul" and rank_of(self.node.inputs[0]) != 2
 
     @property
@@ -109,17 +103,18 @@ def int8_rewrites(model: ir.Model) -> Iterator[LintFinding]:
     layers = list(_layers(model))
     constants = _constants(model, layers)
     for layer in layers:
-        for rule, judge in _RULES.items():
-            if message := judge(layer, constants):
+        for rule, explain in _RULES.items():
+            if message := explain(layer, constants):
                 yield LintFinding("wrong", rule, name_of(layer.node), message)
                 break
 
 
 def _layers(model: ir.Model) -> Iterator[_Layer]:
+    """Yield the layers that read a dequantized activation."""
     for node in nodes_of(model):
         if not is_standard(node) or len(node.inputs) < 2 or node.inputs[1] is None:
             continue
-        # The pair may stand before Identities and moves.
+        # The pair may stand before Identities and moves
         value = node.inputs[0]
         while (moved := maker(value, "Identity", *PASSED)) is not None:
             value = moved.inputs[0]
@@ -151,7 +146,7 @@ def _constants(model: ir.Model, layers: list[_Layer]) -> Constants:
         wanted += [layer.bias if scale is None else scale]
     values = [value for value in dict.fromkeys(wanted) if value is not None]
     known = {str(v.name): array for v in values if (array := array_of(v)) is not None}
-    # What nodes compute of constants is folded by onnxruntime, too
+    # onnxruntime folds what nodes compute of constants, too
     constant = constant_values(model)
     names = [str(v.name) for v in values if v in constant and str(v.name) not in known]
     return {**known, **evaluate_constants(model, names)}
@@ -164,6 +159,7 @@ def _scale_of_bias(layer: _Layer) -> ir.Value | None:
 
 
 def _numbers(value: ir.Value | None, constants: Constants) -> Numbers | None:
+    """Return a constant, widened to float64; None if it is not known."""
     array = None if value is None else constants.get(str(value.name))
     return None if array is None else np.asarray(array, np.float64)
 
@@ -193,6 +189,7 @@ def _wrapped(layer: _Layer, constants: Constants) -> str:
     fits = bias.ndim == 1 and steps.size in (1, bias.size)
     if not fits or _quantizer(layer) is None:
         return ""
+    # |bias| / (input step * weight step) must be at most 2^31 - 1
     with np.errstate(divide="ignore", invalid="ignore"):
         counts = np.nan_to_num(np.abs(bias) / np.abs(steps), nan=0.0, posinf=np.inf)
     wrapped = np.flatnonzero(counts > INT32_MAX)
@@ -214,6 +211,7 @@ def _misread(layer: _Layer, constants: Constants) -> str:
         return ""
     if own.size > 1 and 1 < steps.size != own.size:
         return ""
+    # The bias is read as steps, and stored as own: a factor of own / steps
     with np.errstate(divide="ignore", invalid="ignore"):
         ratios = own.reshape(-1) / steps
     if np.all(np.abs(ratios - 1) <= SCALES_APART):
@@ -244,7 +242,7 @@ def _becomes_gemm(layer: _Layer) -> bool:
         return False
     # A quantizer beside other readers hides the product
     readers = [] if layer.is_reshaped else list(layer.end.consumers())
-    if any(each.op_type == QUANTIZE for each in readers):
+    if any(reader.op_type == QUANTIZE for reader in readers):
         return len(readers) == 1 and not layer.end.is_graph_output()
     # So does a clip that one node reads, unless that is a quantizer that clips as far
     clip = sole_reader(layer.end) if readers else None
@@ -303,7 +301,7 @@ def _quantizer(layer: _Layer, folded: tuple[str, ...] = ()) -> ir.Node | None:
     value = layer.end
     moves: tuple[str, ...] = PASSED
     if layer.node.op_type == "Gemm" and layer.bias is None:
-        moves = tuple(each for each in moves if each != "Transpose")  # fused before
+        moves = tuple(op for op in moves if op != "Transpose")  # fused before
     stages = [moves] if layer.is_reshaped else [folded, _CLIPS, moves]
     while len(value.uses()) == 1:
         (reader,) = value.consumers()
@@ -333,23 +331,21 @@ def opset(model: ir.Model) -> Iterator[LintFinding]:
     if not reads(opset):
         reasons.append(f"onnxruntime does not read opset {opset}")
     used = {node.op_type for node in nodes_of(model) if is_standard(node)}
-    for each in sorted(used):
-        if has_operator(each, opset_of(model)) and not has_operator(each, opset):
-            reasons.append(f"onnxruntime has no {each} in opset {opset}")
+    for op_type in sorted(used):
+        if has_operator(op_type, opset_of(model)) and not has_operator(op_type, opset):
+            reasons.append(f"onnxruntime has no {op_type} in opset {opset}")
     if reasons:
         file = f"the file is of opset {opset} and IR version {version}"
         cure = "compress -r exact writes it so that it runs"
         yield error("opset", None, f"{file}: {', '.join(reasons)}; {cure}")
 
 
-def scale_shapes(model: ir.Model) -> Iterator[LintFinding]:
+@rule_of_nodes("scale-shape", "error", pairs_of)
+def scale_shapes(node: ir.Node) -> Iterator[str]:
     """Find scales of a rank that no kernel takes, though the file opens."""
-    for node in pairs_of(model):
-        shape = open_shape(node.inputs[1])
-        blocks = node.attributes.get_int("block_size", 0)
-        if shape and len(shape) > 1 and not blocks:
-            text = f"its scale is {list(shape)}: one number, or a row of one a channel"
-            yield error("scale-shape", node, text)
+    shape = open_shape(node.inputs[1])
+    if shape and len(shape) > 1 and not node.attributes.get_int("block_size", 0):
+        yield f"its scale is {list(shape)}: one number, or a row of one a channel"
 
 
 def operators(model: ir.Model) -> Iterator[LintFinding]:
@@ -359,7 +355,7 @@ def operators(model: ir.Model) -> Iterator[LintFinding]:
         domain = "" if is_standard(node) else node.domain
         if (domain, node.op_type) in known or node.op_identifier() in model.functions:
             continue
-        # Name the pass that helps a fused operator: functions need a domain.
+        # Name the pass that helps a fused operator: functions need a domain
         way = ""
         if find(node) is not None:
             way = ": attach-bodies writes one, expand-operators the body in its place"
@@ -383,40 +379,31 @@ def fuses_pads_wrongly() -> bool:
     return (int(major), int(minor)) < (1, 32)
 
 
-def padded_pools(model: ir.Model) -> Iterator[LintFinding]:
+@rule_of_nodes("padded-pool", "wrong")
+def padded_pools(node: ir.Node) -> Iterator[str]:
     """Find a Pad of zeros before a MaxPool: onnxruntime up to 1.31 computes it wrongly.
 
     Its Pad fusion turns the zeros into the pool's own padding, which is minus infinity;
     inputs that are never negative give the same result. Our own sessions disable it.
     """
-    if not fuses_pads_wrongly():
+    pad = maker(node.inputs[0], "Pad") if node.op_type == "MaxPool" else None
+    if pad is None or not is_standard(pad) or not fuses_pads_wrongly():
         return
-    for node in nodes_of(model):
-        pad = maker(node.inputs[0], "Pad") if node.op_type == "MaxPool" else None
-        if (
-            pad is None
-            or not is_standard(pad)
-            or len(list(pad.outputs[0].consumers())) != 1
-        ):
-            continue
-        # What it fills in is zero, or a constant of zeros.
-        mode = pad.attributes.get("mode")
-        if mode is not None and mode.as_string() != "constant":
-            continue
-        filled, value = input_at(pad, 2), array_of(input_at(pad, 2))
-        if filled is not None and (value is None or value.any()):
-            continue
-        # Without negative values the result is the same.
-        image = pad.inputs[0]
-        if image is None or not never_negative(image):
-            yield LintFinding(
-                "wrong",
-                "padded-pool",
-                name_of(node),
-                f"reads the zeros of Pad {pad.name!r}: the Pad fusion of onnxruntime"
-                " up to 1.31 makes them minus infinity; open it with"
-                " disabled_optimizers=['Pad_Fusion']",
-            )
+    if len(list(pad.outputs[0].consumers())) != 1:
+        return
+    # It must fill in zeros: by default, or by a constant
+    constant = pad.attributes.get_string("mode", "constant") == "constant"
+    filling, value = input_at(pad, 2), array_of(input_at(pad, 2))
+    if not constant or (filling is not None and (value is None or value.any())):
+        return
+    # Without negative values the result is the same
+    image = pad.inputs[0]
+    if image is None or not never_negative(image):
+        yield (
+            f"reads the zeros of Pad {pad.name!r}: the Pad fusion of onnxruntime up to"
+            " 1.31 makes them minus infinity; open it with"
+            " disabled_optimizers=['Pad_Fusion']"
+        )
 
 
 RULES: tuple[LintRule, ...] = (

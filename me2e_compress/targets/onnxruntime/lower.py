@@ -42,20 +42,12 @@ PACKED = 4  # channels that onnxruntime's kernel reads at once
 
 @dataclasses.dataclass(frozen=True)
 class Blocks:
-    """How a convolution reads blocks of pixels, along height and width.
+    """How a convolution reads blocks of pixels, along height and width."""
 
-    Attributes:
-        size: pixels along a side of a block.
-        zeros: rows and columns of the new filter before the old one.
-        covered: blocks that the new filter covers.
-        pads: blocks of padding before and behind the image, in the order of ONNX:
-            before height and width, then behind.
-    """
-
-    size: int
-    zeros: tuple[int, int]
-    covered: tuple[int, int]
-    pads: tuple[int, int, int, int]
+    size: int  # pixels along a side of a block
+    zeros: tuple[int, int]  # rows and columns of the new filter before the old one
+    covered: tuple[int, int]  # blocks that the new filter covers
+    pads: tuple[int, int, int, int]  # blocks around the image, in the order of ONNX
 
 
 def blocks_of(node: ir.Node) -> Blocks | None:
@@ -84,7 +76,8 @@ def blocks_of(node: ir.Node) -> Blocks | None:
         or options.get_string("auto_pad", "NOTSET") != "NOTSET"
     ):
         return None
-    # Along each axis: zeros, and in blocks what is covered and padded.
+    # Along each axis: zeros, and in blocks what is covered and padded. The filter
+    # begins `zeros` pixels into a block, so that before + zeros are whole blocks
     sides = []
     axes = zip(lengths, weight[2:], pads[:2], pads[2:], strict=True)
     for length, kernel, before, behind in axes:
@@ -105,31 +98,27 @@ def filter_of_blocks(weight: QuantizedWeight, cut: Blocks) -> QuantizedWeight:
     whole = np.zeros((outputs, channels, covered[0] * size, covered[1] * size), np.int8)
     top, left = cut.zeros
     whole[:, :, top : top + high, left : left + wide] = weight.integers
-    # A block's pixels come first among the channels, the image's channels last.
+    # A block's pixels come first among the channels, the image's channels last
     split = whole.reshape(outputs, channels, covered[0], size, covered[1], size)
-    integers = split.transpose(0, 3, 5, 1, 2, 4).reshape(outputs, -1, *covered)
-    name = f"{weight.name}_blocks"
-    return dataclasses.replace(
-        weight, name=name, integers=np.ascontiguousarray(integers)
-    )
+    blocks = split.transpose(0, 3, 5, 1, 2, 4).reshape(outputs, -1, *covered)
+    integers, name = np.ascontiguousarray(blocks), f"{weight.name}_blocks"
+    return dataclasses.replace(weight, name=name, integers=integers)
 
 
 def read_blocks(writer: Writer, node: ir.Node, cut: Blocks) -> ir.Value:
     """Let a convolution read blocks, and return them; its filter is still the old."""
-    image = node.inputs[0]
+    image, size = node.inputs[0], cut.size
     assert image is not None
     assert image.shape is not None
-    name, size = f"{image.name}_blocks", cut.size
+    name = f"{image.name}_blocks"
     made = writer.node("SpaceToDepth", [image], name, [node], {"blocksize": size})
     blocks = made.outputs[0]
-    batch, channels, high, wide = image.shape
-    known = [int(str(each)) for each in (channels, high, wide)]
-    blocks.shape = ir.Shape(
-        [batch, known[0] * size**2, known[1] // size, known[2] // size]
-    )
+    batch, *dims = image.shape
+    channels, high, wide = (int(str(dim)) for dim in dims)
+    blocks.shape = ir.Shape([batch, channels * size**2, high // size, wide // size])
     blocks.type = image.type
     writer.graph.insert_before(node, made)
-    # The stride is in the blocks now.
+    # The stride is in the blocks now
     node.replace_input_with(0, blocks)
     node.attributes.pop("strides", None)
     node.attributes.add(ir.AttrInt64s("kernel_shape", cut.covered))
@@ -178,15 +167,13 @@ def lower(draft: Draft) -> ir.Model:
         value: Grid.of(origin, *draft.ranges[str(origin.name)])
         for value, origin in region.grids.items()
     }
-    jobs = [
-        (layer, draft.weights[str(layer.outputs[0].name)], grids[value].scale)
-        for layer, value in region.layers.items()
-    ]
-    # Write pairs, then layers; then keep what is float from fusing.
+    # Write pairs, then layers; then keep what is float from fusing
     writer = Writer(main)
+    layers = {layer: str(layer.outputs[0].name) for layer in region.layers}
     _write_pairs(writer, region, grids)
-    for layer, weight, step in jobs:
-        write_layer(writer, layer, weight, step)
+    for layer, name in layers.items():
+        step = grids[region.layers[layer]].scale
+        write_layer(writer, layer, draft.weights[name], step)
     _screen_products(writer)
     _screen_others(writer, draft.model)
     rewrite.sweep(draft.model)
@@ -221,11 +208,8 @@ def _write_pairs(
     for value, grid in grids.items():
         written = value in region.written
         # A tensor that a kernel writes as uint8 has no float version.
-        uses = [
-            (use.node, use.idx)
-            for use in value.uses()
-            if written or region.reads(use.node, use.idx)
-        ]
+        pairs = [(use.node, use.idx) for use in value.uses()]
+        uses = [pair for pair in pairs if written or region.reads(*pair)]
         producer = value.producer()
         source = producer if written and producer is not None else uses[0][0]
         # Insert the pair, and reconnect the readers.
@@ -264,9 +248,10 @@ def _screen_products(writer: Writer) -> None:
             continue
         if not all(map(is_dequantized, node.inputs[:2])):
             continue
+        # Does onnxruntime overlook the layer?
         value = node.outputs[0]
         readers = list(value.consumers())
-        if any(each.op_type == QUANTIZE for each in readers):
+        if any(reader.op_type == QUANTIZE for reader in readers):
             hidden = len(value.uses()) > 1 or value.is_graph_output()
         elif len(readers) != 1:
             hidden = False
@@ -277,10 +262,10 @@ def _screen_products(writer: Writer) -> None:
             clipped = readers[0].outputs[0]
             hidden = readers[0].op_type in ("Relu", "Clip") and (
                 clipped.is_graph_output()
-                or any(each.op_type != QUANTIZE for each in clipped.consumers())
+                or any(other.op_type != QUANTIZE for other in clipped.consumers())
             )
         if hidden:
-            rank = max(graph.rank_of(each) or 2 for each in node.inputs[:2])
+            rank = max(graph.rank_of(operand) or 2 for operand in node.inputs[:2])
             same = writer.constant(np.zeros(rank, np.int64), f"same_{rank}")
             _screen(writer, "Reshape", node, same)
 
@@ -301,6 +286,7 @@ def _screen_others(writer: Writer, model: ir.Model) -> None:
     Without it onnxruntime (1.31) rounds the float weight to int8, with one scale in
     all, though it may have no int8 kernel for the layer.
     """
+    # Averages whose kernel computes something else, and MaxPools of float
     for node in list(writer.graph):
         if is_dequantized(graph.input_at(node, 0)):
             hidden = is_average(node) and not has_average_kernel(node)
@@ -308,6 +294,7 @@ def _screen_others(writer: Writer, model: ir.Model) -> None:
             hidden = node.op_type == "MaxPool" and _is_quantized(node.outputs[0])
         if hidden:
             _screen(writer, "Max", node)
+    # Float weights between pairs
     for layer, quantizer in list(rounded_layers(model)):
         value = quantizer.inputs[0]
         assert value is not None

@@ -7,7 +7,8 @@ import pytest
 
 from me2e_compress.graph.nodes import scalar_of
 from me2e_compress.quantization.plan import make_plan
-from me2e_compress.targets.onnxruntime import OnnxRuntime, convert, unranged
+from me2e_compress.targets.onnxruntime import OnnxRuntime
+from me2e_compress.targets.onnxruntime.convert import convert, unranged
 from me2e_compress.targets.tensorrt import TensorRT
 from tests.support.nets import FULL, PAPER, drawn, net
 from tests.targets.onnxruntime.lowered import (

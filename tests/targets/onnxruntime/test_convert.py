@@ -5,7 +5,7 @@ import pytest
 from me2e_compress import graph
 from me2e_compress.base.errors import PreconditionError
 from me2e_compress.quantization.plan import make_plan
-from me2e_compress.targets.onnxruntime import convert, unranged
+from me2e_compress.targets.onnxruntime.convert import convert, unranged
 from me2e_compress.targets.tensorrt import TensorRT
 from tests.support.nets import FULL, PAPER, drawn, parsed
 from tests.targets.onnxruntime.lowered import (

@@ -9,7 +9,9 @@ from hypothesis import strategies as st
 from me2e_compress.graph import array_of
 from me2e_compress.runtime.optimized import optimize
 from me2e_compress.runtime.session import Session
-from me2e_compress.targets.onnxruntime import OnnxRuntime, int8_layers, int8_rewrites
+from me2e_compress.targets.onnxruntime import OnnxRuntime
+from me2e_compress.targets.onnxruntime.convert import int8_layers
+from me2e_compress.targets.onnxruntime.lint_rules import int8_rewrites
 from tests.support.nets import net, placed
 from tests.support.profiles import scaled
 from tests.targets.onnxruntime.rewritten import SIZE, STEP, Drawn

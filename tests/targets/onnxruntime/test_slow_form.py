@@ -13,7 +13,8 @@ from me2e_compress.runtime.providers import (
     TensorRtProvider,
     TensorRtRtxProvider,
 )
-from me2e_compress.targets.onnxruntime import OnnxRuntime, slow_here
+from me2e_compress.targets.onnxruntime import OnnxRuntime
+from me2e_compress.targets.onnxruntime.convert import slow_here
 from tests.support.nets import conv_attention, drawn, parsed, placed
 from tests.targets.onnxruntime.lowered import (
     MATMUL_RELU,
