@@ -34,23 +34,16 @@ PLUGIN_ATTRIBUTES = ("plugin_version", "plugin_namespace")
 class Operand:
     """One input of a fused operator.
 
-    Attributes:
-        name: the name in messages.
-        dims: its dimensions, separated by blanks: a number, a letter for a size that is
-            equal in all operands of a call, or ``*`` for any; None for any rank.
-        types: the accepted element types.
-        optional: whether it, and all inputs after it, may be omitted.
-        positions: whether it holds sampling positions or matrices to invert: these stay
-            in float.
-        scores: whether it holds weights before their softmax.
+    ``dims`` are its dimensions, separated by blanks: a number, a letter for a size that
+    is equal in all operands of a call, or ``*`` for any; None for any rank.
     """
 
-    name: str
+    name: str  # in messages
     dims: str | None = None
     types: tuple[ir.DataType, ...] = FLOATS
-    optional: bool = False
-    positions: bool = False
-    scores: bool = False
+    optional: bool = False  # it, and all inputs after it, may be omitted
+    positions: bool = False  # of samples, or matrices to invert: these stay in float
+    scores: bool = False  # weights before their softmax
 
     @property
     def letters(self) -> list[str]:
@@ -73,19 +66,14 @@ class Operand:
 class Attribute:
     """One attribute of a fused operator.
 
-    Attributes:
-        name: its name in the file.
-        default: the value of its type that a conversion writes if it knows none.
-        required: whether the plugin refuses a node without it.
-        choices: the allowed values; empty for any.
-        own: its name in the own form; None where that is the same, empty where the own
-            form lacks it.
+    ``own`` is its name in the own form: None where that is the same, empty where the
+    own form lacks it.
     """
 
     name: str
-    default: int | float | str | tuple[int, ...]
-    required: bool = True
-    choices: tuple[int | str, ...] = ()
+    default: int | float | str | tuple[int, ...]  # what a conversion writes otherwise
+    required: bool = True  # the plugin refuses a node without it
+    choices: tuple[int | str, ...] = ()  # the allowed values; empty for any
     own: str | None = None
 
     @property
@@ -100,29 +88,18 @@ class Dialect:
 
     Subclasses override the conversions where inputs, attributes or output differ:
     ``inputs_*`` and ``result_*`` write them as nodes, ``options_*`` convert attributes,
-    and ``shape*`` shapes.
-
-    Attributes:
-        name: its name for ``translate-plugins`` and ``--dialect``.
-        op_type: the operator's name in a file.
-        domain: the domain that exporters use.
-        operands: its inputs in order.
-        source: the library, for messages.
-        attributes: all attributes except ``plugin_version`` and ``plugin_namespace``.
-        version: the ``plugin_version`` that TensorRT looks for.
-        namespace: the ``plugin_namespace`` that TensorRT looks for.
-        int8_scale: index of the input with the scales of int8 features, float32, one
-            per channel; None if there is none.
+    and ``shape*`` shapes. ``int8_scale`` is the index of the input with the scales of
+    int8 features, float32, one per channel; None if there is none.
     """
 
-    name: str
-    op_type: str
-    domain: str
+    name: str  # for `translate-plugins` and `--dialect`
+    op_type: str  # the operator's name in a file
+    domain: str  # that exporters use
     operands: tuple[Operand, ...]
-    source: str = ""
-    attributes: tuple[Attribute, ...] = ()
-    version: str = "1"
-    namespace: str = ""
+    source: str = ""  # the library, for messages
+    attributes: tuple[Attribute, ...] = ()  # but those of PLUGIN_ATTRIBUTES
+    version: str = "1"  # the `plugin_version` that TensorRT looks for
+    namespace: str = ""  # the `plugin_namespace` that TensorRT looks for
     int8_scale: int | None = None
 
     def inputs_to_own(
@@ -177,12 +154,10 @@ class Dialect:
         cast = list(inputs[: len(self.operands)])
         while cast and cast[-1] is None:
             cast.pop()
-        for index, (operand, value) in enumerate(
-            zip(self.operands, cast, strict=False)
-        ):
-            kind = None if value is None else value.dtype
-            if value is not None and kind in INTEGERS and kind not in operand.types:
-                cast[index] = call.cast(value, operand.types[0])
+        for index, value in enumerate(cast):
+            types = self.operands[index].types
+            if value is not None and value.dtype in {*INTEGERS} - {*types}:
+                cast[index] = call.cast(value, types[0])
         return tuple(cast)
 
     def attributes_of(self, node: ir.Node) -> dict[str, AttributeValue]:
@@ -238,34 +213,31 @@ class Dialect:
                 raise PreconditionError(
                     f"{self.call_of(node)}: {operand.name} is {kind}, not {wanted}"
                 )
-            self._check_shape(node, operand, open_shape(value), sizes)
+            letters, shape = operand.letters, open_shape(value)
+            if operand.dims is None or shape is None:
+                continue
+            fits = len(letters) == len(shape)
+            for letter, size in zip(letters, shape, strict=False):
+                if size is None or letter == "*":
+                    continue
+                is_number = letter.isdigit()
+                known = int(letter) if is_number else sizes.setdefault(letter, size)
+                fits = fits and known == size
+            if not fits:
+                # Show the sizes known so far
+                spelt = {letter: f"{letter}={size}" for letter, size in sizes.items()}
+                form = ", ".join(
+                    spelt.get(letter, letter) for letter in operand.letters
+                )
+                dims = ", ".join("'?'" if d is None else str(d) for d in shape)
+                raise PreconditionError(
+                    f"{self.call_of(node)}: {operand.name} is [{dims}], not [{form}]"
+                )
 
     def call_of(self, node: ir.Node) -> str:
         """Name a node and its operator, for messages."""
         name = node.name or node.outputs[0].name
         return f"node {name}: {self.op_type} of {self.source}"
-
-    def _check_shape(
-        self, node: ir.Node, operand: Operand, shape: Dims | None, sizes: dict[str, int]
-    ) -> None:
-        if operand.dims is None or shape is None:
-            return
-        wanted = operand.letters
-        fits = len(wanted) == len(shape)
-        # A letter stands for one size in all operands
-        for letter, size in zip(wanted, shape, strict=False):
-            if size is None or letter == "*":
-                continue
-            known = int(letter) if letter.isdigit() else sizes.setdefault(letter, size)
-            fits = fits and known == size
-        if not fits:
-            # Show the sizes known so far
-            spelt = {letter: f"{letter}={size}" for letter, size in sizes.items()}
-            form = ", ".join(spelt.get(letter, letter) for letter in wanted)
-            raise PreconditionError(
-                f"{self.call_of(node)}: {operand.name} is"
-                f" {[dim if dim is not None else '?' for dim in shape]}, not [{form}]"
-            )
 
 
 def present(inputs: Values) -> tuple[ir.Value, ...]:

@@ -58,6 +58,7 @@ def raise_for_bodies(
     Raises:
         PreconditionError: the graph cannot be written in it; nothing changed.
     """
+    # The newest opset that a body needs and its graph has not
     wanted = 0
     for node in nodes:
         row, where = find(node), node.graph
@@ -101,10 +102,8 @@ def expand(
         opset: of the standard operators; see :func:`raise_for_bodies`.
         by: the name of the pass, for the provenance.
         names: of all values of the model, where many nodes are expanded.
-        compiled: whether the body may call compiled kernels; a session must then
-            register them (:mod:`me2e_compress.operators.kernels`).
-        known: operator and dialect of the node; None asks
-            :func:`~me2e_compress.operators.find`, which knows registered ones only.
+        compiled: allow calls of compiled kernels, which a session must then register.
+        known: operator and dialect of the node, if it is not a registered one.
 
     Raises:
         PreconditionError: attributes or inputs that do not fit the dialect.
@@ -119,9 +118,9 @@ def expand(
     call = FusedCall(node, opset=opset, by=by, names=names, compiled=compiled)
     if compiled:
         dialect.check(node)
-        made = dialect.by_kernel(call, tuple(node.inputs))
-        if made is not None:
-            call.put(made)
+        result = dialect.by_kernel(call, tuple(node.inputs))
+        if result is not None:
+            call.put(result)
             return
     inputs, attributes = _own_call(call, dialect)
     result = operator.body(call, inputs, attributes)
@@ -153,12 +152,12 @@ def translate(
     if to.domain != OWN_DOMAIN:
         options |= zip(PLUGIN_ATTRIBUTES, (to.version, to.namespace), strict=True)
     result = call.add(to.op_type, inputs, options, domain=to.domain)
-    made = result.producer()
-    assert made is not None
+    plugin = result.producer()
+    assert plugin is not None
     if not to.domain:
-        made.domain = PLUGIN_DOMAIN
-        made.metadata_props[ORIGINAL_DOMAIN] = ""
-    set_output(made, operator, to)
+        plugin.domain = PLUGIN_DOMAIN
+        plugin.metadata_props[ORIGINAL_DOMAIN] = ""
+    set_output(plugin, operator, to)
     # Convert the output back to the old layout
     result = to.result_to_own(call, result, own)
     call.put(dialect.result_from_own(call, result, own))
@@ -189,27 +188,29 @@ def write_constant_nodes(function: ir.Function) -> None:
     graph = function.graph
     for name, value in list(graph.initializers.items()):
         tensor = value.const_value
-        made = ir.node("Constant", [], {"value": tensor}, num_outputs=1)
-        result = made.outputs[0]
-        made.name = result.name = name
+        node = ir.node("Constant", [], {"value": tensor}, num_outputs=1)
+        result = node.outputs[0]
+        node.name = result.name = name
         result.type, result.shape, result.const_value = value.type, value.shape, tensor
         del graph.initializers[name]
         value.replace_all_uses_with(result)
-        graph.insert_before(graph[0], made)
+        graph.insert_before(graph[0], node)
 
 
 def _operator_of(
     node: ir.Node, known: tuple[Operator, Dialect] | None
 ) -> tuple[Operator, Dialect]:
-    operator = known or find(node)
-    if operator is None:
+    """Return a node's operator and dialect, or raise as :func:`expand` does."""
+    match = known or find(node)
+    if match is None:
         raise GraphError(f"node {node.name}: {node.op_type} is no fused operator")
-    if read := [value.name for value in node.outputs[1:] if is_read(value)]:
-        raise PreconditionError(f"node {node.name}: it has no output {read[0]}")
-    return operator
+    if extra := [value.name for value in node.outputs[1:] if is_read(value)]:
+        raise PreconditionError(f"node {node.name}: it has no output {extra[0]}")
+    return match
 
 
 def _own_call(call: FusedCall, dialect: Dialect) -> tuple[Values, Attributes]:
+    """Write a call's inputs in the own form; return them with its attributes."""
     dialect.check(call.node)
     attributes = dialect.attributes_of(call.node)
     inputs = dialect.inputs_to_own(call, tuple(call.node.inputs), attributes)

@@ -2,7 +2,7 @@
 
 import dataclasses
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from typing import TypeVar
 
 import numpy as np
@@ -26,18 +26,13 @@ Stored = TypeVar("Stored", bound=np.generic)  # the type of stored integers
 class QuantizedWeight:
     """A weight on the symmetric int8 grid: ``integers * scales`` along an axis.
 
-    Attributes:
-        name: base name of its initializers.
-        integers: int8, in the weight's shape; a MatMul's [1, ..., K, N] becomes one
-            matrix, [K, N].
-        scales: float32 [channels], or [] for one step everywhere.
-        axis: the channel axis of the integers; None without channels.
+    The integers have the weight's shape; a MatMul's [1, ..., K, N] becomes [K, N].
     """
 
-    name: str
+    name: str  # base name of its initializers
     integers: npt.NDArray[np.int8]
-    scales: npt.NDArray[np.float32]
-    axis: int | None
+    scales: npt.NDArray[np.float32]  # (channels,), or () for one step everywhere
+    axis: int | None  # of the channels; None without
 
 
 def weights_of(
@@ -73,11 +68,23 @@ def weights_of(
     values = dict.fromkeys(value for value, _ in layers.values())
     names = [str(value.name) for value in values if value.producer() is not None]
     computed = evaluate_constants(model, names)
-    # Quantize each weight once.
-    quantized = {
-        layer: _quantize(*layer, computed, balanced and layer not in plain)
-        for layer in dict.fromkeys(layers.values())
-    }
+    # Quantize each weight once
+    quantized = dict[tuple[ir.Value, int | None], QuantizedWeight]()
+    for layer in dict.fromkeys(layers.values()):
+        value, axis = layer
+        name = str(value.name)
+        array = computed.get(name)
+        if array is None and value.const_value is not None:
+            array = value.const_value.numpy()
+        if array is None:
+            message = f"{name} is planned as a weight, but is not a constant"
+            raise PreconditionError(message)
+        # A batch of one matrix is stored as that matrix
+        if axis == -1:
+            array, axis = array.reshape(array.shape[-2:]), 1
+        is_balanced = balanced and layer not in plain
+        pair = quantize_weight(array.astype(np.float32), axis, balanced=is_balanced)
+        quantized[layer] = QuantizedWeight(name, *pair, axis)
     return {output: quantized[layer] for output, layer in layers.items()}
 
 
@@ -187,23 +194,6 @@ def _excess(error: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
     excess = np.empty_like(error)
     np.put_along_axis(excess, order, np.where(first, sign, 0.0), -1)
     return excess
-
-
-def _quantize(
-    value: ir.Value, axis: int | None, computed: Mapping[str, Array], balanced: bool
-) -> QuantizedWeight:
-    name = str(value.name)
-    array = computed.get(name)
-    if array is None and value.const_value is not None:
-        array = value.const_value.numpy()
-    if array is None:
-        raise PreconditionError(f"{name} is planned as a weight, but is not a constant")
-    # A batch of one matrix is stored as that matrix
-    if axis == -1:
-        array, axis = array.reshape(array.shape[-2:]), 1
-    weight = array.astype(np.float32)
-    integers, scales = quantize_weight(weight, axis, balanced=balanced)
-    return QuantizedWeight(name, integers, scales, axis)
 
 
 def evaluate_constants(model: ir.Model, names: Sequence[str]) -> dict[str, Array]:

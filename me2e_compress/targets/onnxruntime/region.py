@@ -164,18 +164,14 @@ _UNSIGNED = frozenset(
 class Region:
     """The int8 part of a graph.
 
-    Attributes:
-        grids: the uint8 tensors, and the tensor whose range each one uses: usually its
-            own, or the first of a chain that only moves elements.
-        written: tensors that an int8 kernel writes, so that no float version exists.
-        readers: nodes that read uint8, other than layers.
-        sampled: fused operators that sample uint8, by the first node that reads it.
+    ``grids`` has the uint8 tensors, and the tensor whose range is theirs: usually their
+    own, or the first of a chain that only moves elements.
     """
 
-    layers: dict[ir.Node, ir.Value]
+    layers: dict[ir.Node, ir.Value]  # with the uint8 tensors that they read
     grids: dict[ir.Value, ir.Value]
-    written: frozenset[ir.Value]
-    readers: frozenset[ir.Node]
+    written: frozenset[ir.Value]  # by an int8 kernel, so that no float version exists
+    readers: frozenset[ir.Node]  # that read uint8, other than layers
     sampled: dict[ir.Node, ir.Node] = dataclasses.field(default_factory=dict)
 
     @property
@@ -184,7 +180,7 @@ class Region:
         return tuple(dict.fromkeys(str(value.name) for value in self.grids.values()))
 
     def reads(self, node: ir.Node, index: int) -> bool:
-        """Return whether a node reads an input as uint8 where that exists."""
+        """Return whether a node reads an input as uint8, where the tensor has one."""
         if node in self.readers:
             return index == 0 or node.op_type in JOINS
         return (node in self.layers or node in self.sampled) and index == 0

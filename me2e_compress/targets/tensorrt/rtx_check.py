@@ -10,7 +10,6 @@ import importlib.util
 import json
 import tempfile
 from pathlib import Path
-from typing import Any
 
 import onnx_ir as ir
 
@@ -82,9 +81,20 @@ def check(model: ir.Model, sm: int = 86, *, build: bool = True) -> BuildResult:
     graph.infer_shapes(ready)
     part, gone = cut(ready)
     with tempfile.TemporaryDirectory(prefix="me2e-rtx-") as scratch:
-        answer = _ask(part, Path(scratch), sm, build=build)
-    well = answer["parsed"] and answer["built"] is not False
-    errors = [] if well else [*answer["errors"], *answer["log"]]
+        file, answer_file = Path(scratch, "m.onnx"), Path(scratch, "a.json")
+        graph.save(part, file)
+        words = [str(file), str(answer_file), str(sm), "build" if build else "parse"]
+        done = run_script(Path(__file__).with_name("rtx_main.py"), words)
+        # No answer file means that the process crashed
+        if not answer_file.is_file():
+            last = (done.stderr.strip().splitlines() or ["no message"])[-1]
+            if last.startswith(("ImportError", "ModuleNotFoundError")):
+                raise BrokenPackageError("tensorrt_rtx", EXTRA, last)
+            code = f"TensorRT-RTX ended with code {done.returncode} on the graph"
+            raise GraphError(f"{code}: {last}")
+        answer = json.loads(answer_file.read_text(encoding="utf-8"))
+    passed = answer["parsed"] and answer["built"] is not False
+    errors = [] if passed else [*answer["errors"], *answer["log"]]
     return BuildResult(
         str(answer["version"]),
         gone,
@@ -93,24 +103,6 @@ def check(model: ir.Model, sm: int = 86, *, build: bool = True) -> BuildResult:
         int(answer["layers"]),
         tuple(" ".join(str(each).split()) for each in errors),
     )
-
-
-def _ask(part: ir.Model, scratch: Path, sm: int, *, build: bool) -> dict[str, Any]:
-    """Run ``rtx_main.py`` on a graph in another process, and return its answer."""
-    model, answer = scratch / "m.onnx", scratch / "a.json"
-    graph.save(part, model)
-    words = [str(model), str(answer), str(sm), "build" if build else "parse"]
-    done = run_script(Path(__file__).with_name("rtx_main.py"), words)
-    # No answer file means that the process crashed.
-    if not answer.is_file():
-        last = done.stderr.strip().splitlines()[-1:] or ["no message"]
-        if last[0].startswith(("ImportError", "ModuleNotFoundError")):
-            raise BrokenPackageError("tensorrt_rtx", EXTRA, last[0])
-        raise GraphError(
-            f"TensorRT-RTX ended with code {done.returncode} on the graph: {last[0]}"
-        )
-    result: dict[str, Any] = json.loads(answer.read_text(encoding="utf-8"))
-    return result
 
 
 # Operators that TensorRT supports by its own plugins, and TensorRT-RTX does not
