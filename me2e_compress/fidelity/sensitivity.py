@@ -39,6 +39,21 @@ from me2e_compress.runtime.session import Session
 from me2e_compress.targets import Target
 
 
+__all__ = [
+    "Budget",
+    "Candidate",
+    "Int8Choice",
+    "ModuleSensitivity",
+    "Score",
+    "Sensitivity",
+    "Trials",
+    "advise",
+    "analyse",
+    "search",
+    "write_recipe",
+]
+
+
 @dataclasses.dataclass(frozen=True)
 class Int8Choice:
     """The modules that are int8, in map order, and their nodes that stay float."""

@@ -226,9 +226,7 @@ class Dialect:
             if not fits:
                 # Show the sizes known so far
                 spelt = {letter: f"{letter}={size}" for letter, size in sizes.items()}
-                form = ", ".join(
-                    spelt.get(letter, letter) for letter in operand.letters
-                )
+                form = ", ".join(spelt.get(letter, letter) for letter in letters)
                 dims = ", ".join("'?'" if d is None else str(d) for d in shape)
                 raise PreconditionError(
                     f"{self.call_of(node)}: {operand.name} is [{dims}], not [{form}]"

@@ -24,6 +24,20 @@ from me2e_compress.quantization.costs import Costs
 from me2e_compress.quantization.decision import KeptFloat, QuantPlan
 from me2e_compress.runtime.providers import CPU, Provider
 
+__all__ = [
+    "DEFAULT_TARGET",
+    "TARGETS",
+    "LintFinding",
+    "LintRule",
+    "Severity",
+    "Target",
+    "divided_grids",
+    "error",
+    "of_opset",
+    "valid",
+    "warning",
+]
+
 Severity = Literal["error", "wrong", "warning"]
 SEVERITIES: tuple[Severity, ...] = get_args(Severity)  # the worst first
 
