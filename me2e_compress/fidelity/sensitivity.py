@@ -38,7 +38,6 @@ from me2e_compress.runtime.providers import CPU, Provider
 from me2e_compress.runtime.session import Session
 from me2e_compress.targets import Target
 
-
 __all__ = [
     "Budget",
     "Candidate",

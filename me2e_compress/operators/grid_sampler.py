@@ -370,7 +370,7 @@ def _by_gather(
         for axis in (0, 1)
     )
     x, y = call.split_last(locations, 2)
-    axes = [_corner_pixels(call, at, count) for at, count in ((x, columns), (y, height))]
+    axes = [_corner_pixels(call, *axis) for axis in ((x, columns), (y, height))]
     # Row 0 is the row of zeros
     padded = call.add("Pad", [value, call.integers([0, 1, 0, 0, 0, 0, 0, 0])])
     rows = call.reshape(padded, (-1, width))
