@@ -51,11 +51,9 @@ class EngineRun:
     def run_graph(
         self, session: Session, names: Sequence[str]
     ) -> Iterator[tuple[Arrays, Arrays]]:
-        """Run a graph over all frames; yield its inputs and its outputs ``names``.
-
-        State is that of the dump, or of this run's last frame where the dump lacks it,
-        and is reset where a scene begins.
-        """
+        """Run a graph over all frames; yield its inputs and its outputs ``names``."""
+        # State is that of the dump, or of this run's last frame where the dump lacks
+        # it, and is reset where a scene begins
         own = [name for name in session.recurrent.values() if name not in self.dump[0]]
         computed = list(dict.fromkeys([*names, *own]))
         state = dict[str, Array]()

@@ -224,10 +224,8 @@ def analyse(
 
 
 def int8_names(trials: Trials, module: str) -> tuple[str, ...]:
-    """Name the nodes that become int8 if a module does, in graph order.
-
-    Residual Adds are left out: they follow their convolution.
-    """
+    """Name the nodes that become int8 if a module does, in graph order."""
+    # Residual Adds are left out: they follow their convolution
     chosen = trials.plan(Int8Choice((module,))).chosen
     return tuple(dict.fromkeys(d.node for d in chosen if d.rule != RESIDUAL))
 
@@ -235,13 +233,11 @@ def int8_names(trials: Trials, module: str) -> tuple[str, ...]:
 def _costly_nodes(
     trials: Trials, module: str, loss: float, most: int
 ) -> tuple[tuple[str, float], ...]:
-    """Halve a module's nodes until those that cost much stand alone, worst first.
-
-    The costliest part is halved next, either half int8 with the rest of the module in
-    float; parts that cost less than `BLAME_SHARE` of the module are left. Two costly
-    nodes in one half are found one by one, nodes that cost little never. At most
-    ``most`` variants are run.
-    """
+    """Halve a module's nodes until those that cost much stand alone, worst first."""
+    # The costliest part is halved next, either half int8 with the rest of the module in
+    # float; parts that cost less than `BLAME_SHARE` of the module are left. Two costly
+    # nodes in one half are found one by one, nodes that cost little never. At most
+    # `most` variants are run.
     names = int8_names(trials, module)
     parts, blamed = [(loss, names)], list[tuple[str, float]]()
     while parts:

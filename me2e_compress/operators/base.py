@@ -133,12 +133,10 @@ RESERVED = (OWN_DOMAIN, "com.microsoft")
 
 
 def find(node: ir.Node) -> tuple[Operator, Dialect] | None:
-    """Return a node's fused operator and dialect; None if it is not one.
-
-    TensorRT finds a plugin by the operator's name, and exporters put it in any domain
-    or none: so the name decides. Among several dialects of one name, the domain and
-    ``plugin_version`` decide, then the types and shapes of the node's inputs.
-    """
+    """Return a node's fused operator and dialect; None if it is not one."""
+    # TensorRT finds a plugin by the operator's name, and exporters put it in any domain
+    # or none: so the name decides. Among several dialects of one name, the domain and
+    # `plugin_version` decide, then the types and shapes of the node's inputs.
     rows = _rows().get(node.op_type)
     if rows is None or (is_standard(node) and not is_plugin(node)):
         return None

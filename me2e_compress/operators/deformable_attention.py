@@ -176,10 +176,8 @@ _LAYOUT = ("Expand", "Identity", "Reshape", "Squeeze", "Transpose", "Unsqueeze")
 
 
 def _before_softmax(call: FusedCall, weights: ir.Value) -> ir.Value | None:
-    """Write the scores of a softmax in the layout of its weights, if there is one.
-
-    The last two axes of ``weights`` are one row of the softmax.
-    """
+    """Write the scores of a softmax in the layout of its weights, if there is one."""
+    # The last two axes of `weights` are one row of the softmax
     shape = static_shape(weights)
     if shape is None:
         return None
@@ -312,10 +310,8 @@ class RawOwnForm(Dialect):
 def _tiled(
     call: FusedCall, value: ir.Value, full: Mapping[int, Size], *, beside: bool = False
 ) -> ir.Value:
-    """Repeat a value along axes up to full sizes; ``beside`` a value that has them.
-
-    There sizes of 1 are left to broadcasting.
-    """
+    """Repeat a value along axes up to full sizes; ``beside`` a value that has them."""
+    # There sizes of 1 are left to broadcasting
     times: dict[int, Size] = {}
     for axis, wanted in full.items():
         size = call.size(value, axis)

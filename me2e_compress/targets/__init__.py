@@ -106,10 +106,8 @@ def worst_first(findings: Iterable[LintFinding]) -> tuple[LintFinding, ...]:
 
 
 def of_opset(model: ir.Model) -> Iterator[LintFinding]:
-    """Find operators that are newer than the opset of the graph.
-
-    TensorRT's parser does not look at the opset; onnxruntime does.
-    """
+    """Find operators that are newer than the opset of the graph."""
+    # TensorRT's parser does not look at the opset; onnxruntime does
     for part, opset in bodies(model):
         for node in part.all_nodes():
             name = node.op_type
@@ -126,10 +124,8 @@ def of_opset(model: ir.Model) -> Iterator[LintFinding]:
 
 
 def divided_grids(model: ir.Model) -> Iterator[LintFinding]:
-    """Find divisions by what may be 0 on the way to where GridSample samples.
-
-    Points of depth 0 give 0 / 0 there.
-    """
+    """Find divisions by what may be 0 on the way to where GridSample samples."""
+    # Points of depth 0 give 0 / 0 there
     visited, positive = set[ir.Node](), dict[ir.Value, bool]()
     for sampler in graph.nodes_of(model):
         # Walk back from the grid over what moves or combines positions
@@ -162,10 +158,8 @@ _OF_POSITIVE = _MOVES | {"ReduceMax", "ReduceMean", "ReduceMin", "ReduceSum", "S
 
 
 def _is_positive(value: ir.Value | None, known: dict[ir.Value, bool]) -> bool:
-    """Tell whether something keeps a value above 0: constants, bounds, what is added.
-
-    One side that is positive guards an Add, a Max and a Where.
-    """
+    """Return whether a value is always above 0, by constants, bounds or terms added."""
+    # One side that is positive guards an Add, a Max and a Where
     if (array := graph.array_of(value)) is not None:
         return bool(np.all(array.astype(np.float64) > 0))
     if value is None or (node := value.producer()) is None:

@@ -45,10 +45,8 @@ def is_dequantized(value: ir.Value | None) -> bool:
 
 
 def is_in_a_pair(node: ir.Node) -> bool:
-    """Return whether a node stands between a QuantizeLinear and its DequantizeLinears.
-
-    The integers that it reads must have no other reader.
-    """
+    """Return whether a node stands between the two nodes of a pair."""
+    # The integers that it reads must have no other reader
     before, after = node.inputs[0], node.outputs[0]
     if before is None or not is_quantized(before) or after.is_graph_output():
         return False

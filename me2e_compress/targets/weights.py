@@ -143,12 +143,10 @@ def requantized(
 def scales_in(
     scales: npt.NDArray[np.float32], kind: npt.DTypeLike
 ) -> npt.NDArray[np.floating]:
-    """Round scales to a floating-point type, but none to 0.
-
-    Below its smallest normal number, 2^-14 of float16, a type has fewer digits, and
-    none below its smallest one, 2^-24: such scales are rounded up, so that integers of
-    theirs, rounded again (:func:`requantized`), still fit.
-    """
+    """Round scales to a floating-point type, but none to 0."""
+    # Below its smallest normal number, 2^-14 of float16, a type has fewer digits, and
+    # none below its smallest one, 2^-24: such scales are rounded up, so that integers
+    # of theirs, rounded again (`requantized`), still fit
     near = scales.astype(kind)
     below = near.astype(np.float64) < scales
     few = scales < np.finfo(near.dtype).smallest_normal
@@ -157,17 +155,15 @@ def scales_in(
 
 
 def balanced_steps(exact: npt.NDArray[np.float32]) -> npt.NDArray[np.float64]:
-    """Round a weight [outputs, inputs, elements] so that its errors cancel.
-
-    Neighbouring pixels are alike, and behind a ReLU all inputs are positive: errors of
-    one sign add up to a shift that no average over pixels removes. So elements that lie
-    near the middle between two integers are rounded the other way, those first whose
-    own error grows least, until the errors of a kernel, then those of an output
-    channel, sum to half a step at most. No element moves by a step or more.
-
-    It is SQuant's rounding (Guo et al., ICLR 2022, arXiv 2202.07471), in one pass over
-    kernels and one over channels. It needs no frames.
-    """
+    """Round a weight [outputs, inputs, elements] so that its errors cancel."""
+    # Neighbouring pixels are alike, and behind a ReLU all inputs are positive: errors
+    # of one sign add up to a shift that no average over pixels removes. So elements
+    # that lie near the middle between two integers are rounded the other way, those
+    # first whose own error grows least, until the errors of a kernel, then those of an
+    # output channel, sum to half a step at most. No element moves by a step or more.
+    #
+    # It is SQuant's rounding (Guo et al., ICLR 2022, arXiv 2202.07471), in one pass
+    # over kernels and one over channels. It needs no frames.
     wide = exact.astype(np.float64)
     steps: npt.NDArray[np.float64] = np.rint(wide)
     error: npt.NDArray[np.float64] = steps - wide
@@ -182,10 +178,8 @@ def balanced_steps(exact: npt.NDArray[np.float32]) -> npt.NDArray[np.float64]:
 
 
 def _excess(error: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
-    """Return what to take from errors so that each row sums to half at most: -1, 0, 1.
-
-    Errors are at most a half, so enough of them have the sign of their sum.
-    """
+    """Return what to subtract so that rows of errors sum to 1/2 at most: -1, 0, 1."""
+    # Errors are at most a half, so enough of them have the sign of their sum
     total = error.sum(-1, keepdims=True)
     sign = np.sign(total)
     # The round(|total|) largest errors of its sign move by one step
@@ -273,24 +267,21 @@ def bias_by_channel(node: ir.Node, channels: int | None) -> Floats | None:
 
 
 def least_scales(bias: Floats, step: np.float32) -> npt.NDArray[np.float64]:
-    """Return the least scales of a weight beside which a bias fits into int32.
-
-    A kernel adds the bias to its int32 sums in units of ``step * scale``, where
-    ``step`` is the scale of the activation: onnxruntime rounds a float bias so, too,
-    and one that does not fit wraps around. So |bias| <= BIAS_MAX * step * scale.
-    """
+    """Return the least scales of a weight beside which a bias fits into int32."""
+    # A kernel adds the bias to its int32 sums in units of `step * scale`, where `step`
+    # is the scale of the activation: onnxruntime rounds a float bias so, too, and one
+    # that does not fit wraps around. So |bias| <= BIAS_MAX * step * scale.
     return np.abs(bias.astype(np.float64)) / (np.float64(BIAS_MAX) * step)
 
 
 def with_room(
     weight: QuantizedWeight, least: npt.NDArray[np.float64]
 ) -> QuantizedWeight:
-    """Raise the scales of a weight to the least ones, [channels]; itself if they are.
-
-    The weights of a raised channel are rounded to fewer integers, down to 0 for a dead
-    one. That is harmless: a product of K summands, each off by half a step at most, is
-    off by K * 127 / 2 steps, 6e-8 * K of the bias that raised the scale to 2^-30 of it.
-    """
+    """Raise the scales of a weight to at least the given ones, [channels]."""
+    # The weights of a raised channel are rounded to fewer integers, down to 0 for a
+    # dead one. That is harmless: a product of K summands, each off by half a step at
+    # most, is off by K * 127 / 2 steps, 6e-8 * K of the bias that raised the scale to
+    # 2^-30 of it.
     floor = least if weight.axis is not None else least.max(initial=0.0)
     scales = np.maximum(weight.scales, floor).astype(np.float32)
     if not (scales > weight.scales).any():

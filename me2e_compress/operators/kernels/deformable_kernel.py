@@ -97,12 +97,10 @@ def write_tables(a: Any, w: Any, o: Any, heads: int, together: int) -> None:
 def write_corners(
     w: Any, o: Any, places: Any, shares: Any, start: int, count: int, row: int
 ) -> None:
-    """Write the weights and offsets of the four corners of every point.
-
-    The constants of the points are those from ``start`` on. A position that is NaN
-    counts as outside. Points outside or without weight are not read: masked cameras
-    cost next to nothing, and a NaN there has no effect (in the body, 0 x NaN is NaN).
-    """
+    """Write the weights and offsets of the four corners of every point."""
+    # The constants of the points are those from `start` on. A position that is NaN
+    # counts as outside. Points outside or without weight are not read: masked cameras
+    # cost next to nothing, and a NaN there has no effect (in the body, 0 x NaN is NaN).
     for j in range(count):
         # Pixel position x W - 1/2, clipped to just outside: -1..W
         k = start + j

@@ -86,11 +86,10 @@ call: Any = intrinsic(_call)
 
 
 def stack(kind: Any, count: int) -> Any:
-    """Return an intrinsic for ``count`` uninitialized numbers on the stack.
-
-    Numba's own ``alloca_once`` fills them with zeros, by one instruction that takes
-    LLVM 12 s to compile at 12,000 numbers. Memory is allocated once per function call.
-    """
+    """Return an intrinsic for ``count`` uninitialized numbers on the stack."""
+    # Numba's own `alloca_once` fills them with zeros, by one instruction that takes
+    # LLVM 12 s to compile at 12,000 numbers. Memory is allocated once per function
+    # call.
 
     def typed(context: Any) -> tuple[Any, Callable[..., Any]]:
         def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:

@@ -52,10 +52,8 @@ F = np.float32
 
 
 def _softmax_of(size: int) -> Any:
-    """Return the intrinsic ``((scores, weights))`` for LANES numbers from there.
-
-    They are LANES / size rows; size divides LANES and is a power of two.
-    """
+    """Return the intrinsic ``((scores, weights))`` for LANES numbers from there."""
+    # They are LANES / size rows; size divides LANES and is a power of two
 
     def write(simd: Vectors, scores: Any, weights: Any) -> None:
         def over_row(x: Any, join: Callable[[Any, Any], Any]) -> Any:

@@ -195,10 +195,8 @@ def trampoline() -> Trampoline:
 
 
 def why_not() -> str | None:
-    """Return why this machine runs no kernels; None if it does.
-
-    Nothing is imported for this check: Numba itself may still fail to load.
-    """
+    """Return why this machine runs no kernels; None if it does."""
+    # Nothing is imported for this check: Numba itself may still fail to load
     if sys.platform != "linux":
         return f"there are kernels on Linux only, not on {sys.platform}"
     if platform.machine() not in _MACHINES:

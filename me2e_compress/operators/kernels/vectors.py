@@ -231,10 +231,8 @@ _OTHERS = (4, 32)  # those of aarch64
 
 @functools.cache
 def host_tile(vectors: int = 2) -> Tile:
-    """Return the largest tile of so many vectors that this processor's registers hold.
-
-    Beside the tile, they hold one row of B and one number of A.
-    """
+    """Return the largest tile of so many vectors that fits the processor's registers."""
+    # Beside the tile, they hold one row of B and one number of A
     features = llvm.get_host_cpu_features()
     lanes, registers = next(
         (size for name, size in _VECTORS.items() if features.get(name)), _OTHERS

@@ -83,11 +83,9 @@ class OnnxRuntime(Target):
     def read_back(
         self, model: ir.Model, provider: Provider = CPU
     ) -> tuple[LintFinding, ...]:
-        """Open a graph, and list the layers that are int8 in it and run in float.
-
-        onnxruntime looks for int8 after its first fusions, and for complete patterns: a
-        bias, a ReLU or a second reader of a layer's output hides the layer.
-        """
+        """Open a graph, and list the layers that are int8 in it and run in float."""
+        # onnxruntime looks for int8 after its first fusions, and for complete patterns:
+        # a bias, a ReLU or a second reader of a layer's output hides the layer
         source = with_unique_names(model)
         try:
             running = optimize(source, provider)
@@ -119,11 +117,9 @@ _FLOAT_KERNELS = frozenset(
 
 
 def _int8_of(plan: QuantPlan) -> tuple[dict[str, Decision], dict[str, Decision]]:
-    """Return a plan's int8 layers, and the fused operators that sample int8, by output.
-
-    Products of two activations are left out: int8 makes them slower on this target,
-    0.55 to 0.9 times the speed of float.
-    """
+    """Return a plan's int8 layers, and the operators that sample int8, by output."""
+    # Products of two activations are left out: int8 makes them slower on this target,
+    # 0.55 to 0.9 times the speed of float
     names = int8_op_types()
     layers = {d.output: d for d in plan.chosen if d.weight is not None}
     return layers, {d.output: d for d in plan.chosen if d.op in names}

@@ -71,11 +71,9 @@ def unranged(model: ir.Model) -> tuple[str, ...]:
 def int8_layers(
     model: ir.Model, kinds: Collection[str] = graph.WEIGHTED
 ) -> tuple[ir.Node, ...]:
-    """List the layers whose two operands both come through a DequantizeLinear.
-
-    Whether a runtime computes them in integers is another matter: onnxruntime's CPU
-    runs those of a graph placed for TensorRT in float.
-    """
+    """List the layers whose two operands both come through a DequantizeLinear."""
+    # Whether a runtime computes them in integers is another matter: onnxruntime's CPU
+    # runs those of a graph placed for TensorRT in float
     return tuple(
         node for node in model.graph if node.op_type in kinds and reads_integers(node)
     )
@@ -95,12 +93,10 @@ def dequantizer_of(value: ir.Value | None) -> ir.Node | None:
 
 
 def _draft_of_qdq(model: ir.Model) -> Draft:
-    """Copy a quantized graph without the pairs of its activations.
-
-    A layer becomes int8 if both its input and its weight come through a pair, and it
-    has a kernel. Weights are stored as int8 or, by ModelOpt, in float before a
-    QuantizeLinear. Biases stored as int32 become float again.
-    """
+    """Copy a quantized graph without the pairs of its activations."""
+    # A layer becomes int8 if both its input and its weight come through a pair, and it
+    # has a kernel. Weights are stored as int8 or, by ModelOpt, in float before a
+    # QuantizeLinear. Biases stored as int32 become float again.
     copy = model.clone()
     graph.infer_shapes(copy)
     # Find the pairs of activations, and their ranges
@@ -170,12 +166,10 @@ def _step_of(node: ir.Node) -> Floats:
 
 
 def _weight_of(layer: ir.Node) -> QuantizedWeight | None:
-    """Read the weight of a layer; None if it is not quantized for its kernel.
-
-    A MatMul by [1, ..., K, N] reads [K, N]. onnxruntime's own quantizer, and so
-    ModelOpt, puts scales along axis 1 of such a weight, which is K: no kernel takes it.
-    Another grid than symmetric int8, or other axes, are a PreconditionError.
-    """
+    """Read the weight of a layer; None if it is not quantized for its kernel."""
+    # A MatMul by [1, ..., K, N] reads [K, N]. onnxruntime's own quantizer, and so
+    # ModelOpt, puts scales along axis 1 of such a weight, which is K: no kernel takes
+    # it. Another grid than symmetric int8, or other axes, are a PreconditionError.
     node = producer_of(layer.inputs[1])
     if node is None or node.op_type != DEQUANTIZE:
         return None
@@ -299,11 +293,9 @@ def _is_fast(layer: ir.Node) -> bool:
 
 
 def _ends(value: ir.Value, *, takes_relu: bool) -> list[ir.Node]:
-    """List the readers of a layer's output, past what onnxruntime takes in.
-
-    A ReLU goes where the grid behind it begins at zero; elsewhere it hides the layer,
-    and a Gemm that was made of a MatMul takes none.
-    """
+    """List the readers of a layer's output, past what onnxruntime takes in."""
+    # A ReLU goes where the grid behind it begins at zero; elsewhere it hides the layer,
+    # and a Gemm that was made of a MatMul takes none
     readers = [] if value.is_graph_output() else list(value.consumers())
     if len(readers) != 1:
         return readers

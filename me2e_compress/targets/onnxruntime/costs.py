@@ -148,10 +148,8 @@ def work_of(layer: ir.Node) -> tuple[Counts, Counts] | None:
 
 
 def sampled_work(node: ir.Node) -> tuple[Counts, Counts] | None:
-    """Count a fused operator's work in float and in int8; None where it is unknown.
-
-    On maps that fit the cache, only the conversion of the integers is counted.
-    """
+    """Count a fused operator's work in float and in int8; None where it is unknown."""
+    # On maps that fit the cache, only the conversion of the integers is counted
     plugin, shape = find(node), static_shape(node.inputs[0])
     macs = None if plugin is None else plugin[0].cost(node, plugin[1]).macs
     if macs is None or shape is None:

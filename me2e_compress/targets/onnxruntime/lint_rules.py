@@ -226,10 +226,8 @@ def _misread(layer: _Layer, constants: Constants) -> str:
 
 
 def _becomes_gemm(layer: _Layer) -> bool:
-    """Return whether onnxruntime makes a QGemm of a product: 8 bits, no factors.
-
-    The weight's zero point must be written, even 0.
-    """
+    """Return whether onnxruntime makes a QGemm of a product: 8 bits, no factors."""
+    # The weight's zero point must be written, even 0
     node, integers = layer.node, layer.pair.inputs[0]
     factors = [node.attributes.get_float(name, 1.0) for name in ("alpha", "beta")]
     kind = None if integers is None else integers.dtype
@@ -294,10 +292,8 @@ def _rounded(layer: _Layer, constants: Constants) -> str:
 
 
 def _quantizer(layer: _Layer, folded: tuple[str, ...] = ()) -> ir.Node | None:
-    """Return the QuantizeLinear that alone reads a layer, behind what is looked past.
-
-    Those are what is folded into the layer first, then clips, then moves.
-    """
+    """Return the QuantizeLinear that alone reads a layer; None if there is none."""
+    # Behind what is folded into the layer, then clips, then moves
     value = layer.end
     moves: tuple[str, ...] = PASSED
     if layer.node.op_type == "Gemm" and layer.bias is None:
@@ -381,11 +377,10 @@ def fuses_pads_wrongly() -> bool:
 
 @rule_of_nodes("padded-pool", "wrong")
 def padded_pools(node: ir.Node) -> Iterator[str]:
-    """Find a Pad of zeros before a MaxPool: onnxruntime up to 1.31 computes it wrongly.
-
-    Its Pad fusion turns the zeros into the pool's own padding, which is minus infinity;
-    inputs that are never negative give the same result. Our own sessions disable it.
-    """
+    """Find a Pad of zeros before a MaxPool: wrong in onnxruntime up to 1.31."""
+    # Its Pad fusion turns the zeros into the pool's own padding, which is minus
+    # infinity; inputs that are never negative give the same result. Our own sessions
+    # disable it.
     pad = maker(node.inputs[0], "Pad") if node.op_type == "MaxPool" else None
     if pad is None or not is_standard(pad) or not fuses_pads_wrongly():
         return

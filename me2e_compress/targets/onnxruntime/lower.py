@@ -201,10 +201,8 @@ def _with_image_blocks(draft: Draft) -> Draft:
 def _write_pairs(
     writer: Writer, region: Region, grids: Mapping[ir.Value, Grid]
 ) -> None:
-    """Insert a pair after every uint8 tensor, for the kernels of a region to read.
-
-    Other readers of such a tensor keep the float one, if it exists.
-    """
+    """Insert a pair after every uint8 tensor, for the kernels of a region to read."""
+    # Other readers of such a tensor keep the float one, if it exists
     for value, grid in grids.items():
         written = value in region.written
         # A tensor that a kernel writes as uint8 has no float version.

@@ -35,11 +35,9 @@ JOINS = frozenset({"Add", "Concat"})
 
 
 def objection(node: ir.Node) -> str | None:
-    """Explain why a layer has no int8 kernel; None if it has one.
-
-    There is QLinearConv, but none for ConvTranspose; QGemm has neither beta nor a
-    transposed left operand; MatMul must have one weight for the whole batch.
-    """
+    """Explain why a layer has no int8 kernel; None if it has one."""
+    # There is QLinearConv, but none for ConvTranspose; QGemm has neither beta nor a
+    # transposed left operand; MatMul must have one weight for the whole batch
     if not is_standard(node) or node.op_type not in LAYERS:
         return f"there is no int8 kernel for {node.op_type}"
     # Each operator has its own conditions
@@ -67,11 +65,9 @@ _MAGNIFIERS = ("Log", "Pow", "Reciprocal")
 
 
 def _magnifier(value: ir.Value) -> str | None:
-    """Name an operator that makes a small error of what it reads a large one.
-
-    A QLinearConv writes uint8 of one scale, as TensorRT's convolution need not: small
-    values keep few steps of it, and a logarithm, a quotient or a square lives on them.
-    """
+    """Name an operator that makes a small error of what it reads a large one."""
+    # A QLinearConv writes uint8 of one scale, as TensorRT's convolution need not: small
+    # values keep few steps of it, and a logarithm, a quotient or a square lives on them
     for use in value.uses():
         reader = use.node
         squares = reader.op_type == "Mul" and reader.inputs[0] is reader.inputs[1]
@@ -83,10 +79,8 @@ def _magnifier(value: ir.Value) -> str | None:
 
 
 def reads_one_pixel(node: ir.Node) -> bool:
-    """Return whether a convolution is a Gemm: kernels of 1 over images of one pixel.
-
-    So it is behind a global average. A Gemm may write float; a QLinearConv may not.
-    """
+    """Return whether a convolution is a Gemm: kernels of 1 over images of one pixel."""
+    # So it is behind a global average. A Gemm may write float; a QLinearConv may not.
     image, weight = open_shape(node.inputs[0]), static_shape(node.inputs[1])
     return (
         node.op_type == "Conv"
@@ -116,12 +110,10 @@ def is_average(node: ir.Node) -> bool:
 
 
 def has_average_kernel(node: ir.Node) -> bool:
-    """Return whether the int8 kernel of an average computes what ONNX defines.
-
-    onnxruntime 1.31 refuses a QLinearAveragePool with dilations, of 1 too. With
-    ``count_include_pad`` and ``ceil_mode``, windows that reach beyond the padding are
-    divided by all their places; ONNX leaves those out that are beyond.
-    """
+    """Return whether the int8 kernel of an average computes what ONNX defines."""
+    # onnxruntime 1.31 refuses a QLinearAveragePool with dilations, of 1 too. With
+    # `count_include_pad` and `ceil_mode`, windows that reach beyond the padding are
+    # divided by all their places; ONNX leaves those out that are beyond.
     options = node.attributes
     dilated = "dilations" in options
     beyond = all(options.get_int(n, 0) for n in ("ceil_mode", "count_include_pad"))
@@ -129,10 +121,8 @@ def has_average_kernel(node: ir.Node) -> bool:
 
 
 def end_of(node: ir.Node) -> ir.Value:
-    """Return the output of a layer's kernel: that of the ReLU after it, if any.
-
-    A ReLU costs nothing where its uint8 grid begins at zero: quantization clips.
-    """
+    """Return the output of a layer's kernel: that of the ReLU after it, if any."""
+    # A ReLU costs nothing where its uint8 grid begins at zero: quantization clips
     reader = sole_reader(node.outputs[0])
     if reader is not None and is_clip_at_zero(reader):
         return reader.outputs[0]
@@ -251,11 +241,9 @@ def find_region(graph: ir.Graph, chosen: Collection[str]) -> Region:
 def _averages(
     graph: ir.Graph, layers: Mapping[ir.Node, ir.Value], sampled: Collection[ir.Value]
 ) -> set[ir.Node]:
-    """Find the averages that nothing but int8 kernels reads, directly or moved.
-
-    Other readers get the float average: rounding it would cost them more than the time
-    that it saves.
-    """
+    """Find the averages that nothing but int8 kernels reads, directly or moved."""
+    # Other readers get the float average: rounding it would cost them more than the
+    # time that it saves
     inputs = {*layers.values(), *sampled}
     only: set[ir.Node] = set()
 
@@ -299,15 +287,14 @@ class Grid:
 
     @classmethod
     def of(cls, value: ir.Value, low: float, high: float) -> Self:
-        """Return the grid of a tensor with a range.
-
-        A signed tensor keeps the plan's symmetric int8 grid exactly, moved up by 128:
-        onnxruntime's kernels process uint8 activations 10 to 40 times faster than int8
-        ones on processors with VNNI, whatever the zero point. Where one side of the
-        range is `LOPSIDED` times the other, as behind a SiLU or GELU, that grid wastes
-        up to half of its steps; here the range with zero is divided into 255 of them.
-        Where a tensor is never negative, the kernel's clipping replaces a ReLU.
-        """
+        """Return the grid of a tensor with a range."""
+        # A signed tensor keeps the plan's symmetric int8 grid exactly, moved up by 128:
+        # onnxruntime's kernels process uint8 activations 10 to 40 times faster than
+        # int8 ones on processors with VNNI, whatever the zero point. Where one side of
+        # the range is `LOPSIDED` times the other, as behind a SiLU or GELU, that grid
+        # wastes up to half of its steps; here the range with zero is divided into 255
+        # of them. Where a tensor is never negative, the kernel's clipping replaces a
+        # ReLU.
         low = 0.0 if never_negative(value) else min(low, 0.0)
         high = max(high, 0.0)
         narrow, wide = sorted((-low, high))

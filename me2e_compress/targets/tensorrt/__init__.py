@@ -75,12 +75,10 @@ class TensorRT(Target):
         return copy
 
     def fused_objection(self, node: ir.Node) -> str | None:
-        """Explain why a plugin gets no int8: most support float only.
-
-        A pair before those would run as separate kernels. In explicit quantization a
-        plugin gets the int8 directly, and its scale as an input (SparseDriveV2);
-        BEVFormer_tensorrt's plugins expect it by implicit quantization.
-        """
+        """Explain why a plugin gets no int8: most support float only."""
+        # A pair before those would run as separate kernels. In explicit quantization a
+        # plugin gets the int8 directly, and its scale as an input (SparseDriveV2);
+        # BEVFormer_tensorrt's plugins expect it by implicit quantization.
         plugin = find(node)
         if plugin is None or ir.DataType.INT8 not in plugin[1].operands[0].types:
             return f"the plugin {node.op_type} takes float32 or float16 alone"
@@ -97,11 +95,9 @@ class TensorRT(Target):
         return rules(version_of(self.version) if self.version else None)
 
     def lint(self, model: ir.Model) -> tuple[LintFinding, ...]:
-        """List all findings, as if no Clip stood between the nodes of a pair.
-
-        brevitas writes one there. TensorRT-RTX 1.7 builds int8 kernels of it, for
-        weights in float, activations and narrow ranges (measured).
-        """
+        """List all findings, as if no Clip stood between the nodes of a pair."""
+        # brevitas writes one there. TensorRT-RTX 1.7 builds int8 kernels of it, for
+        # weights in float, activations and narrow ranges (measured).
         copy = model.clone()
         copy.meta.update(model.meta)
         for node in list(nodes_of(copy)):
@@ -116,10 +112,8 @@ class TensorRT(Target):
 def _with_room(
     weights: Mapping[str, QuantizedWeight], nodes: Mapping[str, ir.Node], ranges: Ranges
 ) -> dict[str, QuantizedWeight]:
-    """Leave room for the biases: TensorRT keeps them in float, onnxruntime does not.
-
-    Layers that share a weight share its scales, so the largest of their least ones.
-    """
+    """Leave room for the biases: TensorRT keeps them in float, onnxruntime does not."""
+    # Layers that share a weight share its scales, so the largest of their least ones
     least: dict[tuple[str, int | None], npt.NDArray[np.float64]] = {}
     for output, weight in weights.items():
         value = nodes[output].inputs[0]

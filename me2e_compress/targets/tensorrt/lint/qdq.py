@@ -128,10 +128,8 @@ def biases(node: ir.Node) -> Iterator[str]:
 
 @rule_of_nodes("unpaired", "error", pairs_of)
 def completeness(node: ir.Node) -> Iterator[str]:
-    """Check that only DequantizeLinears of the same scale read a QuantizeLinear.
-
-    A plugin that takes int8, and its scale as another input, may also read it.
-    """
+    """Check that only DequantizeLinears of the same scale read a QuantizeLinear."""
+    # A plugin that takes int8, and its scale as another input, may also read it
     source, result = node.inputs[0], node.outputs[0]
     if node.op_type != QUANTIZE:
         if array_of(source) is None and not is_quantized(source):
@@ -204,10 +202,8 @@ def branches(node: ir.Node) -> Iterator[str]:
 
 @rule_of_nodes("half-quantized", "warning")
 def half_quantized(node: ir.Node) -> Iterator[str]:
-    """Find layers with only one int8 operand.
-
-    A matrix-vector product may have a float activation: its weight decides its speed.
-    """
+    """Find layers with only one int8 operand."""
+    # A matrix-vector product may have a float activation: its weight decides its speed
     if node.op_type not in WEIGHTED or not is_standard(node):
         return
     # Tell which operand is float: the remedy differs

@@ -222,10 +222,8 @@ def one_type(node: ir.Node) -> Iterator[str]:
 
 
 def plugins(model: ir.Model) -> Iterator[LintFinding]:
-    """Check custom operators against the known plugins, whatever their domain.
-
-    TensorRT looks at the name alone; exporters leave the domain out.
-    """
+    """Check custom operators against the known plugins, whatever their domain."""
+    # TensorRT looks at the name alone; exporters leave the domain out
     for node in filter(is_plugin, nodes_of(model)):
         dialect = _plugin(node)
         if dialect is not None:
