@@ -34,11 +34,8 @@ Dump: TypeAlias = EngineDump | Sequence[Arrays]
 class EngineRun:
     """What an engine answered, and what a graph answers with the engine's state.
 
-    Attributes:
-        session: The graph that the engine was built from.
-        frames: The recording.
-        dump: What the engine answered, by frame.
-        names: The outputs that both have.
+    ``session`` runs the graph that the engine was built from, ``dump`` has the engine's
+    answers by frame, ``names`` are the outputs that both have.
     """
 
     def __init__(self, session: Session, frames: Frames, dump: Dump) -> None:
@@ -226,7 +223,14 @@ def find_first_difference(
     shared = [name for name in borders if name in known]
     if not shared:
         raise EvaluationError("the graphs share no value at the border of a module")
-    feeds = _last_feeds(source, frames, provider)
+    # The inputs of the last frame, with the source's state
+    session = Session(source, optimize=False, release=True, provider=provider)
+    *before, last = frames if session.recurrent else frames[-1:]
+    state = session.first_state(frames[0].arrays)
+    for _, _, after in feed_forward(session, before, (), state):
+        state = detached(after)
+    state = session.first_state(last.arrays) if last.starts_scene else state
+    feeds = {**last.arrays, **state}
     expected = _compute(source, shared, feeds, provider)
     values = _compute(candidate, shared, feeds, provider)
     # A few casts to float16 in a float32 graph are what is looked for; not so where a
@@ -303,19 +307,6 @@ def _values_by_name(model: ir.Model) -> dict[str, ir.Node]:
     """Map every named value to its node, in order."""
     pairs = ((value.name, node) for node in model.graph for value in node.outputs)
     return {name: node for name, node in pairs if name}
-
-
-def _last_feeds(
-    model: ir.Model, frames: Sequence[Frame], provider: Provider
-) -> Mapping[str, Array]:
-    """Return a graph's inputs at the last frame, its own state included."""
-    session = Session(model, optimize=False, release=True, provider=provider)
-    *before, last = frames if session.recurrent else frames[-1:]
-    state = session.first_state(frames[0].arrays)
-    for _, _, after in feed_forward(session, before, (), state):
-        state = detached(after)
-    fresh = session.first_state(last.arrays) if last.starts_scene else state
-    return {**last.arrays, **fresh}
 
 
 def _compute(

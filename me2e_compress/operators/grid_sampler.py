@@ -374,7 +374,18 @@ def _by_gather(
     # Row 0 is the row of zeros
     padded = call.add("Pad", [value, call.integers([0, 1, 0, 0, 0, 0, 0, 0])])
     rows = call.reshape(padded, (-1, width))
-    base = _first_rows(call, padded, starts)
+    # The first row of image n, head m, level l: (n (S + 1) + start + 1) M + m
+    batch, length, outer = (call.size(padded, axis) for axis in (0, 1, 2))
+    many = call.value_of(outer)
+    starts = call.cast(starts, ir.DataType.INT64)
+    level = call.add("Mul", [call.add("Add", [starts, call.integers([1])]), many])
+    level = call.unsqueeze(level, (1,))
+    head = call.unsqueeze(call.counting(outer), (1, 2))
+    base = call.add("Add", [head, level])  # [M, L, 1]
+    if batch != 1:
+        step = call.value_of(call.product(length, outer))
+        image = call.add("Mul", [call.counting(batch), step])
+        base = call.add("Add", [call.unsqueeze(image, (1, 2, 3, 4)), base])
     many = call.value_of(heads)
     nothing, zero = call.integers(0), call.numbers(0.0, weights)
     parts = []
@@ -415,22 +426,6 @@ def _corner_pixels(
         inside = call.add("And", [above, call.add("Less", [edge, size])])
         neighbours.append((call.cast(edge, ir.DataType.INT64), inside, share))
     return neighbours
-
-
-def _first_rows(call: FusedCall, padded: ir.Value, starts: ir.Value) -> ir.Value:
-    """Write the first row of image n, head m, level l: (n S + start + 1) M + m."""
-    batch, length, heads = (call.size(padded, axis) for axis in (0, 1, 2))
-    many = call.value_of(heads)
-    starts = call.cast(starts, ir.DataType.INT64)
-    level = call.add("Mul", [call.add("Add", [starts, call.integers([1])]), many])
-    level = call.unsqueeze(level, (1,))
-    head = call.unsqueeze(call.counting(heads), (1, 2))
-    first = call.add("Add", [head, level])  # [M, L, 1]
-    if batch == 1:
-        return first
-    step = call.value_of(call.product(length, heads))
-    image = call.add("Mul", [call.counting(batch), step])
-    return call.add("Add", [call.unsqueeze(image, (1, 2, 3, 4)), first])
 
 
 def sample_levels_array(

@@ -176,16 +176,6 @@ def _begin(a: Any, query: int, count: int, columns: Any, state: Any, sums: Any) 
         sums[j] = F(0)
 
 
-@compiled
-def _end(a: Any, out: int, count: int, state: Any, sums: Any) -> None:
-    """Write the sums of a panel, divided by those of the powers, as rows."""
-    rows = floats(out)
-    for j in range(count):
-        part = F(1) / state[SUM * WIDTH + j]
-        for d in range(a[D]):
-            rows[j * a[ROW] + d] = sums[d * WIDTH + j] * part
-
-
 def _block(user: int, index: int) -> Word:
     a = words(user)
     # The queries of this block, and how many panels they are
@@ -217,8 +207,14 @@ def _block(user: int, index: int) -> Word:
             sizes = (1, a[ROW], WIDTH, WIDTH, a[D], left, many, 1)
             _multiply((value, s, out, *sizes))
     for p in range(panels):
+        # out[j, d] = o[d, j] / sum of powers of query j
         left, at = min(WIDTH, count - p * WIDTH), rows + p * WIDTH * a[ROW] * 4
-        _end(a, a[OUT] + at, left, floats(r + p * STATE * 4), floats(o + p * size))
+        state, sums = floats(r + p * STATE * 4), floats(o + p * size)
+        out_rows = floats(a[OUT] + at)
+        for j in range(left):
+            part = F(1) / state[SUM * WIDTH + j]
+            for d in range(a[D]):
+                out_rows[j * a[ROW] + d] = sums[d * WIDTH + j] * part
     return 0
 
 

@@ -231,7 +231,7 @@ _OTHERS = (4, 32)  # those of aarch64
 
 @functools.cache
 def host_tile(vectors: int = 2) -> Tile:
-    """Return the largest tile of so many vectors that fits the processor's registers."""
+    """Return the largest tile of so many vectors that fits into the registers."""
     # Beside the tile, they hold one row of B and one number of A
     features = llvm.get_host_cpu_features()
     lanes, registers = next(

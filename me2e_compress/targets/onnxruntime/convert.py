@@ -173,11 +173,22 @@ def _weight_of(layer: ir.Node) -> QuantizedWeight | None:
     node = producer_of(layer.inputs[1])
     if node is None or node.op_type != DEQUANTIZE:
         return None
-    step = _step_of(node)
-    integers = _integers(node, step)
-    if integers is None:
-        return None
-    # A batch of one matrix is read as that matrix.
+    step, source = _step_of(node), node.inputs[0]
+    stored = array_of(source)
+    if stored is not None:
+        integers = stored.astype(np.int8)
+    else:
+        # ModelOpt stores floats: quantize them here
+        quantize = maker(source, QUANTIZE)
+        weight = None if quantize is None else array_of(quantize.inputs[0])
+        if weight is None:
+            return None
+        shape = [1] * weight.ndim
+        if step.size > 1:
+            shape[node.attributes.get_int("axis", 1) % weight.ndim] = step.size
+        steps: Floats = np.rint(weight.astype(np.float32) / step.reshape(shape))
+        integers = np.clip(steps, -QUANT_MAX, QUANT_MAX).astype(np.int8)
+    # A batch of one matrix is read as that matrix
     along = node.attributes.get_int("axis", 1) % integers.ndim
     axis = graph.channel_axis(layer)
     if layer.op_type == "MatMul" and integers.ndim > 2:
@@ -192,29 +203,8 @@ def _weight_of(layer: ir.Node) -> QuantizedWeight | None:
         )
     # One scale in all is repeated for every channel.
     scales = np.broadcast_to(step.reshape(-1), (integers.shape[axis],))
-    source = node.inputs[0]
     name = str(layer.outputs[0].name if source is None else source.name)
     return QuantizedWeight(name, integers, np.ascontiguousarray(scales), axis)
-
-
-def _integers(dequantize: ir.Node, step: Floats) -> npt.NDArray[np.int8] | None:
-    """Return the constant input of a DequantizeLinear as int8."""
-    source = dequantize.inputs[0]
-    stored = graph.array_of(source)
-    if stored is not None:
-        return stored.astype(np.int8)
-    # ModelOpt stores floats: quantize them here.
-    quantize = producer_of(source)
-    if quantize is None or quantize.op_type != QUANTIZE:
-        return None
-    weight = graph.array_of(quantize.inputs[0])
-    if weight is None:
-        return None
-    shape = [1] * weight.ndim
-    if step.size > 1:
-        shape[dequantize.attributes.get_int("axis", 1) % weight.ndim] = step.size
-    steps: Floats = np.rint(weight.astype(np.float32) / step.reshape(shape))
-    return np.clip(steps, -QUANT_MAX, QUANT_MAX).astype(np.int8)
 
 
 # Tell a quantized file that onnxruntime's CPU runs slower than float: TensorRT's form.
