@@ -113,17 +113,15 @@ OPERATORS: Registry[Operator] = Registry(
         "deformable-aggregation": (
             f"{_HERE}.deformable_aggregation:DeformableAggregation"
         ),
-        "rotate": f"{_HERE}.rotate:Rotate",
+        "rotate": f"{_HERE}.birds_eye_view:Rotate",
         "inverse": f"{_HERE}.inverse:Inverse",
         "grid-sampler-2d": f"{_HERE}.grid_sampler:GridSampler2D",
         "grid-sampler-3d": f"{_HERE}.grid_sampler:GridSampler3D",
         "select-and-pad": f"{_HERE}.select_and_pad:SelectAndPad",
-        "bev-pool": f"{_HERE}.bev_pool:BEVPool",
+        "bev-pool": f"{_HERE}.birds_eye_view:BEVPool",
         "multi-head-attention": f"{_HERE}.multi_head_attention:FusedMultiHeadAttention",
-        "deformable-convolution": (
-            f"{_HERE}.deformable_convolution:DeformableConvolution"
-        ),
-        "winograd-convolution": f"{_HERE}.winograd_convolution:WinogradConvolution",
+        "deformable-convolution": f"{_HERE}.convolutions:DeformableConvolution",
+        "winograd-convolution": f"{_HERE}.convolutions:WinogradConvolution",
         "histogram": f"{_HERE}.histogram:Histogram",
     },
 )

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from me2e_compress.base.errors import FramesError
 from me2e_compress.operators import kernels
-from me2e_compress.operators.winograd_convolution import WinogradConvolution
+from me2e_compress.operators.convolutions import WinogradConvolution
 from me2e_compress.runtime.session import Session
 from tests.operators.kernels import needs_kernels
 from tests.operators.running import graph_of
