@@ -221,10 +221,7 @@ class Target(abc.ABC):
         return ()
 
     def fused_objection(self, node: ir.Node) -> str | None:
-        """Explain why a fused operator cannot read int8; None if it can.
-
-        ``node`` is of an operator that declares which of its inputs may be int8.
-        """
+        """Explain why an operator with int8 inputs cannot read int8; None if it can."""
         return f"{self.name} has no int8 kernel for {node.op_type}"
 
     def check_types(self, plan: QuantPlan, model: ir.Model) -> None:
@@ -257,10 +254,7 @@ class Target(abc.ABC):
         )
 
     def costs(self, model: ir.Model, layers: Collection[ir.Node]) -> Costs | None:
-        """Estimate the savings and costs of int8 for candidate layers; None if unknown.
-
-        Shapes of the float graph are inferred.
-        """
+        """Estimate what int8 of layers saves and costs; None if unknown."""
         return None
 
     def lint_rules(self) -> tuple[LintRule, ...]:

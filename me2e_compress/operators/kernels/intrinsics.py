@@ -114,10 +114,7 @@ def error_status(t: Any, message: int) -> Word:
 
 @compiled
 def read_input(t: Any, context: int, index: int, to: int) -> Word:
-    """Read an input into ten words (dimensions, address, type) and return its rank.
-
-    More than eight dimensions are not read.
-    """
+    """Read an input into ten words (dimensions, address, type) and return its rank."""
     slot = _slot()
     at = address_of(slot)
     call(t[abi.GET_INPUT], context, index, at, 0, 0)
@@ -128,7 +125,7 @@ def read_input(t: Any, context: int, index: int, to: int) -> Word:
     call(t[abi.GET_TYPE], info, to + abi.TYPE * 8, 0, 0, 0)
     call(t[abi.GET_RANK], info, at, 0, 0, 0)
     rank = slot[0]
-    if rank <= abi.ADDRESS:
+    if rank <= abi.ADDRESS:  # more than eight dimensions are not read
         call(t[abi.GET_DIMS], info, to, rank, 0, 0)
     call(t[abi.RELEASE_INFO], info, 0, 0, 0, 0)
     return rank
@@ -152,10 +149,7 @@ _slots = stack(types.int64, 2)
 
 @compiled
 def allocate_memory(t: Any, context: int, size: int, to: Any) -> Word:
-    """Allocate memory of the arena, write its address to ``to[0]``; return the status.
-
-    ``to`` are three words, which :func:`free_memory` needs.
-    """
+    """Allocate arena memory: write three words, its address first; return a status."""
     slots = _slots()
     at = address_of(slots)
     status = call(t[abi.GET_ALLOCATOR], context, t[abi.MEMORY], at, 0, 0)

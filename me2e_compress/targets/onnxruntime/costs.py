@@ -90,10 +90,7 @@ ZEN5 = CpuSeconds(
 def costs_of(
     model: ir.Model, chosen: Collection[ir.Node], machine: CpuSeconds = ZEN5
 ) -> Costs:
-    """Estimate the savings and costs of int8 for some layers.
-
-    Shapes are inferred; candidates without a kernel are ignored.
-    """
+    """Estimate what int8 of layers saves and costs; those without kernel are left out."""
     weights = constant_values(model)
     names = {
         str(node.outputs[0].name)
