@@ -90,7 +90,7 @@ ZEN5 = CpuSeconds(
 def costs_of(
     model: ir.Model, chosen: Collection[ir.Node], machine: CpuSeconds = ZEN5
 ) -> Costs:
-    """Estimate what int8 of layers saves and costs; those without kernel are left out."""
+    """Estimate what int8 of layers saves and costs; without a kernel: nothing."""
     weights = constant_values(model)
     names = {
         str(node.outputs[0].name)
