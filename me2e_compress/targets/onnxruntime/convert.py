@@ -99,7 +99,7 @@ def _draft_of_qdq(model: ir.Model) -> Draft:
     # QuantizeLinear. Biases stored as int32 become float again.
     copy = model.clone()
     graph.infer_shapes(copy)
-    # Find the pairs of activations, and their ranges
+    # Find the pairs of activations
     pairs = dict[ir.Node, ir.Value]()
     for node in copy.graph:
         is_second = node.op_type == DEQUANTIZE
@@ -240,6 +240,7 @@ def slow_here(model: ir.Model, provider: Provider = CPU) -> str | None:
     slow = [node for node in layers if not _is_fast(node)]
     if not slow or 2 * len(slow) < len(layers):
         return None
+    # TensorRT's form: signed, with zero points 0; lower-int8 rewrites its int8
     form, remedy = "a form that is", ""
     read = [pair for node in slow if (pair := dequantizer_of(node.inputs[0]))]
     kinds = {stored_type(pair) for pair in read}
