@@ -47,6 +47,7 @@ def deadlines(
     ``measured`` is the number of samples in the trace that the latencies were drawn
     from; None if each was measured on its own.
     """
+    # A percentile needs enough samples of its own
     count, none = len(latencies_us), "no decision was taken"
     samples = count if measured is None else min(count, measured)
     late = sum(latency_us > 1e3 * budget_ms for latency_us in latencies_us)

@@ -23,9 +23,6 @@ from me2e_compress.metrics.measure import Estimate, mean_estimate
 from me2e_compress.metrics.route_scores import CHECKPOINTS
 from me2e_compress.metrics.route_summary import RouteSummary
 
-# The four measures of EER_AV, route by route.
-
-
 Floats = npt.NDArray[np.float64]
 
 
@@ -48,21 +45,18 @@ def route_measures(
     """Return the measures of driven routes, in their order.
 
     A frame in the paper's joules per frame is one inference (its window is 100 of
-    them), so a route costs that times its decisions; simulator frames without a
-    decision cost nothing. A real run without a log of decisions has one per recorded
-    step, since Bench2Drive's agents do both at once. ``j_per_frame`` is None if it was
-    not measured.
+    them), so a route costs that times its decisions. A real run without a log of
+    decisions has one per recorded step, since Bench2Drive's agents do both at once.
+    ``j_per_frame`` is None if it was not measured.
 
     A driver that never passed the first 5 % of a route, or ended it within 20 frames,
     has no efficiency or comfort (equations 6 and 7 leave the route out). Here every
-    route has a score (equation 9), so that counts as 0; otherwise the failure would be
-    left out too. A route without moving traffic has no efficiency, nor has one without
-    recorded frames or decisions.
+    route has a score (equation 9), so that counts as 0: the failure must not vanish.
     """
     rows = list[tuple[float, float, float, float]]()
     for route in routes:
         efficiency, comfort, joules = route.efficiency, route.comfort, math.nan
-        # without frames the record lacks them, not the drive, unless the driver failed
+        # Without frames the record lacks them, not the drive, unless the driver failed
         failed = route.ending in FAILURES
         recorded = bool(route.duration_us) or failed
         if efficiency is None:
@@ -159,11 +153,16 @@ def eer(
         kept, gaps = ~gone.any(axis=1), gone.sum(axis=0).tolist()
         left_out = {m: n for m, n in zip(MEASURES, gaps, strict=True) if n}
     tables = {name: measures.table[kept] for name, measures in able.items()}
-    # Find weights and scales, unless they are given
+    # Normalize each measure by min-max, and weigh it, unless a scale is given
     reason = "" if kept.any() else "no route has all four measures"
     if not reason and scale is None:
+        rows = np.concatenate(list(tables.values()))  # (variants * routes, 4)
+        offset, span = rows.min(axis=0), np.ptp(rows, axis=0)
+        span = np.where(span > 0.0, span, 1.0)  # a constant measure has weight 0
         try:
-            scale = scale_of(tables)
+            weights = critic_weights((rows - offset) / span)
+            columns = (tuple(row.tolist()) for row in (weights, offset, span))
+            scale = EerScale(*columns)
         except EvaluationError as error:
             reason = str(error)
     # Estimate every variant's score, or say why there is none
@@ -174,23 +173,16 @@ def eer(
         if why or scale is None:
             scores[name] = Estimate.missing(POINTS, why)
             continue
-        # Equation 8
-        rows = (tables[name] - np.array(scale.offset)) / np.array(scale.span)
-        terms = rows * np.array(scale.weights) * SIGNS
+        # Equation 8: the driving score counts always, the rest without a collision
+        x = (tables[name] - np.array(scale.offset)) / np.array(
+            scale.span
+        )  # (routes, 4)
+        terms = x * np.array(scale.weights) * SIGNS
         safe = np.where(measures.crashed[kept], 0.0, terms[:, 1:].sum(axis=1))
         routes[name] = np.asarray(100.0 * (terms[:, 0] + safe))
         own_kinds = [kind for kind, keep in zip(kinds, kept, strict=True) if keep]
         scores[name] = mean_estimate(routes[name].tolist(), own_kinds, POINTS, seed)
     return EerResult(scores, routes, None if reason else scale, left_out, kept)
-
-
-def scale_of(tables: Mapping[str, Floats]) -> EerScale:
-    """Return offset, span and CRITIC weights of every measure, from complete tables."""
-    rows = np.concatenate(list(tables.values()))
-    offset, span = rows.min(axis=0), np.ptp(rows, axis=0)
-    span = np.where(span > 0.0, span, 1.0)  # a constant measure has weight 0
-    weights = critic_weights((rows - offset) / span)
-    return EerScale(*(tuple(row.tolist()) for row in (weights, offset, span)))
 
 
 def critic_weights(rows: Floats) -> Floats:
@@ -200,8 +192,7 @@ def critic_weights(rows: Floats) -> Floats:
     Mavrotas and Papayannakis 1995), here in the paper's form.
 
     Equation 10: c_i = sigma_i * sum over j of (1 - abs(r_ij)); equation 11: w_i = c_i /
-    sum of c. Sigma is the population's standard deviation (the sample's gives the same
-    weights), r is Pearson's. The sign of a criterion does not matter. A constant
+    sum of c. Sigma is the population's standard deviation, r is Pearson's. A constant
     criterion has weight 0 and is left out of the sums of the others.
 
     Example: the columns (0, 0, 1, 1), (0, 1, 1, 1) and (0, 1, 0, 1) have sigma 1/2,
@@ -223,7 +214,7 @@ def critic_weights(rows: Floats) -> Floats:
         correlation = np.atleast_2d(np.corrcoef(rows[:, varies], rowvar=False))
         apart = np.clip(1.0 - np.abs(correlation), 0.0, 1.0)
         content[varies] = spread[varies] * apart.sum(axis=1)
-    # Fully correlated criteria give no weights
+    # Divide by the sum; fully correlated criteria give no weights
     total = float(content.sum())
     if total <= ALIKE * float(spread.sum()) or not varies.any():
         raise EvaluationError(

@@ -9,15 +9,6 @@ from typing import Annotated, Any
 
 from pydantic import ConfigDict, Field, TypeAdapter, with_config
 
-__all__ = [
-    "FRAME_US",
-    "EgoFrame",
-    "Ending",
-    "Episode",
-    "Given",
-    "InferenceRecord",
-]
-
 
 class InfractionKind(StrEnum):
     """The keys of `infractions` in a leaderboard record, and `GIVE_WAY`, our own."""
@@ -120,7 +111,6 @@ class Infraction:
 
 
 # Record of how close an episode came to a collision.
-
 
 TTC_HORIZON_S = 10.0
 """A contact later than this is not written down: our choice, far beyond every
@@ -301,8 +291,10 @@ class Episode:
         """Return plain objects; frames and decisions are stored column by column."""
         bare = dataclasses.replace(self, frames=(), decisions=())
         record: dict[str, Any] = _EPISODE.dump_python(bare, mode="json")
-        record["frames"] = _columns(EgoFrame, self.frames)
-        record["decisions"] = _columns(InferenceRecord, self.decisions)
+        for kind, rows in ((EgoFrame, self.frames), (InferenceRecord, self.decisions)):
+            names = [field.name for field in dataclasses.fields(kind)]
+            columns = {name: [getattr(row, name) for row in rows] for name in names}
+            record["frames" if kind is EgoFrame else "decisions"] = columns
         return record
 
     @classmethod
@@ -312,24 +304,17 @@ class Episode:
         Raises:
             ValueError: If anything is missing, unknown, of another type or not finite.
         """
-        by_columns = ("frames", "decisions")
-        rows = {name: _rows(name, record.get(name, {})) for name in by_columns}
-        return _EPISODE.validate_python({**record, **rows})
+        record = dict(record)
+        for name in ("frames", "decisions"):
+            columns = record.get(name, {})
+            lists = columns.values() if isinstance(columns, dict) else ()
+            if not isinstance(columns, dict) or set(map(type, lists)) - {list}:
+                raise ValueError(f"{name} are not stored as columns")
+            if len(set(map(len, lists))) > 1:
+                raise ValueError(f"the columns of {name} differ in length")
+            rows = zip(*lists, strict=True)
+            record[name] = tuple(dict(zip(columns, row, strict=True)) for row in rows)
+        return _EPISODE.validate_python(record)
 
 
 _EPISODE = TypeAdapter(Episode)
-
-
-def _columns(kind: type, rows: tuple[Any, ...]) -> dict[str, list[Any]]:
-    names = [field.name for field in dataclasses.fields(kind)]
-    return {name: [getattr(row, name) for row in rows] for name in names}
-
-
-def _rows(name: str, columns: object) -> tuple[dict[str, Any], ...]:
-    lists = columns.values() if isinstance(columns, dict) else ()
-    if not isinstance(columns, dict) or set(map(type, lists)) - {list}:
-        raise ValueError(f"{name} are not stored as columns")
-    if len(set(map(len, lists))) > 1:
-        raise ValueError(f"the columns of {name} differ in length")
-    rows = zip(*lists, strict=True)
-    return tuple(dict(zip(columns, row, strict=True)) for row in rows)

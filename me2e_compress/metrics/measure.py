@@ -23,8 +23,6 @@ from statistics import fmean
 import numpy as np
 import numpy.typing as npt
 
-# Percentiles of a sample, and how many samples they need.
-
 
 def too_few(percent: float, count: int) -> str:
     """Say why there are too few samples for a percentile; empty if there are enough.
@@ -154,25 +152,28 @@ def intervals(
     The statistic takes weights of the routes [resamples, routes] and returns
     [resamples]; ``value`` is what it is of the routes as they are. See `mean_estimate`.
     """
+
+    def middle(values: Floats, n: int) -> Interval:
+        # Where nothing differed, the interval is that of what could differ unseen
+        tail = 50.0 * (1.0 - CONFIDENCE)
+        low, high = map(float, np.percentile(values, [tail, 100.0 - tail]))
+        same = is_a_point((low, high))
+        return unseen_interval(value, n, bounds) if same else (low, high)
+
+    kinds = len(set(types))
     if len(types) < 2:
         return (None, None), (None, None)
     within, anew = _weights(tuple(types), seed)
-    here = _middle(statistic(within))
-    if is_a_point(here):
-        here = unseen_interval(value, len(types), bounds)
-    kinds = len(set(types))
+    here = middle(statistic(within), len(types))
     if kinds < FEWEST_TYPES:
         return here, (None, None)
-    over_types = _middle(statistic(anew))
-    if is_a_point(over_types):
-        over_types = unseen_interval(value, kinds, bounds)
-    return here, over_types
+    return here, middle(statistic(anew), kinds)
 
 
 def unseen_share(n: int) -> float:
     """Return the largest share that n draws without a hit leave open, with 95 %.
 
-    Exact (1 - 0.05 ** (1 / n)); the rule of three says 3 / n.
+    Exact, 1 - 0.05 ** (1 / n); the rule of three approximates it by 3 / n.
     """
     return float(1.0 - (1.0 - CONFIDENCE) ** (1.0 / n))
 
@@ -211,6 +212,7 @@ def _weights(types: tuple[str, ...], seed: int) -> tuple[Floats, Floats]:
     names, type_of, sizes = np.unique(
         np.array(types, str), return_inverse=True, return_counts=True
     )
+    # Resample the routes of each stratum, then whole types
     stratum = np.where(sizes[type_of] == 1, -1, type_of)
     random, within = np.random.default_rng(seed), np.zeros((RESAMPLES, len(stratum)))
     for name in np.unique(stratum):
@@ -224,6 +226,7 @@ def _weights(types: tuple[str, ...], seed: int) -> tuple[Floats, Floats]:
 
 def drawn(random: np.random.Generator, size: int, resamples: int = RESAMPLES) -> Floats:
     """Return [resamples, size] how often each was drawn, scaled to a sum of size."""
+    # Count the draws of every resample at once: its own range of bins
     draws = max(size - 1, 1)
     picked = random.integers(size, size=(resamples, draws))
     picked += size * np.arange(resamples)[:, None]
@@ -231,15 +234,7 @@ def drawn(random: np.random.Generator, size: int, resamples: int = RESAMPLES) ->
     return counts.reshape(resamples, size).astype(np.float64) * (size / draws)
 
 
-def _middle(values: Floats) -> Interval:
-    tail = 50.0 * (1.0 - CONFIDENCE)
-    low, high = np.percentile(values, [tail, 100.0 - tail])
-    return float(low), float(high)
-
-
-def is_a_point(interval: Interval) -> bool:
+def is_a_point(interval: tuple[float, float]) -> bool:
     """Return whether both ends are equal, to nine digits."""
     low, high = interval
-    if low is None or high is None:
-        return False
     return high - low <= 1e-9 * max(abs(low), abs(high), 1e-9)

@@ -49,7 +49,6 @@ def route_score(episode: Episode) -> RouteScore:
 
 # Driving efficiency: the ego's speed relative to the traffic around it.
 
-
 CHECKPOINTS = 20
 OUTLIER_PERCENT = 1000.0
 DONE_PERCENT = 95.0
@@ -68,10 +67,10 @@ def efficiency(episode: Episode) -> Measure:
     ratios = speed_ratios(episode)
     if episode.completion_percent < 100.0 / CHECKPOINTS:
         return Measure(None, PERCENT, "the ego did not pass the first 5 % of the route")
-    kept = [ratio for ratio in ratios if ratio <= OUTLIER_PERCENT]
-    if not kept:
+    usual = [ratio for ratio in ratios if ratio <= OUTLIER_PERCENT]
+    if not usual:
         return Measure(None, PERCENT, "no check point saw moving traffic")
-    return Measure(fmean(kept), PERCENT)
+    return Measure(fmean(usual), PERCENT)
 
 
 def speed_ratios(episode: Episode) -> tuple[float, ...]:
@@ -80,12 +79,11 @@ def speed_ratios(episode: Episode) -> tuple[float, ...]:
     Ratios reported by the simulator take precedence. Bench2Drive writes the last one
     twice if more than 95 % of the route was passed; it is kept once.
     """
-    if episode.speed_ratios_percent is not None:
-        given = episode.speed_ratios_percent
+    if (reported := episode.speed_ratios_percent) is not None:
         done = episode.completion_percent > DONE_PERCENT
-        twice = done and len(given) > 1 and given[-1] == given[-2]
-        return given[:-1] if twice else given
-    # The frames between two check points
+        twice = done and len(reported) > 1 and reported[-1] == reported[-2]
+        return reported[:-1] if twice else reported
+    # Cut the frames at the check points
     spacing_m = episode.route_length_m / CHECKPOINTS
     passed, stretches = 0, list[list[EgoFrame]]([[]])
     for frame in episode.frames:
@@ -94,6 +92,7 @@ def speed_ratios(episode: Episode) -> tuple[float, ...]:
         if reached > passed:
             passed = reached
             stretches.append([])
+    # The last stretch counts only if it ends at the goal
     ended = episode.ending is Ending.COMPLETED and passed < CHECKPOINTS
     sums = map(beside_traffic, stretches if ended else stretches[:-1])
     return tuple(100.0 * ego / traffic for ego, traffic, _ in sums if traffic > 0.0)
@@ -111,7 +110,6 @@ def beside_traffic(stretch: Sequence[EgoFrame]) -> tuple[float, float, int]:
 
 # Driving comfort: the share of seconds with every variable in its range.
 
-
 SEGMENT_FRAMES = 20
 WINDOW = 7
 ORDER = 2
@@ -119,7 +117,6 @@ BLOCKED_SPEED_MPS = 0.1
 BLOCKED_US = 60_000_000
 
 Floats = npt.NDArray[np.float64]
-
 
 # The paper's table 1 in SI units: the 99th percentiles of human drivers that nuPlan's
 # comfort metric uses
@@ -208,7 +205,6 @@ def _blocked_frames(episode: Episode) -> npt.NDArray[np.bool_]:
 # routes end in one, so collisions alone separate drivers slowly; these measures also
 # count near misses. Each is None if its input was not recorded.
 
-
 TTC_CRITICAL_S = 1.5
 """A time to collision below this is a conflict: SSAM's default (Gettman et al. 2008,
 FHWA-HRT-08-051), after Van der Horst and Hogema 1993."""
@@ -236,11 +232,11 @@ def room_kept(episode: Episode) -> Measure:
     that was the ego's fault. The driving score sees neither near misses nor faults.
     """
     exposed, pet = ttc_exposure(episode).value, smallest_pet(episode).value
-    kept = room_of(exposed, pet, at_fault_collision(episode))
-    if kept is None:
+    room = room_of(exposed, pet, at_fault_collision(episode))
+    if room is None:
         why = "whose fault a collision was is not known"
         return Measure(None, "%", NOT_RECORDED if exposed is None else why)
-    return Measure(kept, "%")
+    return Measure(room, "%")
 
 
 def room_of(
@@ -249,8 +245,8 @@ def room_of(
     """Return `room_kept` of its three parts; None if the first or last is unknown."""
     if ttc_exposure is None or at_fault is None:
         return None
-    kept = 1.0 if smallest_pet is None else min(smallest_pet / TTC_CRITICAL_S, 1.0)
-    return 0.0 if at_fault else (100.0 - ttc_exposure) * kept
+    share = 1.0 if smallest_pet is None else min(smallest_pet / TTC_CRITICAL_S, 1.0)
+    return 0.0 if at_fault else (100.0 - ttc_exposure) * share
 
 
 def smallest_ttc(episode: Episode) -> Measure:

@@ -20,7 +20,6 @@ from me2e_compress.metrics.measure import (
     Estimate,
     mean_estimate,
     unseen_interval,
-    unseen_share,
 )
 
 PERCENTS = (50, 90, 99, 100)
@@ -96,8 +95,8 @@ class RouteSummary:
     @property
     def moments(self) -> tuple[tuple[str, int | None], ...]:
         """Kind and time of each infraction but being too slow, which has no moment."""
-        timed = (one for one in self.infractions if one[0] != InfractionKind.MIN_SPEED)
-        return tuple((kind, time_us) for kind, time_us, _ in timed)
+        slow = InfractionKind.MIN_SPEED
+        return tuple((kind, us) for kind, us, _ in self.infractions if kind != slow)
 
     @property
     def fate(self) -> str:
@@ -119,30 +118,32 @@ class RouteSummary:
         latency_us = np.percentile(charged or [0], PERCENTS, method="higher")
         steps = 0 if episode.given is None else len(episode.frames)
         return cls(
-            episode.route,
-            episode.scenario,
-            scored.route_score(episode).composed,
-            episode.completion_percent,
-            episode.succeeded,
-            episode.ending.value,
-            tuple((e.kind.value, e.time_us, e.detail) for e in episode.infractions),
-            scored.efficiency(episode).value,
-            scored.comfort(episode).value,
-            episode.frames[-1].time_us if episode.frames else 0,
-            len(charged) or steps,
-            tuple(map(int, latency_us)) if charged else (),
-            sum(charged),
-            scored.ttc_exposure(episode).value,
-            scored.smallest_ttc(episode).value,
-            scored.smallest_pet(episode).value,
-            scored.smallest_distance(episode).value,
-            scored.at_fault_collision(episode),
-            bench2drive.efficiency(episode).value,
-            bench2drive.smoothness(episode).value,
+            route=episode.route,
+            scenario=episode.scenario,
+            driving_score=scored.route_score(episode).composed,
+            completion=episode.completion_percent,
+            succeeded=episode.succeeded,
+            ending=episode.ending.value,
+            infractions=tuple(
+                (e.kind.value, e.time_us, e.detail) for e in episode.infractions
+            ),
+            efficiency=scored.efficiency(episode).value,
+            comfort=scored.comfort(episode).value,
+            duration_us=episode.frames[-1].time_us if episode.frames else 0,
+            decisions=len(charged) or steps,
+            latency_us=tuple(map(int, latency_us)) if charged else (),
+            latency_sum_us=sum(charged),
+            ttc_exposure=scored.ttc_exposure(episode).value,
+            smallest_ttc=scored.smallest_ttc(episode).value,
+            smallest_pet=scored.smallest_pet(episode).value,
+            smallest_distance=scored.smallest_distance(episode).value,
+            at_fault=scored.at_fault_collision(episode),
+            bench2drive_efficiency=bench2drive.efficiency(episode).value,
+            bench2drive_smoothness=bench2drive.smoothness(episode).value,
         )
 
     def rounded(self) -> Self:
-        """Return it with as many digits as files keep."""
+        """Return it with the digits that files hold."""
         floats = ((k, v) for k, v in vars(self).items() if isinstance(v, float))
         rounded: dict[str, Any] = {name: round(value, DIGITS) for name, value in floats}
         return replace(self, **rounded)
@@ -248,27 +249,23 @@ class PairedDifference:
     What makes a route hard for both cancels out, so the intervals are narrower than
     those of the two means suggest. The interval over these scenario types is never
     narrower than what so few routes can exclude (`metrics.measure.unseen_share`).
-    ``better`` and ``worse`` count routes by driving score; ``gained`` and ``lost``
-    count routes on which only this variant, or only the reference, succeeds.
+
+    Attributes:
+        routes_better: Routes with a higher driving score than the reference's.
+        success_gained: Routes on which only this variant succeeds.
+        success_lost: Routes on which only the reference succeeds.
+        mcnemar_p: Two-sided p-value of McNemar's exact test that success is equally
+            frequent; routes are treated as independent.
     """
 
     driving_score: Estimate
     room_kept: Estimate
     success_rate: Estimate
-    better: int
-    worse: int
-    gained: int = 0
-    lost: int = 0
-
-    @property
-    def differ(self) -> int:
-        """Number of routes whose driving scores differ."""
-        return self.better + self.worse
-
-    @property
-    def unseen_percent(self) -> float:
-        """Upper 95 % bound of the share that could differ if none of these does."""
-        return 100.0 * unseen_share(self.driving_score.n)
+    routes_better: int
+    routes_worse: int
+    success_gained: int = 0
+    success_lost: int = 0
+    mcnemar_p: float = 1.0
 
     @property
     def smallest_shown(self) -> float:
@@ -290,36 +287,17 @@ class PairedDifference:
             return "too few routes"
         return ("no difference shown", "better", "worse")[score.sign]
 
-    @property
-    def p_value(self) -> float:
-        """Two-sided p-value of McNemar's exact test that success is equally frequent.
-
-        Only routes with different outcomes count; without any it is 1. Routes are
-        treated as independent.
-        """
-        from scipy.stats import binomtest  # takes a second to import
-
-        parted = self.gained + self.lost
-        return float(binomtest(self.gained, parted).pvalue) if parted else 1.0
-
-    def to_json(self) -> dict[str, Any]:
-        """Return both estimates, all counts and the p-value."""
-        return {
-            "driving_score": self.driving_score,
-            "room_kept": self.room_kept,
-            "success_rate": self.success_rate,
-            "routes_better": self.better,
-            "routes_worse": self.worse,
-            "success_gained": self.gained,
-            "success_lost": self.lost,
-            "mcnemar_p": self.p_value,
-        }
-
 
 def difference(
     routes: Sequence[RouteSummary], reference: Sequence[RouteSummary], seed: int = 0
 ) -> PairedDifference:
-    """Compare two drives of the same routes, at least one, route by route."""
+    """Compare two drives of the same routes, at least one, route by route.
+
+    Raises:
+        EvaluationError: A route was driven by one of the two only.
+    """
+    from scipy.stats import binomtest  # takes a second to import
+
     # Routes must match, whatever their order
     ours, others = ({route.route for route in drive} for drive in (routes, reference))
     if unpaired := sorted(ours ^ others):
@@ -330,15 +308,19 @@ def difference(
     scores, room, rates = (
         column.values(routes) - column.values(reference) for column in (DS, ROOM, SR)
     )
+    # Only routes with different outcomes count in McNemar's test
     gaps, turns = scores.by_route.values(), rates.by_route.values()
+    gained, lost = sum(turn > 0 for turn in turns), sum(turn < 0 for turn in turns)
+    p_value = float(binomtest(gained, gained + lost).pvalue) if gained + lost else 1.0
     return PairedDifference(
         _estimate(scores, seed),
         _estimate(room, seed),
         _estimate(rates, seed),
         sum(gap > 0 for gap in gaps),
         sum(gap < 0 for gap in gaps),
-        sum(turn > 0 for turn in turns),
-        sum(turn < 0 for turn in turns),
+        gained,
+        lost,
+        p_value,
     )
 
 

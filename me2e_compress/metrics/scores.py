@@ -1,6 +1,6 @@
 """All scores of a set of driven routes."""
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from statistics import fmean
 from typing import Any
@@ -8,12 +8,7 @@ from typing import Any
 import numpy as np
 
 from me2e_compress.metrics import bench2drive, route_scores
-from me2e_compress.metrics.bench2drive import (
-    ABILITIES,
-    ability_rates,
-    success,
-    successes,
-)
+from me2e_compress.metrics.bench2drive import ABILITIES, mastered, success
 from me2e_compress.metrics.episode import FAILURES, Episode
 from me2e_compress.metrics.measure import (
     Bounds,
@@ -52,11 +47,9 @@ class SafetyScores:
 class Scores:
     """Means over the driven routes, each with its interval.
 
-    Percentages, except for comfort: it is the share of smooth segments (equation 7, SI
-    units). The fields
-    ``bench2drive_...`` follow Bench2Drive's own arithmetic; its smoothness is also
-    called comfort there. ``failures`` has the reason for each route that the policy or
-    the simulator ended by failing. A partial result has fewer routes than ``expected``.
+    Percentages, but for comfort: the share of smooth segments (equation 7, SI units).
+    The fields ``bench2drive_...`` follow Bench2Drive's own arithmetic. ``failures`` has
+    the reason for each route that the policy or the simulator ended by failing.
     """
 
     driving_score: Estimate
@@ -75,12 +68,12 @@ class Scores:
     @property
     def failed(self) -> str:
         """Number of routes that a failure ended, with one of them; empty if none."""
-        if not self.failures:
-            return ""
-        route, words = next(iter(self.failures.items()))
-        count = f"{len(self.failures)} of {self.routes} routes"
-        why = f"{words} ({route})"
-        return f"{count} ended because the policy or the simulator failed: {why}"
+        for route, words in self.failures.items():
+            return (
+                f"{len(self.failures)} of {self.routes} routes ended because the policy"
+                f" or the simulator failed: {words} ({route})"
+            )
+        return ""
 
     @property
     def partial(self) -> bool:
@@ -110,43 +103,22 @@ class Scores:
 def score(
     episodes: Sequence[Episode], expected: int = FULL_SET, seed: int = 0
 ) -> Scores:
-    """Score a set of routes; their order affects nothing but the bootstrap."""
+    """Score a set of routes; their order affects nothing but the bootstrap.
+
+    ``expected`` is the number of routes of the whole set.
+    """
 
     def driving_score(episode: Episode) -> Measure:
         return Measure(route_scores.route_score(episode).composed, "%")
 
-    mean_ability, each_ability = _abilities(episodes, seed)
-    succeeded = [episode.succeeded for episode in episodes]
-    smoothness = bench2drive.smoothness
-    failed = [episode for episode in episodes if episode.ending in FAILURES]
-    return Scores(
-        driving_score=_mean(episodes, driving_score, "%", seed, PERCENT),
-        success_rate=_rate(succeeded, _types(episodes), seed),
-        efficiency=_mean(episodes, route_scores.efficiency, "%", seed),
-        comfort=_mean(episodes, route_scores.comfort, "ratio", seed, SHARE),
-        abilities=mean_ability,
-        each_ability=each_ability,
-        bench2drive_efficiency=_mean(episodes, bench2drive.efficiency, "%", seed),
-        bench2drive_smoothness=_mean(episodes, smoothness, "ratio", seed, SHARE),
-        safety=_safety(episodes, seed),
-        routes=len(episodes),
-        expected=expected,
-        failures={
-            episode.route: episode.failure or episode.ending.value for episode in failed
-        },
-    )
-
-
-def _safety(episodes: Sequence[Episode], seed: int) -> SafetyScores:
+    # A rate over routes without a collision alone would be nothing but zeros
     faults = [route_scores.at_fault_collision(episode) for episode in episodes]
-    known = [fault for fault in faults if fault is not None]
-    if len(known) == len(faults):
-        at_fault = _rate(known, _types(episodes), seed)
-    else:
-        # Routes without a collision alone would make a rate of nothing but zeros
-        reason = f"whose fault {len(faults) - len(known)} collisions were is not known"
+    if unknown := faults.count(None):
+        reason = f"whose fault {unknown} collisions were is not known"
         at_fault = Estimate.missing("%", reason)
-    return SafetyScores(
+    else:
+        at_fault = _rate(episodes, list(map(bool, faults)), seed)
+    safety = SafetyScores(
         _mean(episodes, route_scores.room_kept, "%", seed, PERCENT),
         _mean(episodes, route_scores.ttc_exposure, "%", seed, PERCENT),
         _mean(episodes, route_scores.smallest_ttc, "s", seed),
@@ -154,10 +126,27 @@ def _safety(episodes: Sequence[Episode], seed: int) -> SafetyScores:
         _mean(episodes, route_scores.smallest_distance, "m", seed),
         at_fault,
     )
-
-
-def _types(episodes: Iterable[Episode]) -> list[str]:
-    return [episode.scenario for episode in episodes]
+    # All other scores, ours and in Bench2Drive's arithmetic
+    mean_ability, each_ability = _abilities(episodes, seed)
+    smoothness = bench2drive.smoothness
+    return Scores(
+        driving_score=_mean(episodes, driving_score, "%", seed, PERCENT),
+        success_rate=_rate(episodes, [one.succeeded for one in episodes], seed),
+        efficiency=_mean(episodes, route_scores.efficiency, "%", seed),
+        comfort=_mean(episodes, route_scores.comfort, "ratio", seed, SHARE),
+        abilities=mean_ability,
+        each_ability=each_ability,
+        bench2drive_efficiency=_mean(episodes, bench2drive.efficiency, "%", seed),
+        bench2drive_smoothness=_mean(episodes, smoothness, "ratio", seed, SHARE),
+        safety=safety,
+        routes=len(episodes),
+        expected=expected,
+        failures={
+            episode.route: episode.failure or episode.ending.value
+            for episode in episodes
+            if episode.ending in FAILURES
+        },
+    )
 
 
 def _mean(
@@ -167,6 +156,7 @@ def _mean(
     seed: int,
     bounds: Bounds | None = None,
 ) -> Estimate:
+    """Return the mean of a metric over the routes that have it, with its intervals."""
     measured = [(metric(episode), episode.scenario) for episode in episodes]
     known = [(own.value, kind) for own, kind in measured if own.value is not None]
     if not known:
@@ -176,59 +166,60 @@ def _mean(
     return mean_estimate(values, types, unit, seed, bounds)
 
 
-def _rate(outcomes: Sequence[bool], types: Sequence[str], seed: int) -> Estimate:
+def _rate(episodes: Sequence[Episode], outcomes: Sequence[bool], seed: int) -> Estimate:
     """Return a rate with its exact interval, and the one over types drawn anew."""
-    n, good = len(outcomes), sum(outcomes)
-    if n == 0:
+    if not outcomes:
         return Estimate.missing("%", "no such route was driven")
+    types = [episode.scenario for episode in episodes]
     percents = [100.0 * outcome for outcome in outcomes]
     mean = mean_estimate(percents, types, "%", seed, PERCENT)
-    low, high = binomial_interval(good, n)
+    low, high = binomial_interval(sum(outcomes), len(outcomes))
     return replace(mean, low=low, high=high)
 
 
 def _abilities(
     episodes: Sequence[Episode], seed: int
 ) -> tuple[Estimate, dict[str, Estimate]]:
-    """Return the mean of the abilities' success rates, and each of them.
-
-    Real runs do not tell where junctions are, which Traffic_Signs needs.
-    """
-    if any(episode.given is not None for episode in episodes):
-        return ability_rates(episodes)
-    outcomes = successes(episodes)
-    rates = {
-        name: _rate(mastered, _types(e for e in episodes if name in e.abilities), seed)
-        for name, mastered in outcomes.items()
-    }
-    return _mean_ability(episodes, outcomes, seed), rates
-
-
-def _mean_ability(
-    episodes: Sequence[Episode], outcomes: Mapping[str, tuple[bool, ...]], seed: int
-) -> Estimate:
-    """Return the mean of the abilities' success rates, if all five were driven."""
-    # The mean needs all five abilities
-    missing = [name for name in ABILITIES if not outcomes[name]]
-    if missing:
-        reason = f"no route for {', '.join(missing)} was driven"
-        return Estimate.missing("%", reason)
-    # [routes, 5] which abilities a route tests, and which it masters
-    tests = np.array([[a in e.abilities for a in ABILITIES] for e in episodes])
-    good = np.zeros(tests.shape)
+    """Return the mean of the five abilities' success rates, and each of them."""
+    # Which abilities each route tests, and which of those it masters
+    shape = len(episodes), len(ABILITIES)
+    tests, good = np.zeros(shape, np.bool_), np.zeros(shape)  # (routes, abilities)
+    rates = dict[str, Estimate]()
     for column, name in enumerate(ABILITIES):
-        good[tests[:, column], column] = outcomes[name]
+        tests[:, column] = [name in episode.abilities for episode in episodes]
+        tested = [episode for episode in episodes if name in episode.abilities]
+        outcomes = [mastered(episode, name) for episode in tested]
+        good[tests[:, column], column] = [bool(outcome) for outcome in outcomes]
+        unknown = [
+            episode.route
+            for episode, outcome in zip(tested, outcomes, strict=True)
+            if outcome is None
+        ]
+        if unknown:
+            others = f" and {len(unknown) - 1} others" if len(unknown) > 1 else ""
+            reason = f"where the junction is on {unknown[0]}{others} is not known"
+            rates[name] = Estimate.missing("%", reason, len(tested))
+        else:
+            rates[name] = _rate(tested, list(map(bool, outcomes)), seed)
+    # The mean needs all five abilities
+    if undriven := [name for name, rate in rates.items() if not rate.n]:
+        reason = f"no route for {', '.join(undriven)} was driven"
+        return Estimate.missing("%", reason), rates
+    for name, rate in rates.items():
+        if rate.value is None:
+            return Estimate.missing("%", f"{name}: {rate.measure.reason}"), rates
 
     def mean_rate(weights: Floats) -> Floats:
-        n = weights @ tests
-        rates = np.full(n.shape, np.nan)
-        np.divide(weights @ good, n, out=rates, where=n > 0)
-        return np.asarray(100.0 * np.nanmean(rates, axis=1))
+        n = weights @ tests  # (resamples, abilities)
+        drawn = np.full(n.shape, np.nan)
+        np.divide(weights @ good, n, out=drawn, where=n > 0)
+        # Resampled routes may test none of an ability: hence nanmean
+        return np.asarray(100.0 * np.nanmean(drawn, axis=1))
 
-    # Resampled routes may test none of an ability: hence nanmean
-    value = fmean(100.0 * sum(won) / len(won) for won in outcomes.values())
-    here, anew = intervals(mean_rate, _types(episodes), seed, value, PERCENT)
-    return Estimate(Measure(value, "%"), *here, len(episodes), *anew)
+    value = fmean(rate.value or 0.0 for rate in rates.values())
+    types = [episode.scenario for episode in episodes]
+    here, anew = intervals(mean_rate, types, seed, value, PERCENT)
+    return Estimate(Measure(value, "%"), *here, len(episodes), *anew), rates
 
 
 # Scores of a set of records, as the simulator wrote them and as computed here.
@@ -238,10 +229,7 @@ def _mean_ability(
 
 @dataclass(frozen=True, slots=True)
 class Quotients:
-    """One sum over records, divided by the size of the set or by the records.
-
-    None without records.
-    """
+    """A sum over records, divided by the size of the set or by the records; or None."""
 
     set: float | None = None
     driven: float | None = None
@@ -252,8 +240,7 @@ class LeaderboardScores:
     """Scores of a set of records, as given by the simulator and as computed here.
 
     Driving scores, completion and success rate are percentages; a penalty is the
-    product of the factors of all infractions. A success has status Completed or Perfect
-    and no infraction but low speed.
+    product of the factors of all infractions.
     """
 
     set_size: int

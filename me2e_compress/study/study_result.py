@@ -9,6 +9,7 @@ from typing import Any
 from me2e_compress.base.display import Cell, Table, plural
 from me2e_compress.commands.result import Result, View, plain
 from me2e_compress.metrics.bench2drive import ABILITIES
+from me2e_compress.metrics.measure import unseen_share
 from me2e_compress.metrics.route_summary import COLUMNS, PairedDifference, holm
 from me2e_compress.runtime.latency_trace import Load
 from me2e_compress.runtime.providers import PROVIDERS
@@ -205,9 +206,9 @@ def difference_table(result: StudyResult) -> Table:
     compared = [(drive, gap) for drive in result.drives if (gap := drive.difference)]
     gaps = [gap for _, gap in compared]
     # p-values are corrected for all comparisons shown
-    corrected, rows = holm([gap.p_value for gap in gaps]), list[tuple[Cell, ...]]()
+    corrected, rows = holm([gap.mcnemar_p for gap in gaps]), list[tuple[Cell, ...]]()
     for (drive, gap), p in zip(compared, corrected, strict=True):
-        counts = map(Cell, (f"{p:.2g}", str(gap.better), str(gap.worse)))
+        counts = map(Cell, (f"{p:.2g}", str(gap.routes_better), str(gap.routes_worse)))
         rows.append((Cell(result.label(drive)), *_gap_cells(gap), *counts))
     columns = ("variant", *GAPS, "SR p", "routes better", "routes worse")
     title = f"Difference to {result.study.baseline} on the same routes"
@@ -232,10 +233,14 @@ def _differences_note(gaps: Sequence[PairedDifference]) -> str:
     if gaps:
         on, least = plural(gaps[0].driving_score.n, "route"), gaps[0].smallest_shown
         note += f" {on} cannot show a difference below {least:.1f} points."
-    alike = [gap for gap in gaps if not gap.differ]
-    if alike:
-        routes, share = alike[0].driving_score.n, alike[0].unseen_percent
-        note += f" Where 0 of {routes} routes differ, at most {share:.1f} % do (95 %)."
+    for gap in gaps:
+        if not (gap.routes_better or gap.routes_worse):
+            routes = gap.driving_score.n
+            share = 100.0 * unseen_share(routes)
+            note += (
+                f" Where 0 of {routes} routes differ, at most {share:.1f} % do (95 %)."
+            )
+            break
     return note
 
 

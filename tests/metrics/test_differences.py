@@ -41,7 +41,7 @@ def test_the_mean_of_differences_route_by_route() -> None:
     assert result.driving_score.value == pytest.approx((30.0 - 100.0) / 4)
     assert result.success_rate.value == pytest.approx(-25.0)
     assert result.driving_score.measure.unit == "points"
-    assert (result.better, result.worse) == (0, 1)
+    assert (result.routes_better, result.routes_worse) == (0, 1)
     assert difference(BAD, GOOD[::-1]) == result
 
 
@@ -63,8 +63,7 @@ def test_where_nothing_differs_the_interval_is_what_may_be_unseen() -> None:
     score = result.driving_score
     assert score.value == 0.0
     assert (score.low, score.high) == pytest.approx((-share, share))
-    assert result.unseen_percent == pytest.approx(share)
-    assert result.differ == 0
+    assert (result.routes_better, result.routes_worse) == (0, 0)
 
 
 def test_four_routes_that_differ_alike_say_little_of_a_fifth() -> None:
@@ -87,9 +86,9 @@ def test_success_is_compared_by_mcnemars_exact_test() -> None:
     result = difference(one, other)
 
     # 8 routes gained, 1 lost: 2 * (1 + 9) / 2 ** 9
-    assert (result.gained, result.lost) == (8, 1)
-    assert result.p_value == pytest.approx(20 / 512)
-    assert difference(one, one).p_value == 1.0
+    assert (result.success_gained, result.success_lost) == (8, 1)
+    assert result.mcnemar_p == pytest.approx(20 / 512)
+    assert difference(one, one).mcnemar_p == 1.0
 
 
 def test_holm_by_hand() -> None:

@@ -3,7 +3,7 @@ import math
 
 import pytest
 
-from me2e_compress.metrics.bench2drive import ability_rates, mastered
+from me2e_compress.metrics.bench2drive import mastered
 from me2e_compress.metrics.episode import (
     PENALTY,
     Ending,
@@ -12,7 +12,7 @@ from me2e_compress.metrics.episode import (
     InfractionKind,
 )
 from me2e_compress.metrics.route_scores import RouteScore, route_score
-from me2e_compress.metrics.scores import Quotients, leaderboard_scores
+from me2e_compress.metrics.scores import Quotients, leaderboard_scores, score
 from tests.metrics.drives import drive, infraction
 
 # Bench2Drive, statistics_manager.py; give way is ours.
@@ -111,13 +111,19 @@ TESTED = (
 
 
 def test_traffic_signs_are_rated_unless_a_junction_decides() -> None:
-    mean, rates = ability_rates(TESTED)
+    scores = score(TESTED)
 
+    rates = scores.each_ability
     assert rates["Traffic_Signs"].value == rates["Merging"].value == 50.0
     # the others were not driven, so there is no mean of five
-    assert mean.measure.reason == "Overtaking: no such route was driven"
+    assert scores.abilities.value is None
+
+
+def test_a_real_run_does_not_say_where_its_junctions_are() -> None:
     rammed = drive(CRASH, route="rammed", abilities=SIGNS, completion=80.0)
-    _, rates = ability_rates((*TESTED, rammed))
+
+    rates = score((*TESTED, given(rammed, "Completed", 48.0))).each_ability
+
     signs = rates["Traffic_Signs"].measure
     assert signs.reason == "where the junction is on rammed is not known"
     assert rates["Merging"].value == pytest.approx(100 / 3)
@@ -127,6 +133,4 @@ def test_the_mean_is_that_of_five() -> None:
     others = ("Overtaking", "Emergency_Brake", "Give_Way")
     routes = (*TESTED, *(drive(route=other, abilities=(other,)) for other in others))
 
-    mean, _ = ability_rates(routes)
-
-    assert mean.value == (100 + 50 + 100 + 100 + 50) / 5
+    assert score(routes).abilities.value == (100 + 50 + 100 + 100 + 50) / 5

@@ -78,7 +78,7 @@ def test_the_same_model_does_not_differ_and_the_baseline_is_not_compared(
     assert again.driving_score.low != again.driving_score.high
     assert fast is not None
     assert blind is not None
-    assert fast.better + fast.worse > 0
+    assert fast.routes_better + fast.routes_worse > 0
 
 
 def test_a_model_has_size_latency_and_fidelity_and_a_driver_has_none(
