@@ -18,6 +18,7 @@ os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")
 if TYPE_CHECKING:  # what a type checker sees; at run time names load when asked for
     from me2e_compress import graph as graph
     from me2e_compress.base.errors import Me2eError as Me2eError
+    from me2e_compress.base.listener import Listener as Listener
     from me2e_compress.calibration.dataset import CalibrationSet as CalibrationSet
     from me2e_compress.commands.calibrate import calibrate as calibrate
     from me2e_compress.commands.compare import compare as compare
@@ -46,7 +47,6 @@ if TYPE_CHECKING:  # what a type checker sees; at run time names load when asked
     from me2e_compress.commands.options import WriteOptions as WriteOptions
     from me2e_compress.commands.plan import plan as plan
     from me2e_compress.commands.profile import profile as profile
-    from me2e_compress.commands.result import Listener as Listener
     from me2e_compress.commands.score import score as score
     from me2e_compress.commands.search import (
         measure_sensitivity as measure_sensitivity,
@@ -90,7 +90,7 @@ _ROOMS = {
     ),
     "commands.plan": "plan",
     "commands.profile": "profile",
-    "commands.result": "Listener",
+    "base.listener": "Listener",
     "commands.score": "score",
     "commands.search": "measure_sensitivity search",
 }

@@ -24,7 +24,7 @@ import numpy as np
 import numpy.typing as npt
 import onnx
 
-from me2e_compress.commands.result import SILENT
+from me2e_compress.base.listener import SILENT
 from me2e_compress.driving.contract import Observation, RouteInfo
 from me2e_compress.driving.latency import FixedLatency
 from me2e_compress.driving.onnx_policy import OnnxPolicy

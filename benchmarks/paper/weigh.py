@@ -15,11 +15,11 @@ from benchmarks.paper.drives import (
 from benchmarks.paper.evidence import FEWEST_RUNS
 from me2e_compress import graph
 from me2e_compress.base.errors import StudyError
+from me2e_compress.base.listener import Listener
 from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.commands.inspect import inspect
 from me2e_compress.commands.options import InspectOptions, ProfileOptions
 from me2e_compress.commands.profile import profile
-from me2e_compress.commands.result import Listener
 from me2e_compress.graph import WEIGHTED
 from me2e_compress.quantization.decision import plan_of
 from me2e_compress.runtime.energy.meter import measure_energy

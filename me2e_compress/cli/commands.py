@@ -44,21 +44,24 @@ def demo(
         output: the folder to write
     """
     require_extra("highway", "driving in the demo")
-    from me2e_compress.study.demo import DemoResult, DriverDemo, figure
+    from me2e_compress.commands.compress import CompressResult
+    from me2e_compress.study.demo import DemoResult, DriverDemo
 
     steps = DriverDemo(output, writing.force).steps
-    # each step says what it found as soon as it is done
+    # every step prints its result, in a line, as soon as it is done
     output.mkdir(parents=True, exist_ok=True)
     results = dict[str, Result]()
     for name, step in steps.items():
         begun = time.monotonic()
         with listening() as listener:
-            results[name] = step(listener)
+            results[name] = result = step(listener)
         if not printing.json:
             seconds = time.monotonic() - begun
-            say(f"{name:<10}{seconds:4.0f} s   {figure(results[name])}")
+            compressed = isinstance(result, CompressResult)
+            text = result.size if compressed else result.headline
+            say(f"{name:<10}{seconds:4.0f} s   {text}")
             if printing.verbose:
-                show(results[name])
+                show(result)
     # with -v every step was shown in full already
     if printing.json or not printing.verbose:
         show(DemoResult(results))

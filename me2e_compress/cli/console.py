@@ -26,7 +26,8 @@ from me2e_compress.base.display import (
     format_duration,
     plural,
 )
-from me2e_compress.commands.result import SILENT, Listener, Result
+from me2e_compress.base.listener import SILENT, Listener
+from me2e_compress.commands.result import Result
 
 console = Console(record=True, emoji=False)
 errors = Console(stderr=True, highlight=False, emoji=False)

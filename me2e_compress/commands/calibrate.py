@@ -9,6 +9,7 @@ from me2e_compress.base import atomic
 from me2e_compress.base.atomic import write_bytes
 from me2e_compress.base.display import plural
 from me2e_compress.base.errors import FramesError
+from me2e_compress.base.listener import SILENT, Listener
 from me2e_compress.calibration.calibrator import Calibrator
 from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.calibration.exchange import pick_ranges, read_cache
@@ -25,7 +26,7 @@ from me2e_compress.commands.checks import (
 )
 from me2e_compress.commands.options import CalibrateOptions
 from me2e_compress.commands.plan import PreparedGraph
-from me2e_compress.commands.result import SILENT, Listener, Result, View
+from me2e_compress.commands.result import Result, View
 from me2e_compress.manager import recipe
 from me2e_compress.quantization.decision import keep_readers, overrides_text
 

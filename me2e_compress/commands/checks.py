@@ -34,10 +34,10 @@ from me2e_compress import graph
 from me2e_compress.base.atomic import is_marked, write_bytes
 from me2e_compress.base.display import plural
 from me2e_compress.base.errors import GraphError
+from me2e_compress.base.listener import Listener
 from me2e_compress.calibration.dataset import CalibrationSet, npz_bytes
 from me2e_compress.commands import opening_main
 from me2e_compress.commands.options import GraphOptions
-from me2e_compress.commands.result import Listener
 from me2e_compress.driving.adapter.outputs import adapted, state_and_plan
 from me2e_compress.graph.modules.assign import map_of
 from me2e_compress.graph.modules.module_map import ModuleMap

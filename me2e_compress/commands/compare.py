@@ -16,12 +16,13 @@ from me2e_compress.base.errors import (
     GraphError,
     ModuleMapError,
 )
+from me2e_compress.base.listener import SILENT, Listener
 from me2e_compress.calibration.calibrator import Extremes
 from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.calibration.statistics import first_bad_node, index_inputs
 from me2e_compress.commands.checks import model_path, opened
 from me2e_compress.commands.options import CompareOptions, GraphOptions
-from me2e_compress.commands.result import SILENT, Listener, Result, View
+from me2e_compress.commands.result import Result, View
 from me2e_compress.commands.runtime_loss import (
     RuntimeLoss,
     RuntimeTally,

@@ -8,12 +8,13 @@ import onnx_ir as ir
 from me2e_compress import graph
 from me2e_compress.base.display import format_number, plural, table
 from me2e_compress.base.errors import EvaluationError
+from me2e_compress.base.listener import SILENT, Listener
 from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.calibration.engine_dump import EngineDump
 from me2e_compress.commands.checks import model_path, opened
 from me2e_compress.commands.compare import headline_of, stamp_modules
 from me2e_compress.commands.options import CompareOptions
-from me2e_compress.commands.result import SILENT, Listener, Result, View
+from me2e_compress.commands.result import Result, View
 from me2e_compress.fidelity.engine_loss import (
     EngineRun,
     FirstDifference,

@@ -11,6 +11,7 @@ from me2e_compress.base import atomic
 from me2e_compress.base.atomic import write_document
 from me2e_compress.base.display import format_mb
 from me2e_compress.base.errors import PreconditionError, RecipeError
+from me2e_compress.base.listener import SILENT, Listener
 from me2e_compress.calibration.review import NOT_FINITE
 from me2e_compress.commands.checks import (
     load_map,
@@ -29,7 +30,7 @@ from me2e_compress.commands.measured_loss import (
     split_frames,
 )
 from me2e_compress.commands.options import CompressOptions
-from me2e_compress.commands.result import SILENT, Listener, Result, View, plain
+from me2e_compress.commands.result import Result, View, plain
 from me2e_compress.commands.written import size_note, speed_note
 from me2e_compress.fidelity.floor import Floor
 from me2e_compress.graph.files import data_names

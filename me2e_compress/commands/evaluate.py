@@ -8,10 +8,11 @@ from typing import cast
 from me2e_compress import graph
 from me2e_compress.base.display import table
 from me2e_compress.base.errors import EvaluationError, FramesError, GraphError
+from me2e_compress.base.listener import SILENT, Listener
 from me2e_compress.base.registry import options_of
 from me2e_compress.commands.checks import check_folder, model_path, try_first, writing
 from me2e_compress.commands.options import EvaluateOptions, GraphOptions
-from me2e_compress.commands.result import SILENT, Listener, Result, View
+from me2e_compress.commands.result import Result, View
 from me2e_compress.commands.score import driving_score, scores_table
 from me2e_compress.driving.adapter.adapter import Adapter
 from me2e_compress.driving.adapter.outputs import PortUse, input_uses, output_uses

@@ -9,6 +9,7 @@ from typing import Self
 from me2e_compress.base.display import plural
 from me2e_compress.base.errors import FramesError
 from me2e_compress.base.extras import require_extra
+from me2e_compress.base.listener import SILENT, Listener
 from me2e_compress.calibration.dataset import PixelInput
 from me2e_compress.calibration.recording import (
     LOGS,
@@ -21,7 +22,7 @@ from me2e_compress.calibration.recording import (
 )
 from me2e_compress.commands.checks import check_folder, model_path, try_first, writing
 from me2e_compress.commands.options import FramesOptions
-from me2e_compress.commands.result import SILENT, Listener, Result
+from me2e_compress.commands.result import Result
 from me2e_compress.driving.adapter import Adapter
 from me2e_compress.driving.adapter.outputs import adapted
 from me2e_compress.driving.onnx_policy import OnnxPolicy

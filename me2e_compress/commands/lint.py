@@ -10,9 +10,10 @@ import onnx_ir as ir
 from me2e_compress import graph
 from me2e_compress.base.display import plural, table
 from me2e_compress.base.errors import PreconditionError, RecipeError
+from me2e_compress.base.listener import SILENT, Listener
 from me2e_compress.commands.checks import model_path, try_first
 from me2e_compress.commands.options import LintOptions
-from me2e_compress.commands.result import SILENT, Listener, Result, Status, View
+from me2e_compress.commands.result import Result, Status, View
 from me2e_compress.passes import Pass
 from me2e_compress.passes.import_normalize import with_own_domains
 from me2e_compress.passes.quantize_int8 import QuantizeInt8

@@ -9,10 +9,10 @@ import onnx_ir as ir
 
 from me2e_compress.base.display import Table, plural
 from me2e_compress.base.errors import EvaluationError, FramesError, GraphError
+from me2e_compress.base.listener import Listener
 from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.calibration.sample import hold_out, spread
 from me2e_compress.commands.compare import compare_sessions, outputs_table
-from me2e_compress.commands.result import Listener
 from me2e_compress.commands.runtime_loss import RuntimeLoss, has_int8_kernels
 from me2e_compress.fidelity.compare import Fidelity, SetFidelity, SetTally, compare
 from me2e_compress.fidelity.floor import Floor, Shortfall, format_figure

@@ -6,10 +6,11 @@ from pathlib import Path
 from me2e_compress import graph
 from me2e_compress.base import atomic
 from me2e_compress.base.errors import EvaluationError
+from me2e_compress.base.listener import SILENT, Listener
 from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.commands.checks import load_map, model_path, opened, writing
 from me2e_compress.commands.options import ProfileOptions, check_number
-from me2e_compress.commands.result import SILENT, Listener, Result, View
+from me2e_compress.commands.result import Result, View
 from me2e_compress.graph.modules.assign import assign
 from me2e_compress.metrics import BUDGET_MS
 from me2e_compress.metrics.deadlines import Deadlines, deadlines, deadlines_table

@@ -2,8 +2,7 @@
 
 import dataclasses
 import math
-from collections.abc import Callable, Iterable, Mapping
-from dataclasses import field
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
@@ -125,31 +124,3 @@ def plain(value: object) -> Any:
     if isinstance(value, float):
         return float(value) if math.isfinite(value) else None
     return str(value) if isinstance(value, Path) else value
-
-
-Progress = Callable[[str, int, int, str], None]
-Warn = Callable[[str], None]
-
-
-@dataclasses.dataclass(frozen=True)
-class Listener:
-    """Functions that are called while a workflow runs; neither changes its result.
-
-    Attributes:
-        on_progress: gets the stage, things done, things in all, and words.
-        on_warning: gets one line per surprise.
-    """
-
-    on_progress: Progress = field(default_factory=lambda: _ignore, repr=False)
-    on_warning: Warn = field(default_factory=lambda: _ignore, repr=False)
-
-    def counting(self, stage: str, words: str = "") -> Callable[[int, int], None]:
-        """Return a function of things done, and in all, that reports a stage."""
-        return lambda done, total: self.on_progress(stage, done, total, words)
-
-
-def _ignore(*words: object) -> None:
-    """Say nothing."""
-
-
-SILENT = Listener()

@@ -12,8 +12,9 @@ from me2e_compress.base.display import (
     table,
 )
 from me2e_compress.base.errors import EvaluationError
+from me2e_compress.base.listener import SILENT, Listener
 from me2e_compress.commands.options import check_number
-from me2e_compress.commands.result import SILENT, Listener, Result, View
+from me2e_compress.commands.result import Result, View
 from me2e_compress.commands.score_eer import EerScores, estimate_cells, score_eer
 from me2e_compress.evaluators.bench2drive.real_results import (
     Bench2DriveResults,

@@ -12,6 +12,7 @@ import onnx_ir as ir
 from me2e_compress import graph
 from me2e_compress.base.display import format_mb, format_significant, plural, table
 from me2e_compress.base.errors import EnergyError, RecipeError
+from me2e_compress.base.listener import SILENT, Listener
 from me2e_compress.calibration.calibrator import Calibrator
 from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.calibration.ranges import Ranges
@@ -29,7 +30,7 @@ from me2e_compress.commands.options import (
     TrialOptions,
 )
 from me2e_compress.commands.plan import PreparedGraph
-from me2e_compress.commands.result import SILENT, Listener, Result, View
+from me2e_compress.commands.result import Result, View
 from me2e_compress.fidelity.sensitivity import (
     Budget,
     Candidate,

@@ -4,7 +4,7 @@ Neither imports highway-env.
 """
 
 import abc
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar, Protocol, Self
@@ -12,6 +12,7 @@ from typing import Any, ClassVar, Protocol, Self
 from pydantic import TypeAdapter, ValidationError
 
 from me2e_compress.base.errors import EvaluationError
+from me2e_compress.base.listener import Listener
 from me2e_compress.base.registry import Registry
 from me2e_compress.driving.contract import RouteInfo
 from me2e_compress.driving.latency import FixedLatency, LatencySource
@@ -23,20 +24,6 @@ from me2e_compress.simulator.routes import Route
 from me2e_compress.version import __version__
 
 FRAME_LIMIT_S = 60.0
-
-
-class Listener(Protocol):
-    """Hears how far a long step is; see `me2e_compress.commands.listener`."""
-
-    @property
-    def on_progress(self) -> Callable[[str, int, int, str], None]:
-        """Gets the stage, things done, things in all, and words."""
-        ...
-
-    @property
-    def on_warning(self) -> Callable[[str], None]:
-        """Gets one line per surprise."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -103,7 +90,7 @@ class Drive:
         dt_ms: float = 50.0,
         weather: str = "",
     ) -> Self:
-        """Read what the command, a study's file and Python say alike of conditions.
+        """Parse the options that the command, a study's file and Python share.
 
         The weather is ``fog_m=80,night=0.5,dropped=BACK+FRONT``.
 
@@ -116,8 +103,20 @@ class Drive:
         if not 0 < dt_ms <= FRAME_US / 1000:  # a product of inf is no integer
             words = f"it must divide {FRAME_US // 1000} ms"
             raise EvaluationError(f"a step of {dt_ms:g} ms: {words}")
-        model, conditions = LatencyModel(latency_model), _weather_of(weather)
-        dt_us = round(dt_ms * 1000)
+        # Weather is option=value pairs; dropped cameras are joined by +
+        options: dict[str, object] = {}
+        for pair in filter(None, weather.split(",")):
+            name, _, value = pair.partition("=")
+            options[name.strip()] = value.split("+") if name == "dropped" else value
+        try:
+            conditions = TypeAdapter(Weather).validate_python(options)
+        except ValidationError as error:
+            first = error.errors(include_url=False)[0]
+            names = ", ".join(Weather.__dataclass_fields__)
+            raise EvaluationError(
+                f"weather option {first['loc'][0]}: {first['msg']}; there are {names}"
+            ) from error
+        model, dt_us = LatencyModel(latency_model), round(dt_ms * 1000)
         return cls(dt_us=dt_us, weather=conditions, latency_model=model)
 
     def conditions(self) -> dict[str, Any]:
@@ -131,29 +130,22 @@ class Drive:
         }
 
 
-def _weather_of(text: str) -> Weather:
-    """Read ``option=value`` pairs; dropped cameras are joined by ``+``."""
-    options: dict[str, object] = {}
-    for pair in filter(None, text.split(",")):
-        name, _, value = pair.partition("=")
-        options[name.strip()] = value.split("+") if name == "dropped" else value
-    try:
-        return TypeAdapter(Weather).validate_python(options)
-    except ValidationError as error:
-        first = error.errors(include_url=False)[0]
-        there = ", ".join(Weather.__dataclass_fields__)
-        raise EvaluationError(
-            f"weather option {first['loc'][0]}: {first['msg']}; there are {there}"
-        ) from error
-
-
 ABILITIES = (
-    *("policy", "adapter", "module_map", "provider", "routes", "latency"),
-    *("latency_model", "dt_ms", "weather", "engine", "render"),
+    "policy",
+    "adapter",
+    "module_map",
+    "provider",
+    "routes",
+    "latency",
+    "latency_model",
+    "dt_ms",
+    "weather",
+    "engine",
+    "render",
 )
 """What an evaluator may declare that it takes: options of the command or of a study."""
 METHODS = {"routes": ("routes",), "render": ("render", "routes")}
-"""What who declares an ability must define."""
+"""Methods that an evaluator with an ability must define."""
 
 
 @dataclass(frozen=True)
@@ -174,8 +166,8 @@ class Evaluator(abc.ABC):
         """Yield one episode a route of the drive as it ends, in any order.
 
         Without routes in the drive, all of its own, in a fixed order. The same options
-        give the same episodes, but where latency is measured. Episodes are kept by who
-        asks; ``folder`` is there for anything else, e.g. a log beside it.
+        give the same episodes, but where latency is measured. The caller stores the
+        episodes; ``folder`` is for anything else, e.g. a log beside it.
 
         Raises:
             EvaluationError: It cannot go on; the message is one line.
@@ -184,7 +176,7 @@ class Evaluator(abc.ABC):
     def routes(
         self, words: str, beside: Path = Path()
     ) -> tuple[Sequence[RouteInfo], int]:
-        """Return the routes that words name, and the size of the set they are from.
+        """Return the routes that words name, and the size of their set.
 
         Files are looked up in the folder ``beside``.
 
@@ -238,10 +230,10 @@ class Evaluator(abc.ABC):
         raise NotImplementedError
 
     def check_takes(self, options: Iterable[str], whose: str = "") -> None:
-        """Refuse options that it does not take: each an ability, or an option's flag.
+        """Refuse options (names of abilities, or flags) that it does not take.
 
         Raises:
-            EvaluationError: The first of them, by name.
+            EvaluationError: It names the first of them.
         """
         for option in options:
             if option not in self.takes:
@@ -269,7 +261,7 @@ def evaluator_named(text: str) -> Evaluator:
     """Build an evaluator from ``name`` or ``name{option=value}``.
 
     Raises:
-        EvaluationError: There is none, or it declares what it does not have.
+        EvaluationError: There is none, or it lacks what it declares.
     """
     return with_abilities(EVALUATORS.parse(text))
 
@@ -278,7 +270,7 @@ def with_abilities(evaluator: Evaluator) -> Evaluator:
     """Return an evaluator that has what it declares.
 
     Raises:
-        EvaluationError: It declares what it does not have.
+        EvaluationError: It lacks what it declares.
     """
     name, cls = evaluator.name, type(evaluator)
     if not isinstance(evaluator, Evaluator):

@@ -1,9 +1,9 @@
-"""A results folder: one JSON file per route, and a manifest; and what fills it."""
+"""A results folder: one JSON file per route, and a manifest; and the drive into it."""
 
 import hashlib
 import json
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Self
@@ -11,8 +11,9 @@ from typing import Any, Self
 from me2e_compress.base import atomic, documents
 from me2e_compress.base.atomic import write_json
 from me2e_compress.base.errors import EvaluationError
+from me2e_compress.base.listener import Listener
 from me2e_compress.driving.policies import Driver
-from me2e_compress.evaluators.contract import Drive, Driven, Evaluator, Listener
+from me2e_compress.evaluators.contract import Drive, Driven, Evaluator
 from me2e_compress.metrics.episode import Episode
 from me2e_compress.metrics.route_scores import route_score
 from me2e_compress.simulator.routes import VERSION, check_version, is_route_id
@@ -63,7 +64,7 @@ class ResultsFolder:
                 drawn = {} if measured is None else {MEASURED: measured}
                 write_json(path / MANIFEST, made_by | drawn, indent=1)
         folder = cls.open(path)
-        # All that decides the results must agree
+        # All options that decide the results must agree
         for key in sorted({*made_by, *folder.made_by} - {MEASURED}):
             old, new = folder.made_by.get(key), made_by.get(key)
             if old != new:
@@ -75,10 +76,30 @@ class ResultsFolder:
 
     @classmethod
     def open(cls, path: Path) -> Self:
-        """Open an existing folder."""
+        """Open an existing folder.
+
+        Raises:
+            EvaluationError: Its manifest is missing or malformed.
+        """
         with documents.reading(path / MANIFEST, EvaluationError, "not JSON"):
             made_by = documents.from_json(documents.read_bytes(path / MANIFEST))
-        _check_manifest(path, made_by)
+        if not isinstance(made_by, dict) or not isinstance(made_by.get("routes"), list):
+            raise EvaluationError(f"{path}: {MANIFEST} does not name its routes")
+        # Drives of another version of the road are compared with none of this
+        if "evaluator" not in made_by:
+            check_version(path, made_by.get(VERSION))
+        # Routes are file names; the set has all of them
+        routes, names = made_by["routes"], f"{path}: {MANIFEST}"
+        for route in routes:
+            if not isinstance(route, str) or not is_route_id(route):
+                raise EvaluationError(f"{names}: {_short(route)} is not a route")
+        if len(set(routes)) < len(routes):
+            raise EvaluationError(f"{names} names a route twice")
+        size = made_by.get("set_size", len(routes))
+        if type(size) is not int or not len(routes) <= size <= LARGEST_SET:
+            raise EvaluationError(
+                f"{names}: set_size is {_short(size)}, it must be {len(routes)} or more"
+            )
         return cls(path, made_by)
 
     @property
@@ -153,29 +174,6 @@ def log_cost(folder: Path, driven: Driven) -> None:
         lines.write(f"{json.dumps(cost | mark)}\n")
 
 
-def _check_manifest(path: Path, made_by: object) -> None:
-    """Check the parts that are read: routes, which are file names, and set size.
-
-    Drives of another version of the road are compared with none of this.
-    """
-    if not isinstance(made_by, dict) or not isinstance(made_by.get("routes"), list):
-        raise EvaluationError(f"{path}: {MANIFEST} does not name its routes")
-    if "evaluator" not in made_by:  # another's drives are of no road of ours
-        check_version(path, made_by.get(VERSION))
-    routes = made_by["routes"]
-    for route in routes:
-        if not isinstance(route, str) or not is_route_id(route):
-            raise EvaluationError(f"{path}: {MANIFEST}: {_short(route)} is not a route")
-    if len(set(routes)) < len(routes):
-        raise EvaluationError(f"{path}: {MANIFEST} names a route twice")
-    size = made_by.get("set_size", len(routes))
-    if type(size) is not int or not len(routes) <= size <= LARGEST_SET:
-        raise EvaluationError(
-            f"{path}: {MANIFEST}: set_size is {_short(size)}, it must be"
-            f" {len(routes)} or more"
-        )
-
-
 def _short(value: object) -> str:
     text = json.dumps(value)
     return text if len(text) <= 60 else f"{text[:57]}..."
@@ -189,11 +187,11 @@ def drive_routes(
     listener: Listener,
     stage: str = "evaluate",
 ) -> tuple[Episode, ...]:
-    """Drive what a folder lacks, keep it there, and return all routes in their order.
+    """Drive the routes that a folder lacks, store them, and return all in their order.
 
     The files do not depend on the number of workers, the engine or the clock, unless
-    latency is measured during the run. What an evaluator reads without a policy is read
-    again: its files may have changed.
+    latency is measured during the run. Results that an evaluator reads without a policy
+    are read again: its files may have changed.
 
     Raises:
         EvaluationError: The policy cannot be opened, the folder belongs to another
@@ -215,8 +213,17 @@ def drive_routes(
     _report(listener, stage, done, total)
     if missing.routes or not routes:
         for episode in evaluator.episodes(policy, missing, folder, listener):
-            _check_episode(evaluator, episode, done, routes)
-            done[episode.route] = episode
+            route, yields = episode.route, f"{evaluator.name} yields route"
+            if not is_route_id(route):
+                raise EvaluationError(
+                    f"{yields} {route[:60]!r}: a name is made of letters, digits, '_'"
+                    " and '-'"
+                )
+            if route in done:
+                raise EvaluationError(f"{yields} {route} twice")
+            if routes and route not in routes:
+                raise EvaluationError(f"{yields} {route}, not of its drive")
+            done[route] = episode
             if results is not None:
                 results.keep(episode)
             _report(listener, stage, done, max(total, len(done)))
@@ -232,27 +239,6 @@ def drive_routes(
         for episode in done.values():
             results.keep(episode)
     return tuple(done[route] for route in routes or done)
-
-
-def _check_episode(
-    evaluator: Evaluator,
-    episode: Episode,
-    done: Mapping[str, Episode],
-    routes: Sequence[str],
-) -> None:
-    """Refuse a route that is no file name, comes twice, or is not one of the drive."""
-    route = episode.route
-    if not is_route_id(route):
-        raise EvaluationError(
-            f"{evaluator.name} yields route {route[:60]!r}: a name is made of letters, "
-            "digits, '_' and '-'"
-        )
-    if route in done:
-        raise EvaluationError(f"{evaluator.name} yields route {route} twice")
-    if routes and route not in routes:
-        raise EvaluationError(
-            f"{evaluator.name} yields route {route}, not of its drive"
-        )
 
 
 def _report(

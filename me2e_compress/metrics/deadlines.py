@@ -1,19 +1,16 @@
 """Share of decisions that exceed their latency budget."""
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from statistics import fmean
 from typing import Any
 
 from me2e_compress.base.display import Table, format_number, missing_note, plural, table
 from me2e_compress.metrics import BUDGET_MS
-from me2e_compress.metrics.episode import FRAME_US, Episode
+from me2e_compress.metrics.episode import Episode
 from me2e_compress.metrics.measure import Measure, percentile, too_few
-from me2e_compress.metrics.route_scores import TTC_CRITICAL_S
 
 PERCENTILES = {f"p{percent:g}_ms": percent for percent in (50.0, 99.0, 99.9)}
-CRITICAL, OTHER = "critical_mean_ms", "other_mean_ms"
-UNSEEN = Measure(None, "ms", "nobody looked at the road")
 
 
 @dataclass(frozen=True, slots=True)
@@ -22,9 +19,7 @@ class Deadlines:
 
     Attributes:
         measures: By name: the percentiles, which have no value if too few samples were
-            measured for them, ``mean_ms``, ``max_ms``, ``over_budget_percent``, and the
-            means over decisions on frames with a time to collision below 1.5 s, and on
-            other frames.
+            measured for them, ``mean_ms``, ``max_ms``, ``over_budget_percent``.
     """
 
     budget_ms: float
@@ -59,7 +54,7 @@ def deadlines(
     measures["mean_ms"] = _mean(latencies_us, none)
     measures["max_ms"] = _mean([max(latencies_us)] if count else (), none)
     over = Measure(100.0 * late / count, "%") if count else Measure(None, "%", none)
-    measures |= {"over_budget_percent": over, CRITICAL: UNSEEN, OTHER: UNSEEN}
+    measures["over_budget_percent"] = over
     return Deadlines(budget_ms, count, measures)
 
 
@@ -70,27 +65,12 @@ def charged(
 ) -> Deadlines | None:
     """Compare the latencies charged in episodes with a budget; None if all are zero.
 
-    ``measured`` is the one of :func:`deadlines`.
+    ``measured`` is that of :func:`deadlines`.
     """
-    # All latencies, and those on frames with a low time to collision or on others
-    latencies, critical, other = list[int](), list[int](), list[int]()
-    for episode in episodes:
-        ttc_s = () if episode.conflicts is None else episode.conflicts.ttc_s
-        for decision in episode.decisions:
-            latencies.append(decision.latency_us)
-            frame = decision.time_us // FRAME_US
-            if frame < len(ttc_s):
-                seconds = ttc_s[frame]
-                near = seconds is not None and seconds < TTC_CRITICAL_S
-                (critical if near else other).append(decision.latency_us)
-    if not any(latencies):
-        return None
-    compared = deadlines(latencies, budget_ms, measured)
-    by_frame = {
-        CRITICAL: _mean(critical, "no decision on a frame with TTC below 1.5 s"),
-        OTHER: _mean(other, "no decision on another frame"),
-    }
-    return replace(compared, measures={**compared.measures, **by_frame})
+    latencies = [
+        decision.latency_us for episode in episodes for decision in episode.decisions
+    ]
+    return deadlines(latencies, budget_ms, measured) if any(latencies) else None
 
 
 def _mean(latencies_us: Sequence[int], why: str) -> Measure:
@@ -104,8 +84,6 @@ def deadlines_table(title: str, deadlines: Deadlines) -> Table:
     names = {name: f"p{percent:g}" for name, percent in PERCENTILES.items()}
     names |= {"max_ms": "max", "mean_ms": "mean"}
     names["over_budget_percent"] = f"over {deadlines.budget_ms:g} ms"
-    if deadlines.measures[CRITICAL].value is not None:
-        names |= {CRITICAL: "mean, TTC below 1.5 s", OTHER: "mean, other frames"}
     shown = {words: deadlines.measures[name] for name, words in names.items()}
     why = {words: e.reason for words, e in shown.items() if e.value is None}
     return table(

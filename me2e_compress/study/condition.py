@@ -20,6 +20,8 @@ TRACE = "trace"
 """The latency of each model's own trace, times the device scale."""
 
 FORM = ConfigDict(strict=True, extra="forbid", arbitrary_types_allowed=True)
+DRIVE_OPTIONS = ("latency_model", "dt_ms", "weather")
+"""Options of a condition's drive besides its latency."""
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_+-]*")
 
 
@@ -84,6 +86,7 @@ class Condition:
 
     @functools.cached_property
     def _parsed(self) -> LatencySource:
+        # A trace with options is fine, a trace of a file is not
         text = self.latency
         names_a_file = text.startswith(TRACE) and name_in(text) != TRACE
         names_a_file = names_a_file or "trace:" in text or "trace=" in text
@@ -102,30 +105,23 @@ class Condition:
         return not self.mean_of and self._parsed.lacks_trace
 
     @property
-    def _options(self) -> dict[str, object]:
-        """Options of its drive, with the latency apart."""
-        names = ("latency_model", "dt_ms", "weather")
-        return {name: getattr(self, name) for name in names}
-
-    @property
-    def _changed(self) -> dict[str, object]:
-        """Options of its drive that are not the defaults."""
-        own = self._options.items()
-        return {name: value for name, value in own if value != getattr(Condition, name)}
-
-    @property
-    def asks_for(self) -> tuple[str, ...]:
-        """Options that an evaluator must support to drive under it."""
-        return (*("latency",) * (self.latency != "none"), *self._changed)
+    def changed(self) -> dict[str, object]:
+        """Options of its drive, without the latency, that are not the defaults."""
+        options = ((name, getattr(self, name)) for name in DRIVE_OPTIONS)
+        return {n: value for n, value in options if value != getattr(Condition, n)}
 
     def described(self, device: str) -> str:
         """Describe it for the head of a table; ``device`` is that of the traces."""
         latency = self.latency or f"the mean of {self.mean_of}"
         latency += f" of {device}" * self.traced
-        words = [f"{name} {option}" for name, option in self._changed.items()]
+        words = [f"{name} {option}" for name, option in self.changed.items()]
         return ", ".join([f"{self.name}: latency {latency}", *words])
 
     def to_json(self) -> dict[str, Any]:
         """Return every option; ``charged`` is the latency, None for a mean."""
-        charged = {"charged": self.latency or None, "mean_of": self.mean_of or None}
-        return {"name": self.name, **charged, **self._options}
+        return {
+            "name": self.name,
+            "charged": self.latency or None,
+            "mean_of": self.mean_of or None,
+            **{name: getattr(self, name) for name in DRIVE_OPTIONS},
+        }

@@ -1,9 +1,10 @@
-"""A study, as its file says it: variants, conditions, baseline, routes."""
+"""A study, as its TOML file describes it: variants, conditions, baseline, routes."""
 
 from __future__ import annotations
 
 import functools
 import itertools
+import json
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
@@ -15,16 +16,19 @@ from pydantic import (
     BeforeValidator,
     Field,
     PlainValidator,
+    TypeAdapter,
+    ValidationError,
     ValidationInfo,
     with_config,
 )
 from pydantic_core import PydanticCustomError
 
+from me2e_compress.base import documents
 from me2e_compress.base.errors import EvaluationError, FramesError, StudyError
 from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.commands.checks import model_path
 from me2e_compress.driving.contract import Count, Positive, RouteInfo
-from me2e_compress.driving.policies import POLICIES, driver_named
+from me2e_compress.driving.policies import POLICIES, PythonDriver, driver_named
 from me2e_compress.driving.shipped_adapters import adapter_file, shipped_adapters
 from me2e_compress.evaluators.contract import Evaluator, evaluator_named
 from me2e_compress.evaluators.highway.drivers import OnnxDriver
@@ -88,10 +92,10 @@ def _policy(text: str, info: ValidationInfo) -> str:
     return POLICIES.text(replace(driver, path=model_path(driver.path, _folder(info))))
 
 
-def _passes(given: object) -> tuple[Pass, ...]:
-    if not isinstance(given, str):
+def _passes(text: object) -> tuple[Pass, ...]:
+    if not isinstance(text, str):
         raise PydanticCustomError("passes", "Input should be a valid string")
-    return recipes.parse(given)
+    return recipes.parse(text)
 
 
 File = Annotated[Path, BeforeValidator(_beside)]
@@ -135,6 +139,7 @@ class Variant:
         check_name("variant", self.name)
         if self.recipe is not None and self.passes:
             raise StudyError(f"variant {self.name}: give a recipe or passes, not both")
+        # A recipe becomes its passes, a policy of a model its file and options
         resolved = dict[str, object]()
         if self.recipe is not None:
             resolved |= {"passes": recipes.load(self.recipe), "recipe": None}
@@ -284,14 +289,14 @@ class Study:
     def preview(self) -> str:
         """Suffix of titles if only a part of the routes is driven; empty otherwise."""
         driven, whole = len(self.routes), self.set_size
-        partial = 0 < driven < whole
-        return f" (preview: {driven} of {whole} routes)" if partial else ""
+        return f" (preview: {driven} of {whole} routes)" if 0 < driven < whole else ""
 
     def _check_names(self) -> None:
         """Check that all names are known; a mean is of a drive before its condition."""
         variants = [variant.name for variant in self.variants]
         conditions = [condition.name for condition in self.conditions]
         check_known("baseline: no variant", self.baseline, variants)
+        # Names in blocks and pairs
         for block in self.blocks:
             for name in block.variants:
                 check_known(f"block {block.name}: no variant", name, variants)
@@ -300,6 +305,7 @@ class Study:
         drives = [f"{one}.{other}" for other in conditions for one in variants]
         for name in itertools.chain.from_iterable(self.pairs):
             check_known("pair: no VARIANT.CONDITION", name, drives)
+        # The drive of a mean has an earlier condition
         for number, condition in enumerate(self.conditions):
             if condition.mean_of:
                 what = f"condition {condition.name}: mean_of: no VARIANT.CONDITION"
@@ -313,8 +319,9 @@ class Study:
                 asked = ["policy"] if variant.adapter is None else ["policy", "adapter"]
                 self.driven_by.check_takes(asked, f"variant {variant.name}: ")
             for condition in self.conditions:
+                asked = ["latency"] * (condition.latency != "none")
                 whose = f"condition {condition.name}: "
-                self.driven_by.check_takes(condition.asks_for, whose)
+                self.driven_by.check_takes([*asked, *condition.changed], whose)
             if self.routes:
                 self.driven_by.check_takes(["routes"], "routes: ")
         except EvaluationError as error:
@@ -384,6 +391,7 @@ class Study:
         for name in names:
             check_known("no block", name, list(blocks))
         chosen = tuple(blocks[name] for name in names)
+        # Variants and conditions that no chosen block names are left out
         driven = {self.baseline, *(name for block in chosen for name in block.variants)}
         under = {name for block in chosen for name in block.conditions}
         variants = tuple(variant for variant in self.variants if variant.name in driven)
@@ -401,3 +409,87 @@ class Study:
         conditions = {condition.name: condition for condition in self.conditions}
         variant, _, condition = name.partition(".")
         return variants[variant], conditions[condition]
+
+
+_STUDY = TypeAdapter(Study)
+
+
+def load_study(
+    path: str | Path,
+    routes: str | None = None,
+    provider: str | None = None,
+    *,
+    trust_code: bool = False,
+) -> Study:
+    """Read a study.
+
+    Files are looked up next to the study's own file; a policy that is not a file there
+    is a shipped model. Nothing that it names is run here.
+
+    Args:
+        path: The TOML file.
+        routes: Routes to drive instead of the study's.
+        provider: Execution provider instead of the study's, as a text.
+        trust_code: Accept a study that names code: a Python function that makes a
+            policy, or libraries.
+
+    Raises:
+        GraphError: A policy is neither a file nor a shipped model.
+        StudyError: The file is missing or not valid TOML, a key is unknown, missing or
+            of another type, frames are invalid, code is not trusted, or the study is
+            inconsistent.
+        RecipeError: A recipe or pass is unknown.
+        EvaluationError: Routes or latency are unknown.
+        ProviderError: A provider or library is missing.
+    """
+    # Read the file; options of the caller take precedence
+    path = Path(path)
+    if not path.exists():
+        raise StudyError(f"no study {path}: no such file")
+    with documents.reading(path, StudyError, "not TOML"):
+        content = documents.from_toml(documents.read_bytes(path))
+    if "set_size" in content:  # Python's own
+        raise StudyError(f"{path}: no key set_size")
+    own_routes = content.pop("routes", None)
+    which = own_routes if routes is None else routes
+    if provider:
+        content["provider"] = provider
+    # Check its form: JSON has lists for tuples, but no dates
+    try:
+        text = json.dumps(content, default=lambda date: {"date": str(date)})
+        study = _STUDY.validate_json(text, context=path.parent)
+    except ValidationError as error:
+        # An unknown key goes first: it may explain other errors
+        errors = error.errors(include_url=False)
+        unknown = [e for e in errors if e["type"] == "unexpected_keyword_argument"]
+        where = ".".join(map(str, (unknown or errors)[0]["loc"]))
+        words = f"no key {where}" if unknown else f"{where}: {errors[0]['msg']}"
+        raise StudyError(f"{path}: {words}") from error
+    except StudyError as error:
+        raise StudyError(f"{path}: {error}") from error
+    if study.to_record is not None and (study.frames or study.held_out):
+        raise StudyError(f"{path}: give folders of frames, or what to record, not both")
+    # Check that code is trusted, but for what the caller names
+    policies = [variant.policy for variant in study.variants]
+    code = [text for text in policies if isinstance(driver_named(text), PythonDriver)]
+    code += map(str, (*study.plugins, *(() if provider else study.provider.plugins)))
+    if code and not trust_code:
+        raise StudyError(
+            f"{path} runs code: {code[0]}; look at it first, then say --trust-code"
+        )
+    # Plugins of the study belong to its provider
+    plugins = (*study.provider.plugins, *study.plugins)
+    owner = replace(study.provider, plugins=plugins)
+    study = replace(study, provider=owner, plugins=())
+    owner.check()
+    # Find the routes; an evaluator may take none
+    if which is None and "routes" in study.driven_by.takes:
+        which = "all"
+    if which is not None:
+        if isinstance(which, bool) or not isinstance(which, str | int):
+            raise StudyError(f"{path}: routes: it must be a number, names or a file")
+        study.driven_by.check_takes(["routes"], "routes: ")
+        ours, size = study.driven_by.routes(str(which), path.parent)
+        study = replace(study, routes=ours, set_size=size)
+    study.check()
+    return study

@@ -5,6 +5,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 
 from me2e_compress.base.display import Cell, Table
+from me2e_compress.base.listener import Listener
 from me2e_compress.commands.checks import check_folder, check_replaceable
 from me2e_compress.commands.compare import CompareResult, compare
 from me2e_compress.commands.compress import CompressResult, compress, sidecar
@@ -12,19 +13,13 @@ from me2e_compress.commands.files import export_stack
 from me2e_compress.commands.frames import record_frames
 from me2e_compress.commands.inspect import InspectResult, inspect
 from me2e_compress.commands.options import CompressOptions, FramesOptions
-from me2e_compress.commands.result import Listener, Result, View
+from me2e_compress.commands.result import Result, View
 from me2e_compress.evaluators.highway.engine import LocalEngine
-from me2e_compress.quantization.decision import plan_of
 from me2e_compress.simulator.routes import load_routes, pick_routes
 from me2e_compress.study.cells import MISSING, estimate_cell, measure_cell
 from me2e_compress.study.condition import Condition
 from me2e_compress.study.definition import Study, Timing, Variant
-from me2e_compress.study.report.page import (
-    Section,
-    findings,
-    limits,
-    write_study,
-)
+from me2e_compress.study.report.page import findings, limits, write_study
 from me2e_compress.study.run import run_study
 from me2e_compress.study.study_result import StudyResult
 from me2e_compress.study.workspace import HTML, JSON, MARKDOWN
@@ -39,6 +34,7 @@ ROUTES = "5"
 
 def before_and_after(outcome: StudyResult) -> Table:
     """Show size, time, plan and driving score, a row a drive."""
+    # A drive's costs are its variant's
     rows = list[tuple[Cell, ...]]()
     for drive in outcome.drives:
         variant, gap = outcome.variant(drive.variant), drive.difference
@@ -89,17 +85,10 @@ class DemoResult(Result):
         return View(last.headline, last.tables(), last.lines(), alerts)
 
 
-def figure(result: Result) -> str:
-    """Return a step's result, short enough for a line of a terminal."""
-    return result.size if isinstance(result, CompressResult) else result.headline
-
-
 class DriverDemo:
     """Compress the shipped driver and compare both, on frames and on the road.
 
-    Args:
-        out: The folder that everything is written to.
-        force: Replace files that we did not write, too.
+    ``out`` is the folder of all files; ``force`` replaces files that we did not write.
 
     Raises:
         GraphError: The output folder is a file, or a user's file would be overwritten.
@@ -111,7 +100,6 @@ class DriverDemo:
         self._source = out / f"{DRIVER}.onnx"
         self._small = out / f"{DRIVER}.{RECIPE}.onnx"
         self._frames, self._held_out = out / "frames", out / "frames-held-out"
-        self._sections = list[Section]()
         check_folder(out, ())
         records = (sidecar(self._small, what) for what in ("report", "plan"))
         pages = (out / name for name in (JSON, MARKDOWN, HTML))
@@ -143,25 +131,17 @@ class DriverDemo:
         options = CompressOptions(
             target=DEFAULT_TARGET, measure_frames=0, allow_empty=True, force=self.force
         )
-        files = self._source, self._small
-        result = compress(*files, RECIPE, self._frames, options, listener)
-        self._sections.append(Section("The passes", result.tables()))
-        plan = plan_of(result.report.model)
-        if plan is not None:
-            self._sections.append(Section("What became int8", plan.tables()))
-        return result
+        return compress(
+            self._source, self._small, RECIPE, self._frames, options, listener
+        )
 
     def weigh(self, listener: Listener) -> InspectResult:
         """Weigh the modules of what was compressed."""
-        result = inspect(self._small)
-        self._sections.append(Section("The modules", result.tables()))
-        return result
+        return inspect(self._small)
 
     def compare(self, listener: Listener) -> CompareResult:
         """Compare the compressed graph with the driver on other frames."""
-        result = compare(self._source, self._small, self._held_out, listener=listener)
-        self._sections.append(Section("The outputs", result.tables()))
-        return result
+        return compare(self._source, self._small, self._held_out, listener=listener)
 
     def drive(self, listener: Listener) -> DriveResult:
         """Drive the routes with both, and write the report."""
@@ -179,21 +159,8 @@ class DriverDemo:
         )
         engine = LocalEngine(WORKERS)
         result = run_study(study, self.out, engine, listener, force=self.force)
-        # Its report, with the demo's own sections and the files linked from the page
-        files = (
-            ("the driver", self._source),
-            ("the small one", self._small),
-            ("pass by pass", sidecar(self._small, "report")),
-            ("node by node", sidecar(self._small, "plan")),
-            ("calibration", self._frames),
-            ("held out", self._held_out),
-            ("drives", self.out / "results"),
-        )
-        links = ((words, path.name) for words, path in files if path.exists())
-        linked = Section("Files", files=(*links, ("for programs", JSON)))
         words = ("me2e-compress", "demo", "-o", str(self.out))
-        sections = (*self._sections, linked)
-        written = write_study(result, self.out, words, sections, force=self.force)
+        written = write_study(result, self.out, words, force=self.force)
         ending = (
             f"{self._small} is yours; {written.report} tells all of it.",
             f"Its int8 is for {DEFAULT_TARGET}, which drives here. For TensorRT:",

@@ -99,12 +99,19 @@ class DriveRecord:
 
     def to_json(self) -> dict[str, Any]:
         """Return scores, difference and routes, as they stand in the study's JSON."""
-        keys = ("route", "driving_score", "room_kept", "succeeded", "ending")
-        routes = list[dict[str, Any]]()
-        for route in self.routes:
-            moments = [{"kind": kind, "time_us": us} for kind, us in route.moments]
-            own = {key: getattr(route, key) for key in keys}
-            routes.append({**own, "infractions": moments})
+        routes = [
+            {
+                "route": route.route,
+                "driving_score": route.driving_score,
+                "room_kept": route.room_kept,
+                "succeeded": route.succeeded,
+                "ending": route.ending,
+                "infractions": [
+                    {"kind": kind, "time_us": us} for kind, us in route.moments
+                ],
+            }
+            for route in self.routes
+        ]
         return {
             "scheme": self.variant,
             "condition": self.condition,
@@ -126,6 +133,7 @@ class DriveRecord:
     @classmethod
     def load(cls, path: Path) -> Self:
         """Read a file that `save` wrote; a repeated route or a cut-off is an error."""
+        # The first line is the fingerprint, each other one a route
         with documents.reading(path, StudyError, "not a record of a drive"):
             content = documents.read_bytes(path, documents.LARGEST_LOG_BYTES)
             text = content.decode("utf-8")

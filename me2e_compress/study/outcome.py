@@ -1,4 +1,4 @@
-"""What a study knows of a variant without its drives: latency, size, plan.
+"""Results of a variant without its drives: latency, size, plan.
 
 Latencies are traces: recorded on a device, or measured here in turn.
 """
@@ -13,8 +13,8 @@ from functools import partial
 from pathlib import Path
 
 from me2e_compress.base.errors import EvaluationError, FramesError
+from me2e_compress.base.listener import Listener
 from me2e_compress.calibration.dataset import CalibrationSet
-from me2e_compress.commands.result import Listener
 from me2e_compress.driving.latency import LatencySource
 from me2e_compress.fidelity.compare import compare
 from me2e_compress.metrics.measure import Measure, too_few
@@ -49,21 +49,19 @@ class Clock:
     load: Load | None = None
 
     def latencies(self, prepared: PreparedVariant) -> dict[int, Measure]:
-        """Return the shown percentiles of a variant; without a model, the reason."""
-        if prepared.model is None:
-            unknown = Measure(None, "ms", prepared.failure or "no model")
-            return dict.fromkeys(LATENCY_PERCENTILES, unknown)
-        shown = LATENCY_PERCENTILES
-        return {percent: self.latency(prepared.name, percent) for percent in shown}
-
-    def latency(self, variant: str, percent: float) -> Measure:
-        """Return a percentile on the device, ms; None without enough samples."""
-        if variant not in self.traces:
-            return Measure(None, "ms", self.reason or "not measured")
-        trace = self.traces[variant]
-        if why := too_few(percent, len(trace.samples_us)):
-            return Measure(None, "ms", why)
-        return Measure(self.scale * trace.percentile_us(percent) / 1e3, "ms")
+        """Return percentiles on the device, ms; None without a trace long enough."""
+        trace = self.traces.get(prepared.name)
+        if prepared.model is None or trace is None:
+            why = self.reason or "not measured"
+            if prepared.model is None:
+                why = prepared.failure or "no model"
+            return dict.fromkeys(LATENCY_PERCENTILES, Measure(None, "ms", why))
+        latencies = dict[int, Measure]()
+        for percent in LATENCY_PERCENTILES:
+            why = too_few(percent, len(trace.samples_us))
+            ms = None if why else self.scale * trace.percentile_us(percent) / 1e3
+            latencies[percent] = Measure(ms, "ms", why)
+        return latencies
 
     def source(
         self, variant: Variant, condition: Condition, seed: int
@@ -90,9 +88,10 @@ def time_all(
             which sets the device scale, is zero.
     """
     traces, measured = dict[str, LatencyTrace](), dict[str, LatencyTrace]()
-    for variant in (entry.variant for entry in prepared):
-        if variant.trace is not None:
-            traces[variant.name] = LatencyTrace.load(variant.trace)
+    for entry in prepared:
+        if entry.variant.trace is not None:
+            traces[entry.name] = LatencyTrace.load(entry.variant.trace)
+    # Measure those without a trace
     reason = "no held-out frames were given"
     if study.held_out is not None:
         reason = "not a model"
@@ -102,7 +101,20 @@ def time_all(
     loads = [trace.others for trace in measured.values() if trace.others is not None]
     load = max(loads, key=lambda load: load.others, default=None)
     traces |= measured
-    return Clock(traces, _scale(study, traces), reason, load)
+    # One scale for all gives the baseline the median that the study asks for
+    median_s, baseline, scale = study.timing.baseline_median_s, study.baseline, 1.0
+    if median_s is not None:
+        if baseline not in traces:
+            raise EvaluationError(
+                f"latency: the device scale needs a median of {median_s} s of"
+                f" {baseline}, and there is no trace of it"
+            )
+        measured_us = traces[baseline].percentile_us(50)
+        if not measured_us:
+            words = f"latency: {baseline} has a median of 0 us: no scale makes it"
+            raise EvaluationError(f"{words} {median_s} s")
+        scale = 1e6 * median_s / measured_us
+    return Clock(traces, scale, reason, load)
 
 
 def _measure_traces(
@@ -112,10 +124,10 @@ def _measure_traces(
     workspace: Workspace,
     listener: Listener,
 ) -> dict[str, LatencyTrace]:
-    """Measure models in turn, or load what was measured together before.
+    """Measure models in turn, or load the traces that were measured together before.
 
     Models measured together share their noise, and a machine's speed varies from day to
-    day: traces are kept as a set, of the same models, machine, samples and frames.
+    day: traces are a set, of the same models, machine, samples and frames.
     """
     # Load the set if it is complete
     timing, frames = study.timing, CalibrationSet(held_out)
@@ -142,23 +154,6 @@ def _measure_traces(
     return traces
 
 
-def _scale(study: Study, traces: Mapping[str, LatencyTrace]) -> float:
-    """Choose the one scale that gives the baseline the requested median."""
-    median_s, baseline = study.timing.baseline_median_s, study.baseline
-    if median_s is None:
-        return 1.0
-    if baseline not in traces:
-        raise EvaluationError(
-            f"latency: the device scale needs a median of {median_s} s of {baseline},"
-            " and there is no trace of it"
-        )
-    measured_us = traces[baseline].percentile_us(50)
-    if not measured_us:
-        words = f"latency: {baseline} has a median of 0 us: no scale makes it"
-        raise EvaluationError(f"{words} {median_s} s")
-    return 1e6 * median_s / measured_us
-
-
 def compare_plans(
     study: Study,
     baseline: PreparedVariant,
@@ -179,7 +174,7 @@ def compare_plans(
         )
     if prepared is baseline:
         return PlanFidelity.unknown("the baseline itself")
-    # Run both models over all held-out frames
+    # Run both models over the held-out frames
     recording, provider = CalibrationSet(study.held_out), study.provider
     left = Session(baseline.model, provider=provider, metadata=baseline.metadata)
     right = Session(prepared.model, provider=provider, metadata=prepared.metadata)
@@ -204,8 +199,8 @@ def compare_plans(
     sqnr = Measure(None, "dB", EXACT if noise_db == math.inf else "no plan")
     if math.isfinite(noise_db):
         sqnr = Measure(noise_db, "dB")
-    metres = Measure(plan.mean_m, "m"), Measure(plan.max_m, "m")
-    return PlanFidelity(*metres, sqnr, fidelity.frames)
+    mean, largest = Measure(plan.mean_m, "m"), Measure(plan.max_m, "m")
+    return PlanFidelity(mean, largest, sqnr, fidelity.frames)
 
 
 def this_machine(load: Load | None = None) -> str:

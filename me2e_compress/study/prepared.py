@@ -1,4 +1,4 @@
-"""The file that drives: given, or made by passes once and kept."""
+"""The file that drives: a model as it is, or made by passes once and stored."""
 
 import hashlib
 from collections.abc import Mapping
@@ -11,12 +11,12 @@ from google.protobuf.message import DecodeError
 from me2e_compress import graph
 from me2e_compress.base import documents
 from me2e_compress.base.errors import GraphError, Me2eError, StudyError
+from me2e_compress.base.listener import Listener
 from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.commands.checks import try_first
 from me2e_compress.commands.compress import compress, sidecar
 from me2e_compress.commands.inspect import WEIGHTS
 from me2e_compress.commands.options import CompressOptions
-from me2e_compress.commands.result import Listener
 from me2e_compress.driving.adapter.outputs import state_and_plan
 from me2e_compress.driving.host_stage import HOST_STAGES
 from me2e_compress.driving.policies import Driver, driver_named
@@ -59,11 +59,10 @@ class PreparedVariant:
         pipeline: The passes, as text; empty if the model is its own source.
         size_bytes: Size of the model with its weights.
         failure: Why there is no model that can drive; empty if there is one.
-        weights: Origin of the weights in a line, such as a checkpoint; empty if
-            unknown.
-        metadata: What adapter and map state of plan and state, as metadata.
+        weights: Origin of the weights, such as a checkpoint; empty if unknown.
+        metadata: Plan and state of adapter and map, as metadata of the graph.
         known: Which inputs are state and which output is the plan, and from where.
-        latency_ms: By percent; empty until it was timed, as it was not compared.
+        latency_ms: By percent; empty until it was timed.
     """
 
     variant: Variant
@@ -143,19 +142,29 @@ def prepare_variant(
     # Fail early on a model that cannot run or drive
     try_first(model, model.name, listener=listener, provider=study.provider)
     study.driven_by.check_policy(driver)
-    # Find what made the file, its state and its plan
+    # Read from the file, and the report beside it, how it was made
     origin = source.name, to_text(variant.passes)
     if not variant.passes:
         origin = _origin_from_report(model) or origin
     loaded = graph.load(model)
-    own = variant.adapter, variant.module_map
-    metadata, known = state_and_plan(loaded, model, *own, {})
+    metadata, known = state_and_plan(
+        loaded, model, variant.adapter, variant.module_map, {}
+    )
     if slow := slow_here(loaded, study.provider):
         listener.on_warning(f"variant {variant.name}: {slow}")
-    facts = (*origin, graph.sha256_of(model), graph.file_bytes(model))
-    prepared = PreparedVariant(variant, driver, model, *facts)
-    weights = loaded.metadata_props.get(WEIGHTS, "")
-    return replace(prepared, weights=weights, metadata=metadata, known=known)
+    made_from, pipeline = origin
+    return PreparedVariant(
+        variant,
+        driver,
+        model,
+        source=made_from,
+        pipeline=pipeline,
+        sha256=graph.sha256_of(model),
+        size_bytes=graph.file_bytes(model),
+        weights=loaded.metadata_props.get(WEIGHTS, ""),
+        metadata=metadata,
+        known=known,
+    )
 
 
 def _origin_from_report(model: Path) -> tuple[str, str] | None:
@@ -177,16 +186,37 @@ def _compressed(
     listener: Listener,
 ) -> Path:
     """Apply the passes, unless a file exists that still matches its report."""
-    frames = None if study.frames is None else CalibrationSet(study.frames)
-    path = workspace.model(variant, _key(study, variant, source, frames))
+    # The file's name has a hash of everything that decides the result
+    contents = list[str]()
+    for file in (file for step in variant.passes for file in step.files()):
+        try:
+            contents.append(hashlib.sha256(file.read_bytes()).hexdigest())
+        except OSError as error:
+            raise StudyError(
+                f"variant {variant.name}: {file}: cannot be read: {error.strerror}"
+            ) from error
+    frames, modules = study.frames, variant.module_map
+    decisive = (
+        __version__,
+        graph.sha256_of(source),
+        to_text(variant.passes),
+        "" if frames is None else CalibrationSet(frames).fingerprint,
+        "" if modules is None else repr(ModuleMap.load(modules)),
+        str(study.seed),
+        # the key of models made before these options existed stays valid
+        *(() if study.provider == CPU else (PROVIDERS.text(study.provider),)),
+        *(() if variant.adapter is None else (graph.sha256_of(variant.adapter),)),
+        *contents,
+    )
+    key = hashlib.sha256("\n".join(decisive).encode()).hexdigest()
+    path = workspace.model(variant, key)
     if path.is_file() and sidecar(path, "report").is_file():
         if _origin_from_report(path) is not None:
             return path
         listener.on_warning(f"{path}: not what its report is of: made again")
-    stage = f"compress {variant.name}"
 
     def report(_: str, done: int, total: int, words: str) -> None:
-        listener.on_progress(stage, done, total, words)
+        listener.on_progress(f"compress {variant.name}", done, total, words)
 
     # The study measures on its own frames; a result without int8 is no error here
     options = CompressOptions(
@@ -200,30 +230,3 @@ def _compressed(
     own = Listener(report, listener.on_warning)
     compress(source, path, variant.passes, study.frames, options, own)
     return path
-
-
-def _key(
-    study: Study, variant: Variant, source: Path, frames: CalibrationSet | None
-) -> str:
-    """Hash everything that decides the result of the passes."""
-    modules, contents = variant.module_map, list[str]()
-    for file in (file for step in variant.passes for file in step.files()):
-        try:
-            contents.append(hashlib.sha256(file.read_bytes()).hexdigest())
-        except OSError as error:
-            raise StudyError(
-                f"variant {variant.name}: {file}: cannot be read: {error.strerror}"
-            ) from error
-    decisive = (
-        __version__,
-        graph.sha256_of(source),
-        to_text(variant.passes),
-        "" if frames is None else frames.fingerprint,
-        "" if modules is None else repr(ModuleMap.load(modules)),
-        str(study.seed),
-        # the key of models made before these options existed stays valid
-        *(() if study.provider == CPU else (PROVIDERS.text(study.provider),)),
-        *(() if variant.adapter is None else (graph.sha256_of(variant.adapter),)),
-        *contents,
-    )
-    return hashlib.sha256("\n".join(decisive).encode()).hexdigest()

@@ -5,10 +5,10 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from me2e_compress.base.errors import StudyError
+from me2e_compress.base.listener import SILENT, Listener
 from me2e_compress.commands.checks import check_folder, check_replaceable, writing
 from me2e_compress.commands.frames import record_frames
 from me2e_compress.commands.options import FramesOptions
-from me2e_compress.commands.result import SILENT, Listener
 from me2e_compress.driving.latency import FixedLatency
 from me2e_compress.evaluators.contract import Drive, Engine
 from me2e_compress.evaluators.highway.engine import LocalEngine
@@ -17,9 +17,8 @@ from me2e_compress.manager.report import versions
 from me2e_compress.metrics.route_summary import difference
 from me2e_compress.metrics.scores import score
 from me2e_compress.study.condition import Condition
-from me2e_compress.study.definition import Study
+from me2e_compress.study.definition import Study, load_study
 from me2e_compress.study.drive_record import DriveRecord
-from me2e_compress.study.file import load_study
 from me2e_compress.study.outcome import Clock, compare_plans, this_machine, time_all
 from me2e_compress.study.prepared import PreparedVariant, prepare_all
 from me2e_compress.study.study_result import StudyResult
@@ -72,17 +71,22 @@ def run_study(
             variants.append(replace(entry, latency_ms=latencies, fidelity=fidelity))
         for condition in study.conditions:
             drives += cells.drive_variants(condition, prepared)
-        compared = tuple(variants), tuple(drives)
-        made_by = this_machine(), versions()
-        return StudyResult(study, *compared, clock.scale, *made_by, clock.load)
+        return StudyResult(
+            study,
+            tuple(variants),
+            tuple(drives),
+            clock.scale,
+            this_machine(),
+            versions(),
+            clock.load,
+        )
 
 
 def prepare_study(
     study: Study, folder: Path, engine: Engine | None, listener: Listener
 ) -> tuple["StudyCells", list[PreparedVariant]]:
     """Record frames, make the models and time them; return what drives them."""
-    # Record frames unless they exist; those held out are of the next seed, so of other
-    # routes
+    # Record frames unless they exist; held-out ones are of the next seed's routes
     workspace, wanted, baseline = Workspace(folder), study.to_record, study.reference
     if wanted is not None:
         frames, held_out = folder / "frames", folder / "frames-held-out"
@@ -144,8 +148,13 @@ class StudyCells:
             latency = FixedLatency(self.means_us[name])
         if latency is None:
             return None
-        drive = replace(condition.drive, latency=latency, engine=self.engine)
-        return replace(drive, routes=study.routes, set_size=study.set_size)
+        return replace(
+            condition.drive,
+            latency=latency,
+            engine=self.engine,
+            routes=study.routes,
+            set_size=study.set_size,
+        )
 
     def _mean_us(self, condition: Condition) -> int:
         """Return the mean decision of a drive, which must be done."""

@@ -1,6 +1,6 @@
 """Result of a study: every table is a pure function of its records."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import chain
@@ -28,7 +28,7 @@ GAPS = ("DS, points", "DS, other types", "room, points", "SR, points")
 
 @dataclass(frozen=True, repr=False)
 class StudyResult(Result):
-    """All that a study found, and what it was made with.
+    """All results of a study, and the machine and packages that made them.
 
     Attributes:
         drives: Condition by condition, the variants in the study's order.
@@ -93,16 +93,17 @@ class StudyResult(Result):
             f" {plural(len(study.conditions), 'condition')} on {driven} of"
             f" {plural(whole, 'route')}"
         )
-        lines, alerts = list[str](), list[str]()
-        for variant in self.variants:
-            if variant.known:
-                lines.append(f"{variant.name}: {variant.known}")
-            if variant.failure:
-                alerts.append(f"variant {variant.name} was left out: {variant.failure}")
+        # Failures of variants and routes, and a busy machine
+        lines = [f"{one.name}: {one.known}" for one in self.variants if one.known]
+        alerts = [
+            f"variant {variant.name} was left out: {variant.failure}"
+            for variant in self.variants
+            if variant.failure
+        ]
         for drive in self.drives:
             if drive.scores is not None and drive.scores.failed:
-                words = f"{drive.variant}, {drive.condition}: {drive.scores.failed}"
-                alerts.append(words)
+                name = f"{drive.variant}, {drive.condition}"
+                alerts.append(f"{name}: {drive.scores.failed}")
         if self.load is not None and self.load.busy:
             alerts.append(str(self.load))
         tables = chain.from_iterable(self.tables_by_section.values())
@@ -130,14 +131,14 @@ class StudyResult(Result):
 
         Latencies, and the scale derived from them, are below the keys ``latency``.
         """
-        study = self.study
+        study, (driven, whole) = self.study, self.coverage
         content = {
             "title": study.title,
             "baseline": study.baseline,
             "seed": study.seed,
             "provider": PROVIDERS.text(study.provider),
             "evaluator": study.evaluator,
-            "routes": dict(zip(("driven", "set"), self.coverage, strict=True)),
+            "routes": {"driven": driven, "set": whole},
             "conditions": study.conditions,
             "latency": {
                 "device_scale": self.device_scale,
@@ -177,28 +178,32 @@ def scoreboard(result: StudyResult) -> Table:
     )
     rows = list[tuple[Cell, ...]]()
     for drive in result.drives:
-        costs = _cost_cells(result.variant(drive.variant))
-        rows.append((Cell(result.label(drive)), *_score_cells(drive), *costs))
+        # A cell for each of `SCORES`
+        cells = (Cell(MISSING, reason=drive.reason),) * len(SCORES)
+        if (scores := drive.scores) is not None:
+            estimates = (
+                scores.driving_score,
+                scores.safety.room_kept,
+                scores.success_rate,
+                scores.efficiency,
+                scores.bench2drive_efficiency,
+                scores.comfort,
+                scores.bench2drive_smoothness,
+            )
+            cells = tuple(map(estimate_cell, estimates))
+        # And one for each of `COSTS`
+        variant = result.variant(drive.variant)
+        latency, fidelity = variant.latency_ms, variant.fidelity
+        costs = (
+            measure_cell(variant.size_mb, ".2f"),
+            measure_cell(latency[50], ".1f"),
+            measure_cell(latency[99], ".1f"),
+            measure_cell(fidelity.plan_mean, ".3f"),
+            measure_cell(fidelity.plan_sqnr, ".1f"),
+        )
+        rows.append((Cell(result.label(drive)), *cells, *costs))
     columns = ("variant", *SCORES, *COSTS)
     return Table("Scoreboard", columns, tuple(rows), note, study.baseline)
-
-
-def _cost_cells(variant: PreparedVariant) -> tuple[Cell, ...]:
-    """Return one cell for each of `COSTS`."""
-    latency, fidelity = variant.latency_ms, variant.fidelity
-    measures = (variant.size_mb, latency[50], latency[99], fidelity.plan_mean)
-    forms = (".2f", ".1f", ".1f", ".3f", ".1f")
-    return tuple(map(measure_cell, (*measures, fidelity.plan_sqnr), forms))
-
-
-def _score_cells(drive: DriveRecord) -> tuple[Cell, ...]:
-    """Return one cell for each of `SCORES`."""
-    if (scores := drive.scores) is None:
-        return (Cell(MISSING, reason=drive.reason),) * len(SCORES)
-    own = scores.driving_score, scores.safety.room_kept, scores.success_rate
-    means = scores.efficiency, scores.bench2drive_efficiency
-    comfort = scores.comfort, scores.bench2drive_smoothness
-    return tuple(map(estimate_cell, (*own, *means, *comfort)))
 
 
 def difference_table(result: StudyResult) -> Table:
@@ -212,10 +217,6 @@ def difference_table(result: StudyResult) -> Table:
         rows.append((Cell(result.label(drive)), *_gap_cells(gap), *counts))
     columns = ("variant", *GAPS, "SR p", "routes better", "routes worse")
     title = f"Difference to {result.study.baseline} on the same routes"
-    return Table(title, columns, tuple(rows), _differences_note(gaps))
-
-
-def _differences_note(gaps: Sequence[PairedDifference]) -> str:
     note = (
         "Mean over routes with its 95 % interval, paired: an interval that holds zero "
         'shows no difference. It is for routes of these scenario types; "DS, other '
@@ -241,7 +242,7 @@ def _differences_note(gaps: Sequence[PairedDifference]) -> str:
                 f" Where 0 of {routes} routes differ, at most {share:.1f} % do (95 %)."
             )
             break
-    return note
+    return Table(title, columns, tuple(rows), note)
 
 
 def _gap_cells(gap: Comparison | PairedDifference) -> tuple[Cell, ...]:

@@ -1,6 +1,5 @@
 """Remaining drives of a study, and an estimate of their duration."""
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -18,8 +17,6 @@ FRAME_S, DECISION_S = 0.0024, 0.021
 """CPU seconds of a frame of the world, and of a decision: six pictures and one
 inference of the driver that ships on one core of a Xeon (two routes, at every frame
 and at every eighth)."""
-ENOUGH = 20
-"""Fewest logged routes from which the machine's speed is fitted."""
 
 
 @dataclass(frozen=True)
@@ -35,13 +32,12 @@ class PlannedDrive:
 
 @dataclass(frozen=True, repr=False)
 class Workload(Result):
-    """Remaining work of a study; ``measured`` if hours come from its own routes."""
+    """Remaining work of a study, by an estimate of the hours."""
 
     title: str
     drives: tuple[PlannedDrive, ...]
     set_size: int
     workers: int
-    measured: bool
 
     def view(self) -> View:
         """Return numbers of drives and routes, the time left, and a row per drive."""
@@ -50,10 +46,9 @@ class Workload(Result):
             routes = sum(drive.routes for drive in self.drives)
             done = sum(drive.done for drive in self.drives)
             left = format_duration(3600 * sum(drive.hours for drive in self.drives))
-            how = "by this folder's logs" if self.measured else "an estimate"
             headline += (
                 f", {plural(routes, 'route')}, {done:,} of them driven; about"
-                f" {left} on {plural(self.workers, 'worker')} ({how})"
+                f" {left} on {plural(self.workers, 'worker')} (an estimate)"
             )
         else:
             headline += ", of routes that the evaluator knows"
@@ -70,10 +65,7 @@ def workload(study: Study, folder: str | Path, workers: int = 1) -> Workload:
 
     A route costs world frames and decisions; the condition decides their ratio.
     """
-    # Speed of this machine, from earlier logs if possible
     place, total = Workspace(Path(folder)), len(study.routes)
-    known = _logged_speed(place.folder)
-    frame_s, decision_s = known or (FRAME_S, DECISION_S)
     drives = list[PlannedDrive]()
     for condition in study.conditions:
         period = frames_per_decision(study, condition)
@@ -88,11 +80,10 @@ def workload(study: Study, folder: str | Path, workers: int = 1) -> Workload:
                 if not recorded and not (finished / f"{route.id}.json").is_file()
             ]
             frames = 1e6 * sum(left_s) / condition.drive.dt_us
-            hours = frames * (frame_s + decision_s / period) / 3600 / workers
+            hours = frames * (FRAME_S + DECISION_S / period) / 3600 / workers
             counts = total - len(left_s), total
             drives.append(PlannedDrive(variant.name, condition.name, *counts, hours))
-    measured = known is not None
-    return Workload(study.title, tuple(drives), study.set_size, workers, measured)
+    return Workload(study.title, tuple(drives), study.set_size, workers)
 
 
 def frames_per_decision(study: Study, condition: Condition) -> int:
@@ -110,17 +101,3 @@ def frames_per_decision(study: Study, condition: Condition) -> int:
     nobody = DecisionFacts(latency_us, np.empty((0, 2)))
     latency_us = source.on_route("")(nobody)
     return skipped_decisions(latency_us, condition.drive.dt_us) + 1
-
-
-def _logged_speed(folder: Path) -> tuple[float, float] | None:
-    """Scale the seconds of frame and decision to the logs; None with too few logs."""
-    rows = [
-        json.loads(line)
-        for log in sorted(folder.glob("results/*.log"))
-        for line in log.read_text("utf-8").splitlines()
-    ]
-    usual = sum(FRAME_S * e["frames"] + DECISION_S * e["decisions"] for e in rows)
-    if len(rows) < ENOUGH or not usual:
-        return None
-    scale = sum(row["seconds"] for row in rows) / usual
-    return scale * FRAME_S, scale * DECISION_S

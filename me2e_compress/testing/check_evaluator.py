@@ -4,11 +4,11 @@ import itertools
 import json
 import tempfile
 from collections import Counter
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 from me2e_compress.base.errors import EvaluationError, VerificationError
+from me2e_compress.base.listener import SILENT
 from me2e_compress.driving.latency import FixedLatency
 from me2e_compress.driving.policies import Driver
 from me2e_compress.evaluators import EVALUATORS, Drive, Evaluator
@@ -19,12 +19,6 @@ from me2e_compress.testing.form import check_form, require
 
 LATENCY_US = 250_000
 """What every decision is charged where an evaluator declares that it takes latency."""
-
-
-@dataclass(frozen=True)
-class _SilentListener:
-    on_progress: Callable[[str, int, int, str], None] = lambda *_: None
-    on_warning: Callable[[str], None] = lambda _: None
 
 
 def check_evaluator(
@@ -87,7 +81,7 @@ def _episodes(
     name = evaluator.name
     with tempfile.TemporaryDirectory() as folder:
         results = Path(folder) / "results"
-        episodes = tuple(evaluator.episodes(policy, drive, results, _SilentListener()))
+        episodes = tuple(evaluator.episodes(policy, drive, results, SILENT))
     if not episodes:
         raise VerificationError(f"{name} yields no episode")
     strange = [each for each in episodes if not isinstance(each, Episode)]

@@ -4,7 +4,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from me2e_compress.commands.result import SILENT, Listener
+from me2e_compress.base.listener import SILENT, Listener
 from me2e_compress.driving.latency import FixedLatency, LatencySource
 from me2e_compress.graph import sha256_of
 from me2e_compress.metrics.scores import Scores

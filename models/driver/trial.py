@@ -4,7 +4,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from me2e_compress.commands.result import Listener
+from me2e_compress.base.listener import Listener
 from me2e_compress.driving.latency import LatencySource
 from me2e_compress.evaluators import Drive
 from me2e_compress.evaluators.highway.drivers import OnnxDriver

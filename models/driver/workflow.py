@@ -4,9 +4,10 @@ import dataclasses
 from pathlib import Path
 
 from me2e_compress.base.display import Table, format_number, table
+from me2e_compress.base.listener import SILENT, Listener
 from me2e_compress.commands.checks import check_folder, writing
 from me2e_compress.commands.options import check_count
-from me2e_compress.commands.result import SILENT, Listener, Result
+from me2e_compress.commands.result import Result
 from me2e_compress.metrics.measure import Estimate
 from models.driver.course import RoundResult, run
 from models.driver.curriculum import FULL, FULL_LATENCY, SMALL, SMALL_LATENCY

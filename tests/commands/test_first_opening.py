@@ -12,10 +12,10 @@ import pytest
 
 from me2e_compress import graph
 from me2e_compress.base.errors import GraphError
+from me2e_compress.base.listener import SILENT, Listener
 from me2e_compress.commands import checks
 from me2e_compress.commands.checks import shortcomings, try_first
 from me2e_compress.commands.compress import compress
-from me2e_compress.commands.result import SILENT, Listener
 from me2e_compress.graph.modules.module_map import ModuleMap
 from me2e_compress.manager import PassManager
 from me2e_compress.manager.recipe import parse

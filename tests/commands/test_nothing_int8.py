@@ -8,7 +8,7 @@ import pytest
 import me2e_compress as me2e
 from me2e_compress import graph
 from me2e_compress.base.errors import PreconditionError
-from me2e_compress.commands.result import Listener
+from me2e_compress.base.listener import Listener
 from tests.support.command import write_frames
 from tests.support.frames import record
 from tests.support.nets import image, parsed, save_text, stored

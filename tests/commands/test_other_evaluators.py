@@ -8,8 +8,8 @@ import pytest
 
 from me2e_compress import evaluate, score
 from me2e_compress.base.errors import EvaluationError, GraphError
+from me2e_compress.base.listener import Listener
 from me2e_compress.commands.options import EvaluateOptions
-from me2e_compress.commands.result import Listener
 from tests.evaluators.bench2drive.files import checkpoint, record, write
 from tests.evaluators.highway.drivers import straight_on
 from tests.evaluators.lanes import DRIVEN, install_lanes

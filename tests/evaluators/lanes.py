@@ -8,11 +8,11 @@ from typing import ClassVar
 import pytest
 
 from me2e_compress.base.errors import EvaluationError
+from me2e_compress.base.listener import Listener
 from me2e_compress.driving.contract import RouteInfo
 from me2e_compress.driving.latency import DecisionFacts
 from me2e_compress.driving.policies import Driver
 from me2e_compress.evaluators import EVALUATORS, Drive, Evaluator
-from me2e_compress.evaluators.contract import Listener
 from me2e_compress.metrics.episode import Episode, InferenceRecord
 from tests.evaluators.highway.asked import observation, planned
 from tests.metrics.drives import drive as by_hand

@@ -11,12 +11,13 @@ import pytest
 from me2e_compress import EvaluateOptions, evaluate
 from me2e_compress.base import registry
 from me2e_compress.base.errors import EvaluationError
+from me2e_compress.base.listener import Listener
 from me2e_compress.commands.evaluate import drive_of
 from me2e_compress.driving.contract import RouteInfo
 from me2e_compress.driving.latency import FrameRate
 from me2e_compress.driving.policies import Driver
 from me2e_compress.evaluators import EVALUATORS, Drive, Evaluator
-from me2e_compress.evaluators.contract import Listener, evaluator_named
+from me2e_compress.evaluators.contract import evaluator_named
 from me2e_compress.evaluators.highway.evaluator import Highway
 from me2e_compress.metrics.episode import Episode
 from tests.evaluators.lanes import Lane

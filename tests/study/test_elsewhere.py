@@ -99,7 +99,7 @@ def test_where_it_drives_is_its_own_affair(asked: Path, tmp_path: Path) -> None:
 
 def test_a_short_study_takes_seconds_not_0_0_hours() -> None:
     drive = PlannedDrive("float", "ideal", 0, 1, 20 / 3600)
-    ahead = Workload("Short", (drive,), 220, 1, False)
+    ahead = Workload("Short", (drive,), 220, 1)
 
     words = "1 drive, 1 route, 0 of them driven; about 20 s on 1 worker"
     assert words in ahead.headline

@@ -7,7 +7,7 @@ import pytest
 
 from me2e_compress import graph
 from me2e_compress.base.errors import StudyError
-from me2e_compress.commands.result import SILENT
+from me2e_compress.base.listener import SILENT
 from me2e_compress.manager import PassManager, recipe
 from me2e_compress.study import Listener, Study, Variant
 from me2e_compress.study.prepared import PreparedVariant, prepare_variant

@@ -280,10 +280,7 @@ def test_everything_in_a_page_is_escaped() -> None:
     row, rows = (MARKUP, MARKUP), [(MARKUP, MARKUP, MARKUP)]
     table = Table(MARKUP, row, ((Cell(MARKUP, MARKUP), Cell("", "", MARKUP)),), MARKUP)
     drawing = Drawing(Markup("<svg>"), MARKUP)
-    sections = [
-        Section(MARKUP, (table,), drawings=(drawing,)),
-        Section(MARKUP, (table,), (row,)),
-    ]
+    sections = [Section(MARKUP, (table,), (drawing,)), Section(MARKUP, (table,))]
     made = [row], rows, [row], MARKUP, [MARKUP]
 
     page = Page(MARKUP, MARKUP, sections, *made, drawing).html()

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from me2e_compress.base.errors import EvaluationError
+from me2e_compress.base.listener import SILENT
 from me2e_compress.calibration.dataset import CalibrationSet
-from me2e_compress.commands.result import SILENT
 from me2e_compress.driving.latency import NoLatency, TraceLatency
 from me2e_compress.graph import sha256_of
 from me2e_compress.metrics.measure import Measure

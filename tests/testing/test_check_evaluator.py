@@ -7,9 +7,9 @@ from typing import ClassVar
 import pytest
 
 from me2e_compress.base.errors import VerificationError
+from me2e_compress.base.listener import Listener
 from me2e_compress.driving.policies import Driver
 from me2e_compress.evaluators import Drive, Evaluator
-from me2e_compress.evaluators.contract import Listener
 from me2e_compress.evaluators.highway.drivers import OnnxDriver
 from me2e_compress.evaluators.highway.evaluator import Highway
 from me2e_compress.metrics.episode import Episode

@@ -8,6 +8,7 @@ from typing import ClassVar
 import numpy as np
 
 from me2e_compress.base.errors import EvaluationError
+from me2e_compress.base.listener import Listener
 from me2e_compress.driving.contract import (
     CAN_BUS_SIZE,
     Observation,
@@ -17,7 +18,6 @@ from me2e_compress.driving.contract import (
 from me2e_compress.driving.latency import DecisionFacts
 from me2e_compress.driving.policies import Driver
 from me2e_compress.evaluators import Drive, Evaluator
-from me2e_compress.evaluators.contract import Listener
 from me2e_compress.metrics.episode import (
     FRAME_US,
     EgoFrame,

@@ -10,6 +10,7 @@ from xml.etree import ElementTree
 
 from me2e_compress.base import documents
 from me2e_compress.base.errors import EvaluationError
+from me2e_compress.base.listener import Listener
 from me2e_compress.driving.policies import Driver
 from me2e_compress.evaluators.bench2drive.recordings import (
     TICK_S,
@@ -23,8 +24,8 @@ from me2e_compress.evaluators.bench2drive.result_files import (
     find_files,
     recordings_of,
 )
-from me2e_compress.evaluators.contract import Drive, Evaluator, Listener
-from me2e_compress.metrics.episode import EgoFrame, Episode, InferenceRecord
+from me2e_compress.evaluators.contract import Drive, Evaluator
+from me2e_compress.metrics.episode import EgoFrame, Episode
 from me2e_compress.metrics.scores import FULL_SET
 
 _IDS = json.loads(Path(__file__).with_name("route_ids.json").read_bytes())
@@ -34,6 +35,10 @@ ROUTE_SETS: dict[str, frozenset[str]] = {
 """The ids of the 220 routes of each version of Bench2Drive: those of
 leaderboard/data/bench2drive220.xml and of bench2drive_0.0.4_val.xml, which share two.
 The ten routes of "dev10" belong to the first."""
+
+
+UNREADABLE = (OSError, documents.MalformedError, BrokenRecordingError)
+"""What a recording or a log that is incomplete raises."""
 
 
 def _ids(routes: Path) -> frozenset[str]:
@@ -54,19 +59,16 @@ class CollectedResults:
     """Every route once, in the order of numbers, and everything else below a folder.
 
     Attributes:
-        route_set: The version of Bench2Drive that the routes are from, or the name of
-            one's own set, if any.
+        route_set: The version of Bench2Drive, or the name of the user's own set, if
+            the routes are of a known one.
         missing: Numbers of the set's routes without a record.
-        repeated: Routes with identical records, as when a merged file lies next to its
-            parts.
-        rerun: Routes that crashed first and were driven again; the crash does not
-            count.
+        repeated: Routes with identical records, as of a merged file and its parts.
+        rerun: Routes that crashed and were driven again; the crash does not count.
         contradictory: Routes with different results; the lowest driving score counts.
         broken: Incomplete files and records, with the reason.
         unfinished: Results files of workers killed on their first route.
         unrecorded: Routes without a recording of the ego.
-        off_rate: Seconds between two steps, for routes not recorded at the simulator's
-            rate.
+        off_rate: Seconds between two steps where that is not the simulator's rate.
         repetitions: How often the set was driven: a leaderboard's ``--repetitions``.
     """
 
@@ -90,14 +92,14 @@ class CollectedResults:
     def of(cls, files: RunFiles, routes: Path | None = None) -> Self:
         """Choose one record of each route, and read the recordings that belong to it.
 
-        One of the files must hold a record. `routes` names the set; None finds it.
+        One of the files must hold a record. `routes` is the set's file; None finds it.
         """
         # Sort the records of all results files by route
         made, by_route = cls(broken=files.broken), dict[str, list[RouteRecord]]()
         for file in files.results:
             for record in file.records:
                 by_route.setdefault(record.episode.route, []).append(record)
-            if not file.records and not file.broken:
+            if not file.records and file.whole:
                 made.unfinished.append(file.path)
         # Choose one record of each route, in order
         records = [made._chosen(route, copies) for route, copies in by_route.items()]
@@ -111,7 +113,13 @@ class CollectedResults:
             paths = recordings_of(record, files.recordings, files.results)
             logs = recordings_of(record, files.decisions, files.results)
             others = [path for path in others if path not in paths]
-            frames, decisions = made._frames(record, paths), made._decisions(logs)
+            frames, decisions = made._frames(record, paths), ()
+            for path in logs:  # the first whole one
+                try:
+                    decisions = read_decisions(path)
+                    break
+                except UNREADABLE as error:
+                    made.broken[str(path)] = str(error)
             episode = replace(record.episode, frames=frames, decisions=decisions)
             made.episodes.append(episode)
         if others:
@@ -168,7 +176,7 @@ class CollectedResults:
             try:
                 raw = documents.from_json(documents.read_bytes(path), finite=False)
                 recording = read_recording(raw)
-            except (OSError, documents.MalformedError, BrokenRecordingError) as error:
+            except UNREADABLE as error:
                 self.broken[str(path)] = str(error)
                 continue
             if len(paths) > 1:
@@ -179,15 +187,6 @@ class CollectedResults:
             if interval_s != TICK_S:
                 self.off_rate[route] = interval_s
             return recording.frames(interval_s)
-        return ()
-
-    def _decisions(self, paths: Sequence[Path]) -> tuple[InferenceRecord, ...]:
-        """Return the decisions of a drive; an incomplete log is reported."""
-        for path in paths:
-            try:
-                return read_decisions(path)
-            except (OSError, documents.MalformedError, BrokenRecordingError) as error:
-                self.broken[str(path)] = str(error)
         return ()
 
 

@@ -209,12 +209,12 @@ decisions: a line each, `frame` and `latency_us`."""
 class ResultFile:
     """One results file: a worker's checkpoint, or several merged.
 
-    ``broken`` says why records could not be read, by their index.
+    ``whole`` is whether all of its records could be read.
     """
 
     path: Path
     records: tuple[RouteRecord, ...] = ()
-    broken: dict[int, str] = field(default_factory=dict)
+    whole: bool = True
 
 
 @dataclass
@@ -247,15 +247,23 @@ def find_files(folder: Path) -> RunFiles:
             files.recordings.append(path)
         elif _is_checkpoint(path):
             try:
-                file = _read(path)
+                content = documents.from_json(documents.read_bytes(path), finite=False)
+                document = _Document.model_validate(content)
             except documents.MalformedError as error:
                 files.broken[str(path)] = f"not JSON: {error}"
-            except BrokenRecordError as error:
-                files.broken[str(path)] = str(error)
-            else:
-                files.results.append(file)
-                for place, why in file.broken.items():
-                    files.broken[f"{path}, record {place}"] = why
+                continue
+            except ValidationError as error:
+                files.broken[str(path)] = _complaint(error, "document")
+                continue
+            # A broken record does not spoil the others
+            records, whole = list[RouteRecord](), True
+            for place, raw in enumerate(document.checkpoint.records):
+                try:
+                    records.append(read_record(raw))
+                except BrokenRecordError as error:
+                    files.broken[f"{path}, record {place}"] = str(error)
+                    whole = False
+            files.results.append(ResultFile(path, tuple(records), whole))
     return files
 
 
@@ -285,21 +293,6 @@ def _is_checkpoint(path: Path) -> bool:
         return False
     cut = b'{"_checkpoint"'.startswith(b"".join(content[:99].split()))
     return cut or _CHECKPOINT in content.replace(b"\0", b"")
-
-
-def _read(path: Path) -> ResultFile:
-    document = documents.from_json(documents.read_bytes(path), finite=False)
-    try:
-        checked = _Document.model_validate(document)
-    except ValidationError as error:
-        raise BrokenRecordError(_complaint(error, "document")) from error
-    records, broken = list[RouteRecord](), dict[int, str]()
-    for place, raw in enumerate(checked.checkpoint.records):
-        try:
-            records.append(read_record(raw))
-        except BrokenRecordError as error:
-            broken[place] = str(error)
-    return ResultFile(path, tuple(records), broken)
 
 
 class _Checkpoint(BaseModel):

@@ -30,7 +30,6 @@ from me2e_compress.simulator.scene import Actor, Ego, Scene, box_of
 
 Floats = npt.NDArray[np.float64]
 
-
 LATEST = round(PET_HORIZON_S * 1e6 / FRAME_US)
 """Most frames between the first and the second at one place."""
 
@@ -55,13 +54,17 @@ def conflicts_of(scenes: Sequence[Scene]) -> ConflictRecord:
     frame = np.repeat(np.arange(len(counts)), counts)
     rows = [(*box_of(a), a.speed_mps, a.id) for scene in scenes for a in scene.actors]
     actors = np.array(rows).reshape(-1, 7)
+    # Columns: x, y, heading, length, width, speed, and the actor's number
     boxes = [(*box_of(scene.ego), scene.ego.speed_mps) for scene in scenes]
     egos = np.array(boxes).reshape(-1, 6)
     # Compare every actor with the ego of the same frame
-    one, other = egos[frame], actors[:, :6]
+    one, other = egos[frame], actors[:, :6]  # (rows, 6) each
     distance = gaps(one[:, :5], other[:, :5])
-    velocity = _velocity(other) - _velocity(one)
-    seconds = contact_times(one[:, :5], other[:, :5], velocity)
+    velocities = [
+        row[:, 5:] * np.stack([np.cos(row[:, 2]), np.sin(row[:, 2])], axis=1)
+        for row in (one, other)
+    ]
+    seconds = contact_times(one[:, :5], other[:, :5], velocities[1] - velocities[0])
     # Find the smallest value of each frame
     nearest, soonest = np.full((2, len(counts)), np.inf)
     np.minimum.at(nearest, frame, distance)
@@ -75,11 +78,15 @@ def conflicts_of(scenes: Sequence[Scene]) -> ConflictRecord:
             for ego_at, at, angle in _same_place(egos, actors[own], frame[own]):
                 time_us = max(ego_at, at) * FRAME_US
                 pet_s = abs(ego_at - at) * FRAME_US / 1e6
-                what = number, kind, time_us, pet_s, round(angle, 3), ego_at < at
-                encounters.append(Encounter(*what))
+                encounters.append(
+                    Encounter(
+                        number, kind, time_us, pet_s, round(angle, 3), ego_at < at
+                    )
+                )
     encounters.sort(key=lambda met: (met.time_us, met.actor))
-    columns = _known(nearest, math.inf), _known(soonest, TTC_HORIZON_S)
-    return ConflictRecord(*columns, tuple(encounters))
+    return ConflictRecord(
+        _known(nearest, math.inf), _known(soonest, TTC_HORIZON_S), tuple(encounters)
+    )
 
 
 def contact_of(ego: Ego, actor: Actor) -> Contact:
@@ -139,6 +146,7 @@ def _same_place(
         near &= ((actor[:, :2] >= low) & (actor[:, :2] <= high)).all(axis=1)
         if not near.any():
             continue
+        # Pairs (i, j) of an ego frame and an actor frame whose boxes overlap
         other, when = actor[near], frame[near]
         apart = np.abs(start + np.arange(len(ego))[:, None] - when)
         away = np.hypot(*(ego[:, None, :2] - other[:, :2]).transpose(2, 0, 1))
@@ -155,11 +163,6 @@ def _same_place(
                 pair = abs(at[0] - at[1]), *at, float(turn[k])
                 best[crossing] = min(best.get(crossing, pair), pair)
     return [pair[1:] for pair in best.values()]
-
-
-def _velocity(rows: Floats) -> Floats:
-    heading, speed = rows[:, 2], rows[:, 5]
-    return np.stack([speed * np.cos(heading), speed * np.sin(heading)], axis=1)
 
 
 def _known(values: Floats, most: float) -> tuple[float | None, ...]:

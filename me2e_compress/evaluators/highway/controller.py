@@ -84,6 +84,7 @@ class AnchoredPlan:
         """Return the arc length (m) of the curve point nearest to a position."""
         (start_x, start_y), (step_x, step_y), square = self._chords
         away_x, away_y = x - start_x, y - start_y
+        # Project the position on every chord, within its ends
         share = ((away_x * step_x + away_y * step_y) / square).clip(0.0, 1.0)
         miss_x, miss_y = away_x - share * step_x, away_y - share * step_y
         i = int((miss_x * miss_x + miss_y * miss_y).argmin())
@@ -125,8 +126,7 @@ class AnchoredPlan:
         lag, fit, weight = ACCELERATION_LAG_S, 0.0, 0.0
         for ahead in AHEAD_S:
             # Distance lost to the lag, distance coasted, distance per commanded m/s2
-            late = lag * (ahead - lag)
-            late += lag**2 * math.exp(-ahead / lag)
+            late = lag * (ahead - lag) + lag**2 * math.exp(-ahead / lag)
             free = speed * ahead + ego.acceleration_mps2 * late
             gain = ahead**2 / 2 - late
             fit += gain * (self.travel_at(age_s + ahead) - here - free)
@@ -136,7 +136,7 @@ class AnchoredPlan:
         # Steering: from where the ego is once the wheels have turned
         travel, pose = speed * STEERING_LAG_S, (ego.x, ego.y, ego.heading)
         x, y, heading = advance(*pose, ego.steering_rad, travel, ego.length)
-        # To the point of the curve one lookahead further
+        # To the point of the curve one lookahead further, in the ego's frame then
         lookahead = max(SHORTEST_LOOKAHEAD_M, LOOKAHEAD_S * speed)
         target_x, target_y = self.point(self.nearest(x, y) + lookahead)
         cos, sin = math.cos(heading), math.sin(heading)
@@ -149,14 +149,14 @@ def _advance_only(points: Floats) -> tuple[Floats, Floats]:
     """Drop the waypoints [N, 2] that do not advance.
 
     The waypoints of a plan that stops lie around one place: they must neither bend the
-    curve nor add to its length. Returns ([K, 2] kept waypoints, [N] metres travelled at
-    each waypoint).
+    curve nor add to its length. Returns [K, 2] knots, and [N] metres travelled.
     """
     knots, travel, arc = [points[0]], [0.0], 0.0
     direction = np.array([1.0, 0.0])
     for point in points[1:]:
         step = point - knots[-1]
         length, forward = float(np.hypot(*step)), float(step @ direction)
+        # A step backwards, or a tiny one, counts at most its way forward
         if length >= MIN_STEP_M and forward > 0:
             direction, arc = step / length, arc + length
             knots.append(point)
@@ -195,8 +195,7 @@ def control_of(pedals: PedalsAndWheel, length_m: float) -> Control:
     """Convert CARLA's throttle, brake and steer to the control of this ego.
 
     Full pedals are the limits of the ego's engine and brakes, as in CARLA: throttle 4
-    m/s2, brake 8 m/s2, both together their difference; with neither the ego keeps its
-    speed (no drag, no creeping).
+    m/s2, brake 8 m/s2, both together their difference; with neither the speed stays.
 
     A steer (to the right positive) gives the circle that CARLA's car would drive, by
     the kinematic bicycle that World on Rails (Chen, Koltun and Kraehenbuehl 2021)

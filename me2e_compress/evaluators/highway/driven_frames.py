@@ -42,11 +42,9 @@ def driven_frames(
     """Yield what a model sees on fresh routes, every half second.
 
     A scene is a random stretch of one route, driven by ``driver`` without latency;
-    fewer frames than ``scene_length`` if the route ends before.
-    Its clock, its CAN bus and (since they are left out) its recurrent inputs start
-    anew. Scenario types alternate; none of the routes is one of the 220 that ship.
-    Frames are keyed by the graph's input names, without the recurrent inputs; the
-    policy defines image size, normalisation, names and types.
+    fewer frames than ``scene_length`` if the route ends before. Its clock and CAN bus
+    start anew. Scenario types alternate; none of the routes is one of the 220 that
+    ship. Frames are keyed by the graph's input names, without the recurrent inputs.
 
     To resume, ``done`` is the number of frames that exist, in whole scenes, and
     ``first`` the index of the route of the first missing scene.
@@ -107,7 +105,7 @@ def _feeds_of_scene(
     world, rules = World(route), EndingRules()
     driving, watching = (_observer_of(world, model) for model in (driver, policy))
     driver.reset(route)
-    # Record every half second, from the first moment on
+    # Record every half second, from the first moment on; the driver drives
     policy.reset(route)
     scene, left = world.scene(), length
     while left and rules.ending(world, scene.ego.speed_mps) is None:

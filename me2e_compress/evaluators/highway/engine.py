@@ -30,6 +30,8 @@ if TYPE_CHECKING:  # highway-env takes a second to import: only who drives needs
 
 POLL_S = 0.05
 
+Line: TypeAlias = "Connection[Route, Driven | Me2eError]"
+"""The parent's end: routes go to the child, an episode or an error comes back."""
 Heartbeat: TypeAlias = "SynchronizedArray[float]"
 """[0] number of the policy call in progress, 0 between calls; [1] percent of
 the route passed."""
@@ -43,9 +45,7 @@ class RouteWorker:
     conditions: Drive
     _process: SpawnProcess | None = field(default=None, init=False)
     _heartbeat: Heartbeat | None = field(default=None, init=False)
-    _line: Connection[Route, Driven | Me2eError] | None = field(
-        default=None, init=False
-    )
+    _line: Line | None = field(default=None, init=False)
 
     def drive(self, route: Route, stop: threading.Event | None = None) -> Driven | None:
         """Drive a route; a policy that hangs or crashes its process has failed.
@@ -87,9 +87,7 @@ class RouteWorker:
             self._line.close()
         self._process = self._heartbeat = self._line = None
 
-    def _started(
-        self,
-    ) -> tuple[SpawnProcess, Heartbeat, Connection[Route, Driven | Me2eError]]:
+    def _started(self) -> tuple[SpawnProcess, Heartbeat, Line]:
         if self._process is None or self._heartbeat is None or self._line is None:
             # The child keeps only its own end of the pipe
             context = spawn_context()
@@ -126,8 +124,8 @@ def _serve(
     conditions: Drive,
 ) -> None:
     """Drive the routes received until the other end of the pipe closes."""
-    end_with_parent()
     # The heartbeat tells the parent when a call of the policy began
+    end_with_parent()
     calls = itertools.count(1)
 
     def on_query(world: World) -> None:
@@ -137,6 +135,7 @@ def _serve(
     def on_answer() -> None:
         heartbeat[0] = 0.0
 
+    # Drive until the parent closes its end; an error of ours goes to the parent
     try:
         from me2e_compress.evaluators.highway.episode_recorder import completion_percent
         from me2e_compress.evaluators.highway.runner import Listeners, drive
@@ -168,6 +167,7 @@ class LocalEngine:
         self, policy: Driver, drive: Drive, routes: Sequence[Route]
     ) -> Iterator[Driven]:
         """Yield each route as it finishes; closing the iterator ends the processes."""
+        # A thread takes an idle worker for each route
         count = max(1, min(self.workers, len(routes)))
         workers = [RouteWorker(policy, drive) for _ in range(count)]
         stop, idle = threading.Event(), queue.SimpleQueue[RouteWorker]()
@@ -218,6 +218,7 @@ class RayEngine:
         except ImportError as error:
             raise with_install_hint(error) from error
         self._connect(ray)
+        # One actor per worker; each drives its routes in a process of its own
         try:
             remote: Any = ray.remote(num_cpus=1)(RouteWorker)
             count = min(self.workers, len(routes))

@@ -64,10 +64,12 @@ class EpisodeRecorder:
         if scene.time_us < len(self.frames) * FRAME_US:
             return
         ego = scene.ego
-        vehicles = [actor for actor in scene.actors if actor.kind in VEHICLES]
-        away_m = [math.hypot(one.x - ego.x, one.y - ego.y) for one in vehicles]
-        pairs = zip(vehicles, away_m, strict=True)
-        near = [vehicle.speed_mps for vehicle, metres in pairs if metres <= NEAR_M]
+        near = [
+            actor.speed_mps
+            for actor in scene.actors
+            if actor.kind in VEHICLES
+            and math.hypot(actor.x - ego.x, actor.y - ego.y) <= NEAR_M
+        ]
         frame = EgoFrame(
             time_us=scene.time_us,
             x=ego.x,
@@ -133,6 +135,7 @@ def junction_m(path: RoutePath) -> float | None:
 
 def _infractions(world: World, ending: Ending) -> tuple[Infraction, ...]:
     """Translate the world's events, and the end of the route, into infractions."""
+    # Events that are infractions; a collision's kind is that of its partner
     infractions = list[Infraction]()
     for event in world.events:
         kind = KINDS.get(event.kind)
@@ -150,13 +153,14 @@ def _infractions(world: World, ending: Ending) -> tuple[Infraction, ...]:
         outside_m = world.outside_distance_m
         passed_m = max(world.progress_m, outside_m, 1e-9)
         percent = min(100.0, 100.0 * outside_m / passed_m)
-        kind, at = InfractionKind.OUTSIDE_ROUTE_LANES, (left.time_us, left.x, left.y)
-        detail = f"{outside_m:.2f} m"
-        infractions.append(Infraction(kind, *at, detail=detail, percent=percent))
+        kind, detail = InfractionKind.OUTSIDE_ROUTE_LANES, f"{outside_m:.2f} m"
+        infractions.append(
+            Infraction(kind, left.time_us, left.x, left.y, detail, percent)
+        )
+    # The end of the route, unless it was reached
     if ending in ENDINGS:
-        ego = world.scene().ego
-        at_end = world.time_us, ego.x, ego.y
-        infractions.append(Infraction(ENDINGS[ending], *at_end, ending.value))
+        ego, kind = world.scene().ego, ENDINGS[ending]
+        infractions.append(Infraction(kind, world.time_us, ego.x, ego.y, ending.value))
     return tuple(sorted(infractions, key=lambda infraction: infraction.time_us or 0))
 
 
@@ -166,9 +170,14 @@ def _infraction(kind: InfractionKind, event: Event, world: World) -> Infraction:
     number = "" if event.actor_id is None else f"{event.actor_id}"
     detail = f"{partner}{number}".strip() or event.detail
     infraction = Infraction(
-        *(kind, event.time_us, event.x, event.y, detail),
+        kind,
+        event.time_us,
+        event.x,
+        event.y,
+        detail,
         ego_speed_mps=event.ego_speed_mps,
     )
+    # Contact and fault follow from the scene of the collision
     if kind in COLLISIONS:
         scene = world.collided[event.time_us]
         for actor in scene.actors:

@@ -1,12 +1,15 @@
 """Closed-loop evaluation in highway-env: routes that do not depend on one another."""
 
+from __future__ import annotations
+
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 from me2e_compress.base.errors import EvaluationError
 from me2e_compress.base.extras import require_extra
+from me2e_compress.base.listener import Listener
 from me2e_compress.driving.contract import RouteInfo
 from me2e_compress.driving.policies import Driver, opened
 from me2e_compress.evaluators.contract import (
@@ -14,7 +17,6 @@ from me2e_compress.evaluators.contract import (
     Drive,
     Engine,
     Evaluator,
-    Listener,
 )
 from me2e_compress.evaluators.highway.drivers import image_size_of
 from me2e_compress.evaluators.highway.engine import LocalEngine
@@ -31,6 +33,13 @@ from me2e_compress.simulator.routes import (
 )
 from me2e_compress.version import __version__
 
+if TYPE_CHECKING:
+    from me2e_compress.simulator.pictures import Moment
+
+EVERY_US = 200_000
+"""Simulated time between two frames of an animation."""
+STRIP = 4
+"""Moments of the strip."""
 LONGER = 1.5
 """Frames of a route, by those of its type in `EXPERT_S`, which knows no traffic."""
 
@@ -102,7 +111,7 @@ class Highway(Evaluator):
                 "it, so they are driven one at a time"
             )
             engine = LocalEngine()
-        # A long route that starts last would keep all other workers waiting
+        # A long route that starts last would leave all other workers waiting
         ordered = longest_first(_ours(drive.routes))
         for driven in engine.drive(policy, replace(drive, routes=()), ordered):
             log_cost(folder, driven)
@@ -116,11 +125,35 @@ class Highway(Evaluator):
     def render(
         self, policy: Driver, drive: Drive, route: RouteInfo, folder: Path
     ) -> tuple[Path, ...]:
-        """Write an animation and a strip of a route."""
-        from me2e_compress.evaluators.highway.render import render
+        """Drive a route again and draw it; return an animation and a strip.
 
+        The animation shows six cameras and the view from above with the plan,
+        infractions marked; the strip shows four moments including the end.
+        """
+        from me2e_compress.evaluators.highway import runner
+        from me2e_compress.simulator.cameras.ground import paint_texture
+        from me2e_compress.simulator.pictures import RoutePicture, write_picture
+        from me2e_compress.simulator.world import World
+
+        moments: list[Moment] = []
         (ours,) = _ours([route])
-        return render(policy, drive, ours, folder)
+
+        def on_moment(moment: Moment) -> None:
+            # Every fourth moment stays, and the last one
+            if moments and moments[-1].scene.time_us % EVERY_US:
+                moments.pop()
+            moments.append(moment)
+
+        runner.drive(ours, policy.open(), drive, runner.Listeners(on_moment=on_moment))
+        # Draw all moments, then four of them side by side
+        world, title = World(ours), f"{ours.scenario} {ours.id} {policy.label}"
+        texture = paint_texture(world.roadmap, world.path.points)
+        picture = RoutePicture(title, texture, world.path.points, moments)
+        gif, png = folder / f"{ours.id}.gif", folder / f"{ours.id}.png"
+        write_picture(gif, picture.frames(), EVERY_US)
+        chosen = [i * (len(moments) - 1) // (STRIP - 1) for i in range(STRIP)]
+        write_picture(png, [picture.strip(chosen)])
+        return gif, png
 
 
 def _ours(routes: Sequence[RouteInfo]) -> list[Route]:

@@ -37,6 +37,7 @@ class RouteNodes:
     @classmethod
     def along(cls, path: RoutePath) -> Self:
         """Place the nodes of a route."""
+        # Stations are the indices of the path's points, a metre apart
         changes = 1 + np.flatnonzero(np.diff(path.commands))
         kept = [0, *changes.tolist(), len(path.points) - 1]
         places: list[int] = []

@@ -132,6 +132,7 @@ class _Drive:
         conditions: Drive,
         listeners: Listeners,
     ) -> None:
+        # The world, its record, and the rules of latency
         self.route, self.policy, self.listeners = route, policy, listeners
         self.hosted = policy if isinstance(policy, HostedPolicy) else None
         self.world = world = World(route, dt_us=conditions.dt_us)
@@ -139,6 +140,7 @@ class _Drive:
         coast, model = Control(0.0, 0.0), conditions.latency_model
         self.clock = ControlClock(coast, conditions.dt_us, model)
         self.charge = conditions.latency.on_route(route.id)
+        # Cameras render for a policy or a picture only
         rig = CameraRig(*image_size_of(policy))
         self.cameras = None
         if policy.needs_images or listeners.on_moment is not None:
@@ -191,11 +193,11 @@ class _Drive:
             self.plan = scene.ego, np.asarray(valid.points, np.float64)
             anchored = AnchoredPlan.of(valid, scene.ego, scene.time_us)
             control = anchored.control(scene.ego, scene.time_us)
+        # Charge the latency, which may depend on the work of a host stage
         work = 0, 0
         if self.hosted is not None:
             work = self.hosted.host_iterations, self.hosted.host_cells
-        facts = DecisionFacts(took_us, road_users(scene), *work)
-        latency_us = self.charge(facts)
+        latency_us = self.charge(DecisionFacts(took_us, road_users(scene), *work))
         self.recorder.decisions.append(InferenceRecord(scene.time_us, latency_us))
         self.clock.decide(control, latency_us)
 

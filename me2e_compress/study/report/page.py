@@ -30,14 +30,10 @@ class Drawing:
 
 @dataclass(frozen=True)
 class Section:
-    """A heading with pictures; its tables, and files to link, are folded.
-
-    So are pictures that are too high to be open, if it is ``high``.
-    """
+    """A heading with pictures; tables are folded, and pictures if they are ``high``."""
 
     title: str
     tables: tuple[Table, ...] = ()
-    files: tuple[tuple[str, str], ...] = ()
     drawings: tuple[Drawing, ...] = ()
     high: bool = False
 
@@ -78,11 +74,9 @@ class Page:
 TIMES = "\N{MULTIPLICATION SIGN}"
 
 
-def study_page(
-    outcome: StudyResult, command: Sequence[str] = (), sections: Sequence[Section] = ()
-) -> Page:
-    """Return the page of a comparison; ``sections`` stand before how it was made."""
-    # What the variants were made of, and how they were timed
+def study_page(outcome: StudyResult, command: Sequence[str] = ()) -> Page:
+    """Return the page of a comparison, with the command that made it."""
+    # What the variants were made of
     variants = list[tuple[str, str, str | None]]()
     for prepared in outcome.variants:
         made_of = prepared.source or prepared.variant.policy
@@ -91,11 +85,20 @@ def study_page(
         if prepared.weights:
             made_of = f"{made_of}; weights: {prepared.weights}"
         variants.append((prepared.variant.name, made_of, prepared.sha256))
+    # How they were timed
     timing = outcome.study.timing
     load = "" if outcome.load is None else f"; while it was timed, {outcome.load}"
     timed = (
         f"{timing.samples} inferences a model, in turn, on"
         f" {plural(timing.threads, 'thread')}; device scale {outcome.device_scale:.3g}"
+    )
+    # Which routes they drove, under which conditions
+    study, (driven, whole) = outcome.study, outcome.coverage
+    share = "" if driven == whole else f"{driven} of "
+    described = "; ".join(map(outcome.described, study.conditions))
+    lede = (
+        f"Drivers compared in closed loop on the same {share}{plural(whole, 'route')}"
+        f" of {study.driven_by.label}. {described}."
     )
     made = [
         ("Command", " ".join(command)),
@@ -106,8 +109,8 @@ def study_page(
     ]
     return Page(
         outcome.title,
-        _lede(outcome),
-        [*_sections(outcome), *sections],
+        lede,
+        _sections(outcome),
         made,
         variants,
         findings(outcome),
@@ -139,20 +142,10 @@ def _sections(outcome: StudyResult) -> list[Section]:
         drawings["Differences"] = (Drawing(gaps, note),)
     high = len(outcome.drives) > MOST_DRIVES
     return [
-        Section(titles.get(name, name), theirs, (), drawings.get(name, ()), high)
+        Section(titles.get(name, name), theirs, drawings.get(name, ()), high)
         for name, theirs in tables.items()
         if theirs
     ]
-
-
-def _lede(outcome: StudyResult) -> str:
-    study, (driven, whole) = outcome.study, outcome.coverage
-    share = "" if driven == whole else f"{driven} of "
-    described = "; ".join(map(outcome.described, study.conditions))
-    return (
-        f"Drivers compared in closed loop on the same {share}{plural(whole, 'route')}"
-        f" of {study.driven_by.label}. {described}."
-    )
 
 
 def _how_to_read(outcome: StudyResult) -> str:
@@ -182,6 +175,7 @@ def findings(outcome: StudyResult) -> tuple[tuple[str, str], ...]:
     """Say of every variant but the baseline what it costs and how it drives."""
     several = len(outcome.study.conditions) > 1
     baseline = outcome.variant(outcome.study.baseline)
+    # Costs relative to the baseline's, then the difference of every drive
     sentences = list[tuple[str, str]]()
     for variant in outcome.variants:
         if variant is baseline:
@@ -239,7 +233,6 @@ def write_study(
     outcome: StudyResult,
     folder: str | Path,
     command: Sequence[str] = (),
-    sections: Sequence[Section] = (),
     *,
     force: bool = False,
 ) -> StudyFiles:
@@ -249,7 +242,6 @@ def write_study(
         outcome: Results to write.
         folder: Created if needed.
         command: The command line that reproduces the study, word by word.
-        sections: Additional sections of the page.
         force: Also replace files that we did not write.
 
     Raises:
@@ -261,7 +253,7 @@ def write_study(
     written = StudyFiles(folder / JSON, folder / MARKDOWN, folder / HTML)
     heading = f"{atomic.IN_MARKDOWN}# {escape_markdown(outcome.title)}\n\n"
     text = heading + "\n".join(table.markdown() for table in outcome.tables())
-    page = study_page(outcome, command, sections)
+    page = study_page(outcome, command)
     # Write all files, or none
     with atomic.writing_errors(folder, StudyError):
         folder.mkdir(parents=True, exist_ok=True)

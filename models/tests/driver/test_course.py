@@ -14,7 +14,7 @@ from pathlib import Path
 import psutil
 import pytest
 
-from me2e_compress.commands.result import Listener
+from me2e_compress.base.listener import Listener
 from me2e_compress.driving.onnx_policy import OnnxPolicy
 from me2e_compress.simulator.routes import load_routes
 from models.driver.checkpoint import TrainingCheckpoint

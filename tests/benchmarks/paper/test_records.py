@@ -12,7 +12,7 @@ from benchmarks.paper.accident import plans_before
 from benchmarks.paper.evidence import FEWEST_RUNS
 from benchmarks.paper.records import RECORDS, add_facts, read_paper
 from me2e_compress.base.errors import StudyError
-from me2e_compress.commands.result import SILENT
+from me2e_compress.base.listener import SILENT
 from me2e_compress.simulator.routes import Route
 from me2e_compress.study import Condition, Study, Timing, Variant, run_study
 from me2e_compress.study.definition import StudyBlock

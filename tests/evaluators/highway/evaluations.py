@@ -5,7 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from me2e_compress.commands.result import SILENT, Listener
+from me2e_compress.base.listener import SILENT, Listener
 from me2e_compress.driving.latency import TraceLatency
 from me2e_compress.driving.policies import Driver
 from me2e_compress.evaluators import Drive

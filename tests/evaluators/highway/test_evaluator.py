@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 
 from me2e_compress.base.errors import EvaluationError
-from me2e_compress.commands.result import Listener
+from me2e_compress.base.listener import Listener
 from me2e_compress.driving.latency import FixedLatency, MeasuredLatency
 from me2e_compress.evaluators import Drive
 from me2e_compress.evaluators.highway.drivers import OnnxDriver

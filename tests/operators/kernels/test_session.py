@@ -15,9 +15,9 @@ import pytest
 
 from me2e_compress import graph
 from me2e_compress.base.errors import FramesError, GraphError
+from me2e_compress.base.listener import SILENT
 from me2e_compress.commands.checks import try_first
 from me2e_compress.commands.listing import doctor
-from me2e_compress.commands.result import SILENT
 from me2e_compress.operators import dialect_of, kernels
 from me2e_compress.operators.deformable_attention import DeformableAttention
 from me2e_compress.operators.kernels import custom_ops, trampoline
