@@ -10,11 +10,11 @@ from me2e_compress.base.errors import Me2eError, OptionError
 from me2e_compress.cli.signals import INTERRUPTED, TERMINATED, handle_signals
 
 RUN_AGAIN = "run again to go on"
+# What to do to resume a command that was interrupted
 RESUMES = {
     **dict.fromkeys(("calibrate", "evaluate", "sensitivity", "study"), RUN_AGAIN),
     "frames": f"{RUN_AGAIN} after the last whole scene, if there is one",
 }
-"""What to do to resume a command that was interrupted."""
 
 
 def main() -> int:

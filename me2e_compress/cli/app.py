@@ -54,6 +54,7 @@ def _default_text(default: object) -> str | None:
     return str(default) if isinstance(default, int | float | str) and default else None
 
 
+# Commands in the order in which `--help` lists them
 _PANELS = {
     "Start here": "demo doctor list",
     "Graphs and frames": "export inspect join split frames",
@@ -61,10 +62,9 @@ _PANELS = {
     "Compare and measure": "compare profile",
     "Drive": "evaluate score study",
 }
-"""Commands in the order in which ``--help`` lists them."""
 _NEED_HIGHWAY = ("evaluate", "study")
+# The panel of every command
 COMMANDS = {name: panel for panel, names in _PANELS.items() for name in names.split()}
-"""The panel of every command."""
 
 
 def _main_app() -> App:

@@ -42,10 +42,8 @@ class Printing:
     json: bool = False
 
 
-printing = Printing()
-"""Of the run at hand: the command sets it."""
-WIDE = 120
-"""Columns that a terminal must have for intervals beside the numbers."""
+printing = Printing()  # of the run at hand: the command sets it
+WIDE = 120  # columns that a terminal must have for intervals beside the numbers
 
 
 @contextmanager
@@ -226,8 +224,7 @@ def print_json(data: object) -> None:
     sys.stdout.write(json.dumps(data, indent=2, allow_nan=False) + "\n")
 
 
-EVERY_S = 10.0
-"""Seconds between two lines."""
+EVERY_S = 10.0  # seconds between two lines
 
 
 class ProgressLines:

@@ -8,15 +8,15 @@ import threading
 from collections.abc import Iterator
 from types import FrameType
 
+# Exit codes after Ctrl-C and after SIGTERM, as shells count them
 INTERRUPTED, TERMINATED = 128 + signal.SIGINT, 128 + signal.SIGTERM
-"""Exit codes after Ctrl-C and after SIGTERM, as shells count them."""
+# Seconds that native code may delay a signal; after that the process ends
 TIMEOUT_S = 5.0
-"""Seconds that native code may delay a signal; after that the process ends."""
+# The signal for which a handler raises each exception
 _SIGNALS: dict[type[BaseException], signal.Signals] = {
     KeyboardInterrupt: signal.SIGINT,
     SystemExit: signal.SIGTERM,
 }
-"""The signal for which a handler raises each exception."""
 _MOMENT_S = 0.02
 
 

@@ -299,8 +299,7 @@ def compare_sessions(
     )
 
 
-FRAMES = 2
-"""The second frame is compared: it reads the state of the first."""
+FRAMES = 2  # the second frame is compared: it reads the state of the first
 
 
 @dataclasses.dataclass(frozen=True, repr=False)

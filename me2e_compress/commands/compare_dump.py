@@ -25,8 +25,8 @@ from me2e_compress.fidelity.engine_loss import (
 from me2e_compress.runtime.session import Session
 from me2e_compress.targets.quantized import describe_quantized
 
+# Above, two float32 programs differ by the order of their sums (60 dB: 0.1 %)
 SAME_DB = 60.0
-"""Above, two float32 programs differ by the order of their sums (60 dB: 0.1 %)."""
 
 
 @dataclasses.dataclass(frozen=True, repr=False)

@@ -33,10 +33,10 @@ from me2e_compress.shipped.drivers import SHIPPED
 from me2e_compress.simulator.routes import Route, pick_routes
 from me2e_compress.targets.onnxruntime.convert import slow_here
 
+# Command-line names of options that differ from their Python names
 _FLAGS = {"module_map": "map"}
-"""Command-line names of options that differ from their Python names."""
+# What an evaluator must take for an option, where that has another name
 _ABILITIES = {"seed": "latency", "workers": "engine"}
-"""What an evaluator must take for an option, where that has another name."""
 _FOR_ALL = ("evaluator", "force")
 
 
@@ -74,20 +74,16 @@ def drive_of(options: EvaluateOptions, evaluator: Evaluator) -> Drive:
 
 @dataclasses.dataclass(frozen=True, repr=False)
 class EvaluateResult(Result):
-    """How a policy drives.
-
-    Attributes:
-        policy: the policy as named, or the evaluator where that drives none.
-        deadlines: latencies charged to decisions, against the frame time; None if none.
-        slow_here: why the policy's file is slow on this CPU, whose form is not its own.
-    """
+    """How a policy drives."""
 
     keys = ("*scores", "deadlines", "slow_here")
-    policy: str
+    policy: str  # the policy as named, or the evaluator where that drives none
     output: Path
     scores: Scores
     pictures: tuple[Path, ...] = ()
+    # latencies charged to decisions, against the frame time; None if none
     deadlines: Deadlines | None = None
+    # why the policy's file is slow on this CPU, whose form is not its own
     slow_here: str | None = None
 
     def view(self) -> View:

@@ -32,25 +32,18 @@ from me2e_compress.runtime.frames import Frame
 from me2e_compress.shipped.drivers import shipped_model
 from me2e_compress.version import __version__
 
-DRIVEN_SCENE_LENGTH = 16
-"""Frames of a stretch of a route, half a second apart."""
+DRIVEN_SCENE_LENGTH = 16  # frames of a stretch of a route, half a second apart
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
 class FramesResult(Result):
-    """A recording that was written for a model.
-
-    Attributes:
-        frames: how many lie there: a log may have fewer than were asked for.
-        seed: None of a log.
-        log: the log that they were read from, as it is written.
-    """
+    """A recording that was written for a model."""
 
     stack: str
     output: Path
-    frames: int
-    seed: int | None = None
-    log: str | None = None
+    frames: int  # how many lie there: a log may have fewer than were asked for
+    seed: int | None = None  # none of a log
+    log: str | None = None  # the log that they were read from, as it is written
 
     @classmethod
     def of(cls, stack: str, output: Path, options: FramesOptions) -> Self:

@@ -35,10 +35,9 @@ from me2e_compress.passes import Context
 from me2e_compress.passes.fix_shapes import FixShapes, open_dimensions
 from me2e_compress.passes.freeze_inputs import advice
 
+# Metadata key of what an exporter says of the checkpoint that it took
 WEIGHTS = "me2e.weights"
-"""Metadata key of what an exporter says of the checkpoint that it took."""
-_SHOWN = 8
-"""Number of reasons for unknown MACs that are named."""
+_SHOWN = 8  # number of reasons for unknown MACs that are named
 
 
 @dataclasses.dataclass(frozen=True, repr=False)

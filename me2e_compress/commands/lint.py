@@ -44,21 +44,13 @@ class RuleSummary:
 
 @dataclasses.dataclass(frozen=True, repr=False)
 class LintResult(Result):
-    """The findings of our rules, and TensorRT-RTX's answer.
+    """The findings of our rules, and TensorRT-RTX's answer."""
 
-    Attributes:
-        model: the file.
-        options: what was asked, and how.
-        findings: the worst first.
-        build: TensorRT-RTX's answer; None if not asked.
-        asked: whether a user named the target; else a pass did.
-    """
-
-    model: Path
-    options: LintOptions
-    findings: tuple[LintFinding, ...]
-    build: BuildResult | None = None
-    asked: bool = True
+    model: Path  # the file
+    options: LintOptions  # what was asked, and how
+    findings: tuple[LintFinding, ...]  # the worst first
+    build: BuildResult | None = None  # TensorRT-RTX's answer; None if not asked
+    asked: bool = True  # whether a user named the target; else a pass did
 
     @property
     def refusal(self) -> str | None:

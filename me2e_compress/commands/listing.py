@@ -94,6 +94,7 @@ def _toml_entry(path: Traversable) -> Entry:
     return Entry(path.name.removesuffix(".toml"), _OURS, doc)
 
 
+# Registries to which other packages add
 REGISTRIES: Mapping[str, Registry[Any]] = {
     "passes": PASSES,
     "rules": RULES,
@@ -110,9 +111,9 @@ REGISTRIES: Mapping[str, Registry[Any]] = {
     "providers": PROVIDERS,
     "operators": OPERATORS,
 }
-"""Registries to which other packages add."""
 
 
+# The functions that find the entries of a kind
 KINDS: Mapping[str, Callable[[], tuple[Entry, ...]]] = {
     **{kind: partial(describe, each) for kind, each in REGISTRIES.items()},  # pyright: ignore[reportArgumentType]
     "recipes": lambda: tuple(
@@ -134,7 +135,6 @@ KINDS: Mapping[str, Callable[[], tuple[Entry, ...]]] = {
         Entry(name, _OURS, "trained; ships with the package") for name in SHIPPED
     ),
 }
-"""The functions that find the entries of a kind."""
 
 
 def list_entries(kind: str | None = None) -> ListResult:

@@ -39,8 +39,8 @@ from me2e_compress.quantization.rules import DEFAULT_RULES, RULE_SETS
 from me2e_compress.shipped.drivers import map_name
 from me2e_compress.targets import DEFAULT_TARGET, TARGETS
 
+# The rules that need all ranges that others do: an override may lift those
 _MOST_RANGES = "paper{without=[fused-operator]}"
-"""The rules that need all ranges that others do: an override may lift those."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -124,16 +124,11 @@ class PreparedGraph:
 
 @dataclasses.dataclass(frozen=True, repr=False)
 class PlanResult(Result):
-    """A plan.
-
-    Attributes:
-        plan: the decision for every node.
-        hint: what the graph lacks for more to be known, else empty.
-    """
+    """A plan."""
 
     keys = ("*plan",)
-    plan: QuantPlan
-    hint: str = ""
+    plan: QuantPlan  # the decision for every node
+    hint: str = ""  # what the graph lacks for more to be known, else empty
 
     def view(self, every: bool = False) -> View:
         """Return how many nodes of each module became what by which rule.

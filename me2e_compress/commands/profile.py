@@ -30,33 +30,28 @@ from me2e_compress.runtime.profile import WARM_UP
 from me2e_compress.runtime.profile import profile as measure
 from me2e_compress.targets.onnxruntime.convert import slow_here
 
-_SHOWN = 12
-"""Number of operators in a table."""
+_SHOWN = 12  # number of operators in a table
+# Samples beyond the 99th percentile from which on it is steady: with fewer, one
+# disturbance more or less moves it
 BEYOND_P99 = 5
-"""Samples beyond the 99th percentile from which on it is steady: with fewer, one
-disturbance more or less moves it."""
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
 class ProfileResult(Result):
-    """Latencies of one model.
-
-    Attributes:
-        operators_us: microseconds of each operator, in inferences under a profiler.
-        energy: joules, or why there are none; None if not asked for.
-        slow_here: why the file is slow on this CPU, whose form is not its own.
-        known: which inputs are state, and from where that is known.
-    """
+    """Latencies of one model."""
 
     model: Path
     trace: LatencyTrace
     output: Path | None
+    # microseconds of each operator, in inferences under a profiler
     operators_us: Microseconds = dataclasses.field(default_factory=dict)
+    # joules, or why there are none; None if not asked for
     energy: EnergyResult | None = None
     energy_output: Path | None = None
     budget_ms: float = BUDGET_MS
+    # why the file is slow on this CPU, whose form is not its own
     slow_here: str | None = None
-    known: str = ""
+    known: str = ""  # which inputs are state, and from where that is known
 
     @property
     def deadlines(self) -> Deadlines:

@@ -9,29 +9,23 @@ from typing import Any, ClassVar, Literal
 from me2e_compress.base.display import Table
 from me2e_compress.base.errors import Me2eError
 
+# Version of the documents that `--json` prints; docs/json.md tells their keys. It grows
+# where a key goes or changes its meaning, not where one is added.
 SCHEMA = 3
-"""Version of the documents that ``--json`` prints; docs/json.md tells their keys. It
-grows where a key goes or changes its meaning, not where one is added."""
 
 Status = Literal["ok", "warning", "refused"]
 
 
 @dataclasses.dataclass(frozen=True)
 class View:
-    """What people see of a result: tables, then lines, then alerts in bold.
+    """What people see of a result: tables, then lines, then alerts in bold."""
 
-    Attributes:
-        headline: what it is, in one line.
-        lines: None are the headline alone; empty where a table says everything.
-        alerts: what must not be overlooked.
-        error: why the command ends with 1 though it has a result.
-    """
-
-    headline: str
+    headline: str  # what it is, in one line
     tables: Iterable[Table] = ()
+    # None are the headline alone; empty where a table says everything
     lines: Iterable[str] | None = None
-    alerts: Iterable[str] = ()
-    error: Me2eError | None = None
+    alerts: Iterable[str] = ()  # what must not be overlooked
+    error: Me2eError | None = None  # why the command ends with 1 though it has a result
 
 
 class Result:

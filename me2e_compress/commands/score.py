@@ -39,15 +39,11 @@ _NAMED = 5
 
 @dataclasses.dataclass(frozen=True)
 class RealRun:
-    """A real run, scored.
-
-    Attributes:
-        scores: scores as of any other run, with Bench2Drive's rules of abilities.
-        leaderboard: scores as the leaderboard and Bench2Drive's tools compute them.
-    """
+    """A real run, scored."""
 
     collected: CollectedResults
-    scores: Scores
+    scores: Scores  # scores as of any other run, with Bench2Drive's rules of abilities
+    # scores as the leaderboard and Bench2Drive's tools compute them
     leaderboard: LeaderboardScores
 
     def tables(self, name: str) -> tuple[Table, ...]:
@@ -156,18 +152,14 @@ def score_real_run(
 
 @dataclasses.dataclass(frozen=True, repr=False)
 class ScoreResult(Result):
-    """Scores by folder.
+    """Scores by folder."""
 
-    Attributes:
-        scores: in the order in which the folders were named.
-        real: details of the folders that hold real runs.
-        eer: EER_AV of all of them together; None where it was not asked for.
-        late: decision times against a budget, of folders whose decisions cost time.
-    """
-
-    scores: Mapping[str, Scores]
+    scores: Mapping[str, Scores]  # in the order in which the folders were named
+    # details of the folders that hold real runs
     real: Mapping[str, RealRun] = dataclasses.field(default_factory=dict)
+    # EER_AV of all of them together; None where it was not asked for
     eer: EerScores | None = None
+    # decision times against a budget, of folders whose decisions cost time
     late: Mapping[str, Deadlines] = dataclasses.field(default_factory=dict)
 
     def view(self) -> View:

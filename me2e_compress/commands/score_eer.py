@@ -29,8 +29,8 @@ from me2e_compress.runtime.energy import EnergyResult
 
 UNITS = ("%", "%", "ratio", "J")
 
+# Why a route is left out, listed beside the measures that may be missing
 UNPAIRED = "a drive in each"
-"""Why a route is left out, listed beside the measures that may be missing."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -222,17 +222,13 @@ def _measure_seconds(trials: Trials, model: ir.Model) -> float:
 
 @dataclasses.dataclass(frozen=True, repr=False)
 class SensitivityResult(Result):
-    """What int8 costs, and the recipe.
-
-    Attributes:
-        score: loss of the choice; None where nothing is int8.
-    """
+    """What int8 costs, and the recipe."""
 
     keys = ("*sensitivity",)
     output: Path
     sensitivity: Sensitivity
     choice: Int8Choice
-    score: Score | None
+    score: Score | None  # loss of the choice; None where nothing is int8
     limit: float
     written: str
 

@@ -49,28 +49,25 @@ class Engine(Protocol):
 class Drive:
     """Which routes are driven, and under which conditions.
 
-    Args:
-        latency: What each decision costs; its seed is that of its draws.
-        dt_us: Step of the world, a divisor of 50 ms; `realtime.skipped_decisions` tells
-            what a finer one changes. Frames are recorded every 50 ms regardless.
-        weather: Clear is what each route says.
-        latency_model: Whether a latency drops decisions or delays every control.
-        routes: In the order of the results; none where the evaluator alone knows them.
-        set_size: Number of routes of the whole set; 0 where the evaluator knows it.
-        engine: Where routes are driven; None for one at a time on this machine.
-        frame_limit_s: A decision that takes longer makes the policy count as hung.
-
     Raises:
         EvaluationError: The latency lacks its trace, or the step divides no frame.
     """
 
+    # What each decision costs; its seed is that of its draws
     latency: LatencySource = field(default_factory=FixedLatency)
+    # Step of the world, a divisor of 50 ms; `realtime.skipped_decisions` tells what a
+    # finer one changes. Frames are recorded every 50 ms regardless.
     dt_us: int = DT_US
-    weather: Weather = CLEAR
+    weather: Weather = CLEAR  # clear is what each route says
+    # Whether a latency drops decisions or delays every control
     latency_model: LatencyModel = LatencyModel.DROP
+    # In the order of the results; none where the evaluator alone knows them
     routes: Sequence[RouteInfo] = ()
+    # Number of routes of the whole set; 0 where the evaluator knows it
     set_size: int = 0
+    # Where routes are driven; None for one at a time on this machine
     engine: Engine | None = None
+    # A decision that takes longer makes the policy count as hung
     frame_limit_s: float = FRAME_LIMIT_S
 
     def __post_init__(self) -> None:
@@ -130,6 +127,7 @@ class Drive:
         }
 
 
+# What an evaluator may declare that it takes: options of the command or of a study
 ABILITIES = (
     "policy",
     "adapter",
@@ -143,9 +141,8 @@ ABILITIES = (
     "engine",
     "render",
 )
-"""What an evaluator may declare that it takes: options of the command or of a study."""
+# Methods that an evaluator with an ability must define
 METHODS = {"routes": ("routes",), "render": ("render", "routes")}
-"""Methods that an evaluator with an ability must define."""
 
 
 @dataclass(frozen=True)

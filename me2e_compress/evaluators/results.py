@@ -20,11 +20,10 @@ from me2e_compress.simulator.routes import VERSION, check_version, is_route_id
 
 MANIFEST = "evaluation.json"
 ROUTES = "routes"
+# Key of a manifest: number of samples that latencies were drawn from. It is derived
+# data, and not compared.
 MEASURED = "latency_samples"
-"""Key of a manifest: number of samples that latencies were drawn from. It is
-derived data, and not compared."""
-LARGEST_SET = 1_000_000
-"""Most routes of a set that a manifest may claim."""
+LARGEST_SET = 1_000_000  # most routes of a set that a manifest may claim
 
 
 @dataclass

@@ -133,8 +133,8 @@ def smoothness(episode: Episode) -> Measure:
 ABILITIES = ("Overtaking", "Merging", "Emergency_Brake", "Give_Way", "Traffic_Signs")
 TRAFFIC_SIGNS = "Traffic_Signs"
 
+# How far past the start of a junction the ego must come to have obeyed its signs
 JUNCTION_MARGIN_M = 8.0
-"""How far past the start of a junction the ego must come to have obeyed its signs."""
 
 
 def mastered(episode: Episode, ability: str) -> bool | None:

@@ -15,15 +15,12 @@ PERCENTILES = {f"p{percent:g}_ms": percent for percent in (50.0, 99.0, 99.9)}
 
 @dataclass(frozen=True, slots=True)
 class Deadlines:
-    """Latencies compared with a budget.
-
-    Attributes:
-        measures: By name: the percentiles, which have no value if too few samples were
-            measured for them, ``mean_ms``, ``max_ms``, ``over_budget_percent``.
-    """
+    """Latencies compared with a budget."""
 
     budget_ms: float
     count: int
+    # By name: the percentiles, which have no value if too few samples were measured for
+    # them, `mean_ms`, `max_ms`, `over_budget_percent`
     measures: Mapping[str, Measure]
 
     def to_json(self) -> dict[str, Any]:

@@ -74,10 +74,9 @@ def route_measures(
 MEASURES: tuple[str, ...] = ("driving score", "efficiency", "comfort", "energy")
 SIGNS = np.array([1.0, 1.0, 1.0, -1.0])
 POINTS = "points"
+# A measure whose standard deviation is below this share of its values is constant
 FLAT = 1e-12
-"""A measure whose standard deviation is below this share of its values is constant."""
-ALIKE = 1e-9
-"""Below this share, all measures are redundant."""
+ALIKE = 1e-9  # below this share, all measures are redundant
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,22 +94,17 @@ class EerScale:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class EerResult:
-    """EER_AV of variants on the same routes.
+    """EER_AV of variants on the same routes."""
 
-    Attributes:
-        scores: Points by variant, with an interval over routes for fixed weights, or
-            the reason why there is none.
-        routes: [n] points per route by variant, for paired comparisons.
-        scale: None if nothing could be scored.
-        left_out: Number of routes left out of all variants, by the missing measure.
-        kept: [all routes] whether each was scored.
-    """
-
+    # Points by variant, with an interval over routes for fixed weights, or the reason
+    # why there is none
     scores: Mapping[str, Estimate]
+    # [n] points per route by variant, for paired comparisons
     routes: Mapping[str, Floats]
-    scale: EerScale | None
+    scale: EerScale | None  # none if nothing could be scored
+    # Number of routes left out of all variants, by the missing measure
     left_out: Mapping[str, int]
-    kept: npt.NDArray[np.bool_]
+    kept: npt.NDArray[np.bool_]  # [all routes] whether each was scored
 
     @property
     def ranking(self) -> tuple[str, ...]:

@@ -18,9 +18,9 @@ class InfractionKind(StrEnum):
     COLLISION_LAYOUT = "collisions_layout"
     RED_LIGHT = "red_light"
     STOP = "stop_infraction"
+    # Crossing a give-way line close before priority traffic: CARLA has no such rule; it
+    # costs as much as a stop sign that was run
     GIVE_WAY = "give_way_infraction"
-    """Crossing a give-way line close before priority traffic: CARLA has no such rule;
-    it costs as much as a stop sign that was run."""
     OUTSIDE_ROUTE_LANES = "outside_route_lanes"
     MIN_SPEED = "min_speed_infractions"
     YIELD_TO_EMERGENCY_VEHICLE = "yield_emergency_vehicle_infractions"
@@ -46,6 +46,9 @@ COLLISIONS = (
     InfractionKind.COLLISION_LAYOUT,
 )
 
+# Factor per event: Bench2Drive 0.0.3, leaderboard/utils/statistics_manager.py. Leaving
+# the lanes has no fixed factor: it costs the share of the way driven outside. GIVE_WAY
+# is ours.
 PENALTY: Mapping[InfractionKind, float] = {
     InfractionKind.COLLISION_PEDESTRIAN: 0.5,
     InfractionKind.COLLISION_VEHICLE: 0.6,
@@ -60,45 +63,32 @@ PENALTY: Mapping[InfractionKind, float] = {
     InfractionKind.VEHICLE_BLOCKED: 1.0,
     InfractionKind.ROUTE_TIMEOUT: 1.0,
 }
-"""Factor per event: Bench2Drive 0.0.3, leaderboard/utils/statistics_manager.py.
-
-Leaving the lanes has no fixed factor: it costs the share of the way driven outside.
-GIVE_WAY is ours.
-"""
 
 
 _STRICT = ConfigDict(allow_inf_nan=False, extra="forbid")
 
+# The largest magnitude of a number on file: beyond, squares and sums overflow
 LARGEST = 1e9
-"""The largest magnitude of a number on file: beyond, squares and sums overflow."""
 
+# A distance, duration or speed that is finite and not negative
 Quantity = Annotated[float, Field(ge=0.0, le=LARGEST)]
-"""A distance, duration or speed that is finite and not negative."""
 
 
 @with_config(_STRICT)
 @dataclass(frozen=True, slots=True)
 class Infraction:
-    """One infraction; values that a simulator does not report are None.
-
-    Attributes:
-        time_us: Simulated microseconds since the route began.
-        x: Position of the ego, metres east.
-        y: Metres north.
-        detail: The other party or obstacle, in a few words.
-        percent: For OUTSIDE_ROUTE_LANES, the share of the driven way spent outside; for
-            MIN_SPEED, the ego's speed relative to the traffic's.
-        contact: For collisions only.
-        at_fault: Whether the ego could have prevented a collision, as nuPlan judges it.
-    """
+    """One infraction; values that a simulator does not report are None."""
 
     kind: InfractionKind
-    time_us: int | None
-    x: float | None
-    y: float | None
-    detail: str
+    time_us: int | None  # simulated microseconds since the route began
+    x: float | None  # position of the ego, metres east
+    y: float | None  # metres north
+    detail: str  # the other party or obstacle, in a few words
+    # For OUTSIDE_ROUTE_LANES, the share of the driven way spent outside; for MIN_SPEED,
+    # the ego's speed relative to the traffic's
     percent: Annotated[float, Field(ge=0.0)] | None = None
-    contact: Contact | None = None
+    contact: Contact | None = None  # for collisions only
+    # Whether the ego could have prevented a collision, as nuPlan judges it
     at_fault: bool | None = None
     ego_speed_mps: Quantity | None = None
 
@@ -112,35 +102,30 @@ class Infraction:
 
 # Record of how close an episode came to a collision.
 
+# A contact later than this is not written down: our choice, far beyond every threshold
+# in use (0.95 s in nuPlan, 1.5 s in SSAM, 4 s in driver assistance)
 TTC_HORIZON_S = 10.0
-"""A contact later than this is not written down: our choice, far beyond every
-threshold in use (0.95 s in nuPlan, 1.5 s in SSAM, 4 s in driver assistance)."""
 
-PET_HORIZON_S = 5.0
-"""Longest post-encroachment time: SSAM's default (FHWA-HRT-08-051)."""
+PET_HORIZON_S = 5.0  # longest post-encroachment time: SSAM's default (FHWA-HRT-08-051)
 
+# From this angle between headings paths cross or merge; below it one follows the other,
+# and the time between them is a headway: SSAM's rear-end angle
 CROSSING_RAD = math.radians(30.0)
-"""From this angle between headings paths cross or merge; below it one follows the
-other, and the time between them is a headway: SSAM's rear-end angle."""
 
 
 @with_config(_STRICT)
 @dataclass(frozen=True, slots=True)
 class Encounter:
-    """The ego and a moving actor were at the same place, one after the other.
-
-    Attributes:
-        time_us: When the second of the two arrived.
-        pet_s: Post-encroachment time (Allen, Shin and Cooper 1978; SAE J2944): from the
-            moment when the first left a place until the second arrived, the minimum
-            over all places; 0 in a collision. A multiple of the frame interval.
-        angle_rad: Angle between their headings, 0 (same direction) to pi (oncoming).
-    """
+    """The ego and a moving actor were at the same place, one after the other."""
 
     actor: int
     kind: str
-    time_us: int
+    time_us: int  # when the second of the two arrived
+    # Post-encroachment time (Allen, Shin and Cooper 1978; SAE J2944): from the moment
+    # when the first left a place until the second arrived, the minimum over all places;
+    # 0 in a collision. A multiple of the frame interval.
     pet_s: Quantity
+    # Angle between their headings, 0 (same direction) to pi (oncoming)
     angle_rad: Annotated[float, Field(ge=0.0, le=3.15)]
     ego_first: bool
 
@@ -148,27 +133,23 @@ class Encounter:
 @with_config(_STRICT)
 @dataclass(frozen=True, slots=True)
 class ConflictRecord:
-    """Distances and times to collision for each frame, and all encounters.
+    """Distances and times to collision for each frame, and all encounters."""
 
-    Attributes:
-        nearest_m: Metres from the ego's outline to that of the nearest actor, 0 if they
-            overlap, None if there is no actor.
-        ttc_s: Time to collision: seconds until the ego's box and an actor's touch if
-            both keep heading and speed, the minimum over all actors; None above 10 s
-            (`TTC_HORIZON_S`). Defined as in nuPlan and NAVSIM, but exact where they try
-            steps of 0.1 and 0.3 s, and including actors from behind.
-        encounters: Those of at most 5 s (`PET_HORIZON_S`), in order of time; an actor
-            has at most one with crossing or merging paths and one in the ego's
-            direction.
-    """
-
+    # Metres from the ego's outline to that of the nearest actor, 0 if they overlap,
+    # None if there is no actor
     nearest_m: tuple[Quantity | None, ...]
+    # Time to collision: seconds until the ego's box and an actor's touch if both keep
+    # heading and speed, the minimum over all actors; None above 10 s (`TTC_HORIZON_S`).
+    # Defined as in nuPlan and NAVSIM, but exact where they try steps of 0.1 and 0.3 s,
+    # and including actors from behind.
     ttc_s: tuple[Quantity | None, ...]
+    # Those of at most 5 s (`PET_HORIZON_S`), in order of time; an actor has at most one
+    # with crossing or merging paths and one in the ego's direction
     encounters: tuple[Encounter, ...]
 
 
+# Microseconds between two frames: the simulators of the benchmarks run at 20 Hz
 FRAME_US = 50_000
-"""Microseconds between two frames: the simulators of the benchmarks run at 20 Hz."""
 
 Number = Annotated[float, Field(ge=-LARGEST, le=LARGEST)]
 
@@ -185,8 +166,8 @@ class Ending(StrEnum):
     SIMULATOR_FAILED = "simulator failed"
 
 
+# Endings that are not the driver's driving
 FAILURES = (Ending.POLICY_FAILED, Ending.SIMULATOR_FAILED)
-"""Endings that are not the driver's driving."""
 
 
 @with_config(_STRICT)
@@ -195,17 +176,9 @@ class EgoFrame:
     """The ego at one instant, every 50 ms, in SI units.
 
     x points east, y north; angles are counter-clockwise from east.
-
-    Attributes:
-        time_us: Simulated microseconds since the route began.
-        steering_rad: Angle of the front wheels, left positive; None if not reported.
-        route_m: Metres of the route passed; never decreases.
-        traffic_speed_mps: Mean speed of nearby vehicles, None if there are none.
-        acceleration_norm_mps2: Norm of the acceleration in the plane if a simulator
-            recorded it separately; None if it follows from the two components.
     """
 
-    time_us: int
+    time_us: int  # simulated microseconds since the route began
     x: Number
     y: Number
     heading: Number
@@ -213,9 +186,13 @@ class EgoFrame:
     acceleration_mps2: Number
     lateral_acceleration_mps2: Number
     yaw_rate_radps: Number
+    # Angle of the front wheels, left positive; None if not reported
     steering_rad: Number | None
-    route_m: Number
+    route_m: Number  # metres of the route passed; never decreases
+    # Mean speed of nearby vehicles, None if there are none
     traffic_speed_mps: Number | None
+    # Norm of the acceleration in the plane if a simulator recorded it separately; None
+    # if it follows from the two components
     acceleration_norm_mps2: Number | None = None
 
 
@@ -246,34 +223,27 @@ class Given:
 @with_config(_STRICT)
 @dataclass(frozen=True, slots=True)
 class Episode:
-    """One route driven to its end.
-
-    Attributes:
-        abilities: The abilities it tests, one or two of Bench2Drive's five.
-        completion_percent: Share of the route that was passed, 0 to 100.
-        failure: How the policy failed, if that ended the route.
-        infractions: In order of time.
-        decisions: One record per inference.
-        junction_m: Metres to the first junction, None if the route has none.
-        speed_ratios_percent: Ego speed over traffic speed at the check points, if the
-            simulator reported them; None if they follow from the frames.
-        given: What the simulator itself scored, if anything.
-        conflicts: How close the ego came to others; None if it was not recorded.
-    """
+    """One route driven to its end."""
 
     route: str
     scenario: str
+    # The abilities it tests, one or two of Bench2Drive's five
     abilities: tuple[str, ...]
     route_length_m: Quantity
+    # Share of the route that was passed, 0 to 100
     completion_percent: Annotated[float, Field(ge=0.0, le=100.0)]
     ending: Ending
-    failure: str | None
-    infractions: tuple[Infraction, ...]
+    failure: str | None  # how the policy failed, if that ended the route
+    infractions: tuple[Infraction, ...]  # in order of time
     frames: tuple[EgoFrame, ...]
-    decisions: tuple[InferenceRecord, ...]
+    decisions: tuple[InferenceRecord, ...]  # one record per inference
+    # Metres to the first junction, None if the route has none
     junction_m: Number | None = None
+    # Ego speed over traffic speed at the check points, if the simulator reported them;
+    # None if they follow from the frames
     speed_ratios_percent: tuple[Number, ...] | None = None
-    given: Given | None = None
+    given: Given | None = None  # what the simulator itself scored, if anything
+    # How close the ego came to others; None if it was not recorded
     conflicts: ConflictRecord | None = None
 
     @property

@@ -110,13 +110,12 @@ class Estimate:
 
 CONFIDENCE = 0.95
 RESAMPLES = 4_000
+# Of fewer types, drawing them anew gives intervals that are too narrow, often narrower
+# than those over these types: there is none
 FEWEST_TYPES = 8
-"""Of fewer types, drawing them anew gives intervals that are too narrow, often narrower
-than those over these types: there is none."""
 Floats = npt.NDArray[np.float64]
 Interval = tuple[float | None, float | None]
-Bounds = tuple[float, float]
-"""Smallest and largest value that a route can have."""
+Bounds = tuple[float, float]  # smallest and largest value that a route can have
 
 
 def mean_estimate(

@@ -19,8 +19,7 @@ from me2e_compress.metrics.episode import (
 )
 from me2e_compress.metrics.measure import Measure
 
-DIGITS = 6
-"""Digits to which the leaderboard rounds each of the three scores."""
+DIGITS = 6  # digits to which the leaderboard rounds each of the three scores
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,8 +50,8 @@ def route_score(episode: Episode) -> RouteScore:
 
 CHECKPOINTS = 20
 OUTLIER_PERCENT = 1000.0
+# Beyond this Bench2Drive also reports the speed over the last stretch
 DONE_PERCENT = 95.0
-"""Beyond this Bench2Drive also reports the speed over the last stretch."""
 PERCENT = "%"
 
 
@@ -205,9 +204,9 @@ def _blocked_frames(episode: Episode) -> npt.NDArray[np.bool_]:
 # routes end in one, so collisions alone separate drivers slowly; these measures also
 # count near misses. Each is None if its input was not recorded.
 
+# A time to collision below this is a conflict: SSAM's default (Gettman et al. 2008,
+# FHWA-HRT-08-051), after Van der Horst and Hogema 1993.
 TTC_CRITICAL_S = 1.5
-"""A time to collision below this is a conflict: SSAM's default (Gettman et al. 2008,
-FHWA-HRT-08-051), after Van der Horst and Hogema 1993."""
 
 NOT_RECORDED = "nobody recorded the distances to others"
 

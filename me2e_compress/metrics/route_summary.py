@@ -22,10 +22,8 @@ from me2e_compress.metrics.measure import (
     unseen_interval,
 )
 
-PERCENTS = (50, 90, 99, 100)
-"""Percentiles of the latencies of a route's decisions."""
-DIGITS = 6
-"""Digits that files keep, as the leaderboard does of scores."""
+PERCENTS = (50, 90, 99, 100)  # percentiles of the latencies of a route's decisions
+DIGITS = 6  # digits that files keep, as the leaderboard does of scores
 
 WORDS = {
     InfractionKind.COLLISION_PEDESTRIAN: "collision with a pedestrian",
@@ -49,43 +47,33 @@ _STRICT = ConfigDict(allow_inf_nan=False, extra="forbid")
 @with_config(_STRICT)
 @dataclass(frozen=True)
 class RouteSummary:
-    """One route of one drive; unrecorded values are None.
-
-    Attributes:
-        driving_score: Percent, as are completion, efficiency and ttc_exposure.
-        succeeded: Whether the whole route was driven without an infraction.
-        infractions: Kind, microseconds if known, and the other party or obstacle.
-        efficiency: None if no traffic moved, or the ego did not.
-        comfort: Share of smooth segments; None if there was no whole one.
-        duration_us: Time of the last frame.
-        latency_us: `PERCENTS` of the decisions' latencies on the vehicle.
-        ttc_exposure: Share of the frames with a time to collision below 1.5 s.
-        smallest_pet: Post-encroachment time of crossing paths, seconds.
-        bench2drive_efficiency: Efficiency in the arithmetic of Bench2Drive's tools; the
-            earliest files lack it, as they lack the next.
-        bench2drive_smoothness: Their comfort.
-    """
+    """One route of one drive; unrecorded values are None."""
 
     route: str
     scenario: str
-    driving_score: float
+    driving_score: float  # percent, as are completion, efficiency and ttc_exposure
     completion: float
-    succeeded: bool
+    succeeded: bool  # whether the whole route was driven without an infraction
     ending: str
+    # Kind, microseconds if known, and the other party or obstacle
     infractions: tuple[tuple[str, int | None, str], ...]
-    efficiency: float | None
-    comfort: float | None
-    duration_us: int
+    efficiency: float | None  # none if no traffic moved, or the ego did not
+    comfort: float | None  # share of smooth segments; None if there was no whole one
+    duration_us: int  # time of the last frame
     decisions: int
-    latency_us: tuple[int, ...]
+    latency_us: tuple[int, ...]  # `PERCENTS` of the decisions' latencies on the vehicle
     latency_sum_us: int
+    # Share of the frames with a time to collision below 1.5 s
     ttc_exposure: float | None = None
     smallest_ttc: float | None = None
+    # Post-encroachment time of crossing paths, seconds
     smallest_pet: float | None = None
     smallest_distance: float | None = None
     at_fault: bool | None = None
+    # Efficiency in the arithmetic of Bench2Drive's tools; the earliest files lack it,
+    # as they lack the next
     bench2drive_efficiency: float | None = None
-    bench2drive_smoothness: float | None = None
+    bench2drive_smoothness: float | None = None  # their comfort
 
     @property
     def room_kept(self) -> float | None:
@@ -149,10 +137,8 @@ class RouteSummary:
         return replace(self, **rounded)
 
 
-POINTS = "points"
-"""Difference of two percentages."""
-PERCENT, SHARE = (0.0, 100.0), (0.0, 1.0)
-"""Bounds of a route's values."""
+POINTS = "points"  # difference of two percentages
+PERCENT, SHARE = (0.0, 100.0), (0.0, 1.0)  # bounds of a route's values
 
 
 @dataclass(frozen=True)
@@ -223,18 +209,17 @@ DE_B2D = RouteColumn("DE b2d %", "%", lambda route: route.bench2drive_efficiency
 DC_B2D = RouteColumn(
     "DC b2d", "ratio", lambda route: route.bench2drive_smoothness, SHARE
 )
+# The paper's scores of a route; b2d: in the arithmetic of Bench2Drive's tools
 COLUMNS = (DS, ROOM, SR, DE, DE_B2D, DC, DC_B2D)
-"""The paper's scores of a route; b2d: in the arithmetic of Bench2Drive's tools."""
 
 
+# Standard deviation, points a route, of the driving score's paired difference between
+# the driver that ships and its int8 forms on the 220 routes, ten decisions a second:
+# 23.0, 27.6 and 28.0 (`benchmarks/road_2/paper`). Where decisions cost what they take
+# on a slow device it is 33 to 36.
 SCATTER = 26.0
-"""Standard deviation, points a route, of the driving score's paired difference between
-the driver that ships and its int8 forms on the 220 routes, ten decisions a second:
-23.0, 27.6 and 28.0 (``benchmarks/road_2/paper``). Where decisions cost what they take
-on a slow device it is 33 to 36."""
 
-Z = 1.96
-"""Standard score of a 95 % interval."""
+Z = 1.96  # standard score of a 95 % interval
 
 
 def shown_by(routes: int) -> float:
@@ -249,22 +234,17 @@ class PairedDifference:
     What makes a route hard for both cancels out, so the intervals are narrower than
     those of the two means suggest. The interval over these scenario types is never
     narrower than what so few routes can exclude (`metrics.measure.unseen_share`).
-
-    Attributes:
-        routes_better: Routes with a higher driving score than the reference's.
-        success_gained: Routes on which only this variant succeeds.
-        success_lost: Routes on which only the reference succeeds.
-        mcnemar_p: Two-sided p-value of McNemar's exact test that success is equally
-            frequent; routes are treated as independent.
     """
 
     driving_score: Estimate
     room_kept: Estimate
     success_rate: Estimate
-    routes_better: int
+    routes_better: int  # routes with a higher driving score than the reference's
     routes_worse: int
-    success_gained: int = 0
-    success_lost: int = 0
+    success_gained: int = 0  # routes on which only this variant succeeds
+    success_lost: int = 0  # routes on which only the reference succeeds
+    # Two-sided p-value of McNemar's exact test that success is equally frequent; routes
+    # are treated as independent
     mcnemar_p: float = 1.0
 
     @property

@@ -21,8 +21,7 @@ from me2e_compress.metrics.measure import (
 )
 from me2e_compress.metrics.route_summary import PERCENT, SHARE
 
-FULL_SET = 220
-"""Routes of a whole benchmark: 44 scenario types with 5 variants each."""
+FULL_SET = 220  # routes of a whole benchmark: 44 scenario types with 5 variants each
 
 
 @dataclass(frozen=True, slots=True)

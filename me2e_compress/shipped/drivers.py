@@ -26,10 +26,9 @@ def write_model_file(path: Path, content: bytes) -> Path:
     return path
 
 
+# One `NAME.onnx`, `NAME.json` and `NAME-frames` per model
 WEIGHTS = Path(__file__).with_name("weights")
-"""One ``NAME.onnx``, ``NAME.json`` and ``NAME-frames`` per model."""
-SHIPPED = ("highway",)
-"""Names of the models, and of their module maps."""
+SHIPPED = ("highway",)  # names of the models, and of their module maps
 
 
 def map_name(path: Path) -> str | None:
@@ -47,30 +46,22 @@ class TrainingData(pydantic.BaseModel):
 
 
 class ModelCard(pydantic.BaseModel):
-    """The card of a shipped model; the model's files must have its digests.
-
-    Attributes:
-        sha256: of the ``.onnx``, lower-case hex.
-        bytes: of the ``.onnx``.
-        parameters: number of trained parameters.
-        seed: of the initial weights and of all random choices in training.
-        data: the training data.
-        command: a description of the training, and a command that trains such a model.
-        hours: of training, on the machine that the page of ``command`` names; None: not
-            measured.
-        scores: by name including the unit (``driving_score_percent``); None: not
-            measured, as a whole or one by one.
-    """
+    """The card of a shipped model; the model's files must have its digests."""
 
     model_config = pydantic.ConfigDict(frozen=True, extra="forbid")
 
+    # of the `.onnx`, lower-case hex
     sha256: str = pydantic.Field(pattern="^[0-9a-f]{64}$")
-    bytes: int = pydantic.Field(gt=0)
-    parameters: int = pydantic.Field(gt=0)
-    seed: int
-    data: TrainingData
+    bytes: int = pydantic.Field(gt=0)  # of the `.onnx`
+    parameters: int = pydantic.Field(gt=0)  # number of trained parameters
+    seed: int  # of the initial weights and of all random choices in training
+    data: TrainingData  # the training data
+    # a description of the training, and a command that trains such a model
     command: str
+    # of training, on the machine that the page of `command` names; None: not measured
     hours: float | None = None
+    # by name including the unit (`driving_score_percent`); None: not measured, as a
+    # whole or one by one
     scores: dict[str, float | None] | None = None
 
     @classmethod

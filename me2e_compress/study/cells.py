@@ -3,12 +3,11 @@
 from me2e_compress.base.display import Cell, format_number
 from me2e_compress.metrics.measure import FEWEST_TYPES, Estimate, Measure
 
-MISSING = "\N{EN DASH}"
-"""Shown if nothing was measured."""
+MISSING = "\N{EN DASH}"  # shown if nothing was measured
 INFINITE = "\N{INFINITY}"
 MINUS = "\N{MINUS SIGN}"
+# Reason why an unchanged plan has no signal-to-noise ratio
 EXACT = "no noise: equal to the bit"
-"""Reason why an unchanged plan has no signal-to-noise ratio."""
 
 
 def estimate_cell(

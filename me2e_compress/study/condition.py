@@ -16,12 +16,11 @@ from me2e_compress.driving.latency import (
 )
 from me2e_compress.evaluators import Drive
 
-TRACE = "trace"
-"""The latency of each model's own trace, times the device scale."""
+TRACE = "trace"  # the latency of each model's own trace, times the device scale
 
 FORM = ConfigDict(strict=True, extra="forbid", arbitrary_types_allowed=True)
+# Options of a condition's drive besides its latency
 DRIVE_OPTIONS = ("latency_model", "dt_ms", "weather")
-"""Options of a condition's drive besides its latency."""
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_+-]*")
 
 
@@ -38,25 +37,20 @@ def check_name(kind: str, name: str) -> None:
 class Condition:
     """The conditions that a variant drives under.
 
-    Args:
-        name: Follows the rules of a variant's name.
-        latency: Latency of decisions, as for ``evaluate``: ``none``, ``fps:F``, or
-            ``trace``, each model's own latencies, also with options
-            (``trace{in_order=true, seed=3}``) and within another source
-            (``limited{source=trace, fps=10}``).
-        mean_of: Instead of a latency: every decision takes the mean of this drive,
-            ``VARIANT.CONDITION``, whose condition comes earlier.
-        latency_model: As of ``evaluate``, and so ``dt_ms``, ``weather``.
-
     Raises:
         StudyError: The name is invalid, or options do not go together.
         EvaluationError: An option is one that `evaluate` refuses, too.
     """
 
-    name: str
+    name: str  # follows the rules of a variant's name
+    # Latency of decisions, as for `evaluate`: `none`, `fps:F`, or `trace`, each model's
+    # own latencies, also with options (`trace{in_order=true, seed=3}`) and within
+    # another source (`limited{source=trace, fps=10}`)
     latency: str = ""
+    # Instead of a latency: every decision takes the mean of this drive,
+    # `VARIANT.CONDITION`, whose condition comes earlier
     mean_of: str = ""
-    latency_model: str = "drop"
+    latency_model: str = "drop"  # as of `evaluate`, and so `dt_ms`, `weather`
     dt_ms: float = 50.0
     weather: str = ""
 

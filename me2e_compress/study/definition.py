@@ -109,30 +109,25 @@ AtLeastOne = Annotated[int, Field(ge=1)]
 class Variant:
     """One driver to compare: a file as it is, or the result of passes.
 
-    Args:
-        name: Letters, digits, ``_``, ``+`` and ``-``; names its folder of results.
-        policy: A policy by name, ``blind:8``, or the path of an ONNX file; what it says
-            of adapter and host stage holds where the variant says nothing. Empty takes
-            the study's.
-        passes: Passes applied to the file; none leaves it as it is.
-        module_map: Preset or TOML file for the passes; None finds the preset.
-        adapter: TOML file that adapts the model to the policy contract.
-        trace: Latencies recorded on a device; None measures them here.
-        host_stage: Changes the model's plan on the host, as a text; a trace does not
-            include its time, see the latency source ``host-stage``.
-        recipe: Passes by the name or the file of a recipe, instead of ``passes``.
-
     Raises:
         StudyError: The name is invalid, or passes, an adapter or a trace lack a model.
     """
 
-    name: str
+    name: str  # letters, digits, `_`, `+` and `-`; names its folder of results
+    # A policy by name, `blind:8`, or the path of an ONNX file; what it says of adapter
+    # and host stage holds where the variant says nothing. Empty takes the study's.
     policy: PolicyText = ""
+    # Passes applied to the file; none leaves it as it is
     passes: Annotated[tuple[Pass, ...], PlainValidator(_passes)] = ()
+    # Preset or TOML file for the passes; None finds the preset
     module_map: Annotated[Name | None, Field(alias="map")] = None
+    # TOML file that adapts the model to the policy contract
     adapter: Annotated[Path | None, BeforeValidator(_adapter)] = None
-    trace: File | None = None
+    trace: File | None = None  # latencies recorded on a device; None measures them here
+    # Changes the model's plan on the host, as a text; a trace does not include its
+    # time, see the latency source `host-stage`
     host_stage: str = ""
+    # Passes by the name or the file of a recipe, instead of `passes`
     recipe: Name | None = None
 
     def __post_init__(self) -> None:
@@ -165,17 +160,12 @@ class Variant:
 @with_config(FORM)
 @dataclass(frozen=True)
 class Timing:
-    """How latencies are measured, and which device they represent.
+    """How latencies are measured, and which device they represent."""
 
-    Args:
-        samples: Timed inferences per model.
-        threads: Threads of onnxruntime.
-        baseline_median_s: Median latency of the baseline on the target device; it sets
-            one scale for all models. None takes this machine as it is.
-    """
-
-    samples: AtLeastOne = 200
-    threads: AtLeastOne = 1
+    samples: AtLeastOne = 200  # timed inferences per model
+    threads: AtLeastOne = 1  # threads of onnxruntime
+    # Median latency of the baseline on the target device; it sets one scale for all
+    # models. None takes this machine as it is.
     baseline_median_s: Positive | None = None
 
 
@@ -192,17 +182,12 @@ class StudyBlock:
 @with_config(FORM)
 @dataclass(frozen=True)
 class FramesToRecord:
-    """Frames of the baseline that a study records itself, on fresh routes.
+    """Frames of the baseline that a study records itself, on fresh routes."""
 
-    Args:
-        frames: Number of frames to calibrate on.
-        held_out: Number of frames to measure fidelity and latency on, of the next seed.
-        seed: Seed of the routes.
-    """
-
-    frames: AtLeastOne
+    frames: AtLeastOne  # number of frames to calibrate on
+    # Number of frames to measure fidelity and latency on, of the next seed
     held_out: AtLeastOne
-    seed: Count = 0
+    seed: Count = 0  # seed of the routes
 
 
 class Pair(NamedTuple):
@@ -217,49 +202,37 @@ class Pair(NamedTuple):
 class Study:
     """Variants x conditions on the same routes.
 
-    Args:
-        title: Title of the report.
-        variants: In the order of the tables.
-        conditions: In the order of the tables.
-        baseline: Name of the variant that the others are compared with.
-        routes: Empty only where the evaluator takes none.
-        set_size: Number of routes of the whole set.
-        frames: Folder of recorded frames that passes calibrate on.
-        held_out: Folder of other frames, for measuring fidelity and latency.
-        timing: How latencies are measured.
-        seed: Seed of bootstraps, of passes and of draws from traces.
-        provider: Execution provider for all models.
-        to_record: Frames that the study records itself; None uses the folders.
-        blocks: Which variants drive under which conditions; empty means all under all.
-            Under each condition the baseline drives too.
-        pairs: Drives to compare.
-        evaluator: Who drives, ``name{option=value}``.
-        policy: That of variants that name none.
-        plugins: Libraries of operators for the provider.
-
     Raises:
         StudyError: There is nothing to drive, a name is repeated or unknown, or passes
             or a trace lack frames.
         EvaluationError: The evaluator or its routes are unknown.
     """
 
-    title: str
+    title: str  # title of the report
+    # In the order of the tables
     variants: Annotated[tuple[Variant, ...], Field(alias="variant")]
+    # In the order of the tables
     conditions: Annotated[tuple[Condition, ...], Field(alias="condition")]
-    baseline: str
+    baseline: str  # name of the variant that the others are compared with
+    # Empty only where the evaluator takes none
     routes: Annotated[Sequence[RouteInfo], PlainValidator(tuple)] = ()
-    set_size: int = 0
-    frames: File | None = None
+    set_size: int = 0  # number of routes of the whole set
+    frames: File | None = None  # folder of recorded frames that passes calibrate on
+    # Folder of other frames, for measuring fidelity and latency
     held_out: File | None = None
+    # How latencies are measured
     timing: Annotated[Timing, Field(alias="latency")] = field(default_factory=Timing)
-    seed: Count = 0
-    provider: Provider = CPU
+    seed: Count = 0  # seed of bootstraps, of passes and of draws from traces
+    provider: Provider = CPU  # execution provider for all models
+    # Frames that the study records itself; None uses the folders
     to_record: Annotated[FramesToRecord | None, Field(alias="record")] = None
+    # Which variants drive under which conditions; empty means all under all. Under each
+    # condition the baseline drives too.
     blocks: Annotated[tuple[StudyBlock, ...], Field(alias="block")] = ()
-    pairs: Annotated[tuple[Pair, ...], Field(alias="pair")] = ()
-    evaluator: str = "highway"
-    policy: PolicyText = ""
-    plugins: tuple[File, ...] = ()
+    pairs: Annotated[tuple[Pair, ...], Field(alias="pair")] = ()  # drives to compare
+    evaluator: str = "highway"  # who drives, `name{option=value}`
+    policy: PolicyText = ""  # that of variants that name none
+    plugins: tuple[File, ...] = ()  # libraries of operators for the provider
 
     def __post_init__(self) -> None:
         # Names must be unique, and refer to something

@@ -47,18 +47,16 @@ class DriveRecord:
     """One variant under one condition, or the reason why it was not driven.
 
     Files hold names, ``made_by`` and the routes; the rest follows from episodes.
-
-    Attributes:
-        made_by: Its fingerprint without the routes.
-        difference: Paired by route with the baseline under the same condition; None for
-            the baseline itself.
     """
 
     variant: str
     condition: str
     routes: tuple[RouteSummary, ...] = ()
+    # Its fingerprint without the routes
     made_by: Mapping[str, Any] = field(default_factory=dict)
     scores: Scores | None = None
+    # Paired by route with the baseline under the same condition; None for the baseline
+    # itself
     difference: PairedDifference | None = None
     reason: str = ""
 

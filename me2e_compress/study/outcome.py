@@ -33,19 +33,12 @@ LATENCY_PERCENTILES = (50, 99)
 
 @dataclass(frozen=True)
 class Clock:
-    """Latencies of the variants on one device.
+    """Latencies of the variants on one device."""
 
-    Attributes:
-        traces: As measured, by the variant's name.
-        scale: How many times slower the device is than the machine of the traces.
-        reason: Why a variant has no trace; empty if all have one.
-        load: The highest load by other processes during measurements, if there were
-            any.
-    """
-
-    traces: Mapping[str, LatencyTrace]
-    scale: float
-    reason: str = ""
+    traces: Mapping[str, LatencyTrace]  # as measured, by the variant's name
+    scale: float  # how many times slower the device is than the machine of the traces
+    reason: str = ""  # why a variant has no trace; empty if all have one
+    # The highest load by other processes during measurements, if there were any
     load: Load | None = None
 
     def latencies(self, prepared: PreparedVariant) -> dict[int, Measure]:

@@ -52,30 +52,22 @@ NOT_COMPARED = PlanFidelity.unknown("not compared")
 
 @dataclass(frozen=True)
 class PreparedVariant:
-    """A variant whose driver is ready; what it costs, without drives.
-
-    Attributes:
-        source: Name of the file that passes were applied to.
-        pipeline: The passes, as text; empty if the model is its own source.
-        size_bytes: Size of the model with its weights.
-        failure: Why there is no model that can drive; empty if there is one.
-        weights: Origin of the weights, such as a checkpoint; empty if unknown.
-        metadata: Plan and state of adapter and map, as metadata of the graph.
-        known: Which inputs are state and which output is the plan, and from where.
-        latency_ms: By percent; empty until it was timed.
-    """
+    """A variant whose driver is ready; what it costs, without drives."""
 
     variant: Variant
     driver: Driver
     model: Path | None = None
-    source: str = ""
-    pipeline: str = ""
+    source: str = ""  # name of the file that passes were applied to
+    pipeline: str = ""  # the passes, as text; empty if the model is its own source
     sha256: str | None = None
-    size_bytes: int | None = None
-    failure: str = ""
-    weights: str = ""
+    size_bytes: int | None = None  # size of the model with its weights
+    failure: str = ""  # why there is no model that can drive; empty if there is one
+    weights: str = ""  # origin of the weights, such as a checkpoint; empty if unknown
+    # Plan and state of adapter and map, as metadata of the graph
     metadata: Mapping[str, str] = field(default_factory=dict)
+    # Which inputs are state and which output is the plan, and from where
     known: str = ""
+    # By percent; empty until it was timed
     latency_ms: Mapping[int, Measure] = field(default_factory=dict)
     fidelity: PlanFidelity = NOT_COMPARED
 

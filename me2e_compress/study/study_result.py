@@ -20,30 +20,24 @@ from me2e_compress.study.drive_record import Comparison, DriveRecord, compared
 from me2e_compress.study.prepared import PreparedVariant
 
 SCORES = tuple(column.name for column in COLUMNS)
-MOST_ROUTES = 40
-"""With more routes than this, the table of endings is left out."""
+MOST_ROUTES = 40  # with more routes than this, the table of endings is left out
 COSTS = ("size MB", "p50 ms", "p99 ms", "plan m", "SQNR dB")
 GAPS = ("DS, points", "DS, other types", "room, points", "SR, points")
 
 
 @dataclass(frozen=True, repr=False)
 class StudyResult(Result):
-    """All results of a study, and the machine and packages that made them.
-
-    Attributes:
-        drives: Condition by condition, the variants in the study's order.
-        device_scale: How many times slower the device is than the machine timed on.
-        versions: Versions of the packages that decide the result.
-        load: Load by other processes while latencies were measured; None if none was
-            measured here.
-    """
+    """All results of a study, and the machine and packages that made them."""
 
     study: Study
     variants: tuple[PreparedVariant, ...]
+    # Condition by condition, the variants in the study's order
     drives: tuple[DriveRecord, ...]
-    device_scale: float
+    device_scale: float  # how many times slower the device is than the machine timed on
     machine: str
-    versions: Mapping[str, str]
+    versions: Mapping[str, str]  # versions of the packages that decide the result
+    # Load by other processes while latencies were measured; None if none was measured
+    # here
     load: Load | None = None
 
     @property

@@ -13,10 +13,10 @@ from me2e_compress.study.condition import Condition
 from me2e_compress.study.definition import Study
 from me2e_compress.study.workspace import Workspace
 
+# CPU seconds of a frame of the world, and of a decision: six pictures and one inference
+# of the driver that ships on one core of a Xeon (two routes, at every frame and at
+# every eighth)
 FRAME_S, DECISION_S = 0.0024, 0.021
-"""CPU seconds of a frame of the world, and of a decision: six pictures and one
-inference of the driver that ships on one core of a Xeon (two routes, at every frame
-and at every eighth)."""
 
 
 @dataclass(frozen=True)

@@ -8,8 +8,8 @@ from me2e_compress.base.errors import StudyError
 from me2e_compress.study.condition import Condition
 from me2e_compress.study.definition import Variant
 
+# Files of the results for programs, repositories and browsers
 JSON, MARKDOWN, HTML = "study.json", "tables.md", "report.html"
-"""Files of the results for programs, repositories and browsers."""
 
 
 @dataclass(frozen=True)

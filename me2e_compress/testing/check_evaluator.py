@@ -17,8 +17,8 @@ from me2e_compress.metrics.episode import Episode
 from me2e_compress.simulator.routes import is_route_id
 from me2e_compress.testing.form import check_form, require
 
+# What every decision is charged where an evaluator declares that it takes latency
 LATENCY_US = 250_000
-"""What every decision is charged where an evaluator declares that it takes latency."""
 
 
 def check_evaluator(

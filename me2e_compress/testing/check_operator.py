@@ -148,8 +148,7 @@ def _evaluate(
 
 
 OPSETS = (13, 17, 20)
-TOLERANCE = 1e-4
-"""Allowed max|a-b| / max(1, max|b|) of float32 against float64."""
+TOLERANCE = 1e-4  # allowed max|a-b| / max(1, max|b|) of float32 against float64
 _PASS = "check-operator"
 
 

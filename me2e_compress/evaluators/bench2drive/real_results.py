@@ -29,16 +29,16 @@ from me2e_compress.metrics.episode import EgoFrame, Episode
 from me2e_compress.metrics.scores import FULL_SET
 
 _IDS = json.loads(Path(__file__).with_name("route_ids.json").read_bytes())
+# The ids of the 220 routes of each version of Bench2Drive: those of
+# leaderboard/data/bench2drive220.xml and of bench2drive_0.0.4_val.xml, which share two.
+# The ten routes of "dev10" belong to the first.
 ROUTE_SETS: dict[str, frozenset[str]] = {
     version: frozenset(ids) for version, ids in _IDS.items()
 }
-"""The ids of the 220 routes of each version of Bench2Drive: those of
-leaderboard/data/bench2drive220.xml and of bench2drive_0.0.4_val.xml, which share two.
-The ten routes of "dev10" belong to the first."""
 
 
+# What a recording or a log that is incomplete raises
 UNREADABLE = (OSError, documents.MalformedError, BrokenRecordingError)
-"""What a recording or a log that is incomplete raises."""
 
 
 def _ids(routes: Path) -> frozenset[str]:
@@ -56,35 +56,32 @@ def _ids(routes: Path) -> frozenset[str]:
 
 @dataclass
 class CollectedResults:
-    """Every route once, in the order of numbers, and everything else below a folder.
-
-    Attributes:
-        route_set: The version of Bench2Drive, or the name of the user's own set, if
-            the routes are of a known one.
-        missing: Numbers of the set's routes without a record.
-        repeated: Routes with identical records, as of a merged file and its parts.
-        rerun: Routes that crashed and were driven again; the crash does not count.
-        contradictory: Routes with different results; the lowest driving score counts.
-        broken: Incomplete files and records, with the reason.
-        unfinished: Results files of workers killed on their first route.
-        unrecorded: Routes without a recording of the ego.
-        off_rate: Seconds between two steps where that is not the simulator's rate.
-        repetitions: How often the set was driven: a leaderboard's ``--repetitions``.
-    """
+    """Every route once, in the order of numbers, and everything else below a folder."""
 
     episodes: list[Episode] = field(default_factory=list)
+    # The version of Bench2Drive, or the name of the user's own set, if the routes are
+    # of a known one
     route_set: str | None = None
     set_size: int = FULL_SET
     crashed: list[str] = field(default_factory=list)
+    # Numbers of the set's routes without a record
     missing: list[str] = field(default_factory=list)
     foreign: list[str] = field(default_factory=list)
+    # Routes with identical records, as of a merged file and its parts
     repeated: list[str] = field(default_factory=list)
+    # Routes that crashed and were driven again; the crash does not count
     rerun: list[str] = field(default_factory=list)
+    # Routes with different results; the lowest driving score counts
     contradictory: list[str] = field(default_factory=list)
+    # Incomplete files and records, with the reason
     broken: dict[str, str] = field(default_factory=dict)
+    # Results files of workers killed on their first route
     unfinished: list[Path] = field(default_factory=list)
+    # Routes without a recording of the ego
     unrecorded: list[str] = field(default_factory=list)
+    # Seconds between two steps where that is not the simulator's rate
     off_rate: dict[str, float] = field(default_factory=dict)
+    # How often the set was driven: a leaderboard's `--repetitions`
     repetitions: int = 1
     notes: list[str] = field(default_factory=list)
 

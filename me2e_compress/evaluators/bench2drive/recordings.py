@@ -17,10 +17,9 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from me2e_compress.base import documents
 from me2e_compress.metrics.episode import LARGEST, EgoFrame, InferenceRecord
 
-TICK_S = 0.05
-"""Simulated seconds between two ticks of a leaderboard run."""
+TICK_S = 0.05  # simulated seconds between two ticks of a leaderboard run
+# Intervals of agents: UniAD, VAD, TCP every tick, ADMLP every tenth
 INTERVALS_S = (0.05, 0.1, 0.2, 0.25, 0.5, 1.0)
-"""Intervals of agents: UniAD, VAD, TCP every tick, ADMLP every tenth."""
 
 _PARTS = ("acceleration", "angular_velocity", "forward_vector", "right_vector")
 _LOCATION = "location"

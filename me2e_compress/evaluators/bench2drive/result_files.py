@@ -23,15 +23,17 @@ from me2e_compress.metrics.episode import (
 )
 from me2e_compress.simulator.routes import SCENARIO_ABILITIES
 
+# The first percentage of a message, as efficiency_smoothness_benchmark.py finds it
 _PERCENT = re.compile(r"\b\d+\.?\d*%")
-"""The first percentage of a message, as efficiency_smoothness_benchmark.py finds it."""
 _OUTSIDE = re.compile(r"\((\d+\.?\d*)% of")
 _PLACE = re.compile(r"\(x=(-?\d+(?:\.\d+)?), y=(-?\d+(?:\.\d+)?)")
+# What a scenario's name has after its type: `ParkingCutIn_1`
 _NUMBER = re.compile(r"_\d+$")
-"""What a scenario's name has after its type: ``ParkingCutIn_1``."""
 _ROUTE = re.compile(r"[\w.-]{1,200}")
 _OUTSIDE_LANES = InfractionKind.OUTSIDE_ROUTE_LANES
 
+# By status. Bench2Drive repeats a route whose status is just `Failed`, as after a
+# crash.
 ENDINGS: Mapping[str, Ending] = {
     "Completed": Ending.COMPLETED,
     "Perfect": Ending.COMPLETED,
@@ -45,8 +47,6 @@ ENDINGS: Mapping[str, Ending] = {
     "Failed - Simulation crashed": Ending.SIMULATOR_FAILED,
     "Failed": Ending.SIMULATOR_FAILED,
 }
-"""By status. Bench2Drive repeats a route whose status is just ``Failed``,
-as after a crash."""
 
 
 class BrokenRecordError(ValueError):
@@ -55,23 +55,14 @@ class BrokenRecordError(ValueError):
 
 @dataclass(frozen=True)
 class RouteRecord:
-    """One parsed record.
+    """One parsed record."""
 
-    Attributes:
-        episode: The episode, without frames.
-        number: The route's id in its routes file, such as ``1711``.
-        recording: Name of the folder of its ``metric_info.json``, if any.
-        duration_s: Simulated seconds; None if not stated.
-        content: Result of the route, to tell a copy from another drive.
-        notes: What could not be interpreted, one line each.
-    """
-
-    episode: Episode
-    number: str
-    recording: str | None
-    duration_s: float | None
-    content: str
-    notes: tuple[str, ...] = ()
+    episode: Episode  # the episode, without frames
+    number: str  # the route's id in its routes file, such as `1711`
+    recording: str | None  # name of the folder of its `metric_info.json`, if any
+    duration_s: float | None  # simulated seconds; None if not stated
+    content: str  # result of the route, to tell a copy from another drive
+    notes: tuple[str, ...] = ()  # what could not be interpreted, one line each
 
     @property
     def crashed(self) -> bool:
@@ -200,9 +191,9 @@ def _infractions(record: _Record) -> list[Infraction]:
 
 
 _CHECKPOINT = b'"_checkpoint"'
+# Names of a drive's recording, as Bench2Drive's agents have it, and of the log of its
+# decisions: a line each, `frame` and `latency_us`
 _RECORDING, _DECISIONS = "metric_info.json", "decisions.jsonl"
-"""Names of a drive's recording, as Bench2Drive's agents have it, and of the log of its
-decisions: a line each, `frame` and `latency_us`."""
 
 
 @dataclass

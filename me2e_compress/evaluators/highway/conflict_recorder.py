@@ -30,20 +30,18 @@ from me2e_compress.simulator.scene import Actor, Ego, Scene, box_of
 
 Floats = npt.NDArray[np.float64]
 
+# Most frames between the first and the second at one place
 LATEST = round(PET_HORIZON_S * 1e6 / FRAME_US)
-"""Most frames between the first and the second at one place."""
 
-STOPPED_MPS = 0.05
-"""nuPlan's threshold of standing, for the ego and others alike."""
+STOPPED_MPS = 0.05  # nuPlan's threshold of standing, for the ego and others alike
 
+# nuPlan: from this bearing on, the other's centre is behind the ego
 BEHIND_RAD = math.radians(150.0)
-"""nuPlan: from this bearing on, the other's centre is behind the ego."""
 
+# Always the ego's fault; a contact at its side only outside of one lane
 AT_FAULT = (Contact.STANDING_PARTNER, Contact.FRONT)
-"""Always the ego's fault; a contact at its side only outside of one lane."""
 
-CHUNK = 256
-"""Number of ego frames that are compared at once."""
+CHUNK = 256  # number of ego frames that are compared at once
 
 
 def conflicts_of(scenes: Sequence[Scene]) -> ConflictRecord:

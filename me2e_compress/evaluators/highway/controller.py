@@ -44,16 +44,13 @@ from me2e_compress.simulator.traffic.bodies import (
     STEERING_LAG_S,
 )
 
+# Lookahead of the pursuit: seconds of travel, and metres at walking pace
 LOOKAHEAD_S, SHORTEST_LOOKAHEAD_M = 0.5, 3.0
-"""Lookahead of the pursuit: seconds of travel, and metres at walking pace."""
+# Seconds ahead at which the planned positions set the acceleration
 AHEAD_S = (0.5, 1.0)
-"""Seconds ahead at which the planned positions set the acceleration."""
-MIN_STEP_M = 0.3
-"""Waypoints nearer than this to their predecessor give no direction."""
-STATION_M = 0.25
-"""Spacing of the curve that is tracked."""
-BEYOND_M = 20.0
-"""Straight extension of the curve, for lookahead beyond a short plan."""
+MIN_STEP_M = 0.3  # waypoints nearer than this to their predecessor give no direction
+STATION_M = 0.25  # spacing of the curve that is tracked
+BEYOND_M = 20.0  # straight extension of the curve, for lookahead beyond a short plan
 
 
 @dataclass(frozen=True, eq=False)
@@ -187,8 +184,8 @@ def _smooth(knots: Floats, course: float) -> Floats:
 
 
 STEER_GAIN_RAD = 0.36848336
+# World on Rails: wheel angle of a full steer, axles from the centre
 FRONT_AXLE_M, REAR_AXLE_M = -0.090769015, 1.4178275
-"""World on Rails: wheel angle of a full steer, axles from the centre."""
 
 
 def control_of(pedals: PedalsAndWheel, length_m: float) -> Control:

@@ -23,10 +23,9 @@ from me2e_compress.simulator.routes import (
 from me2e_compress.simulator.scenarios.builders import stage_of
 from me2e_compress.simulator.world import World
 
-STEP_US = 500_000
-"""Time between two frames of a scene: that between two waypoints."""
+STEP_US = 500_000  # time between two frames of a scene: that between two waypoints
+# Added to every seed, so that it never equals one of a set of routes
 SEED_OFFSET = 1_000_000
-"""Added to every seed, so that it never equals one of a set of routes."""
 
 
 def driven_frames(

@@ -30,11 +30,11 @@ if TYPE_CHECKING:  # highway-env takes a second to import: only who drives needs
 
 POLL_S = 0.05
 
+# The parent's end: routes go to the child, an episode or an error comes back
 Line: TypeAlias = "Connection[Route, Driven | Me2eError]"
-"""The parent's end: routes go to the child, an episode or an error comes back."""
+# [0] number of the policy call in progress, 0 between calls; [1] percent of the route
+# passed
 Heartbeat: TypeAlias = "SynchronizedArray[float]"
-"""[0] number of the policy call in progress, 0 between calls; [1] percent of
-the route passed."""
 
 
 @dataclass

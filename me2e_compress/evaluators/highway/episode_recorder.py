@@ -25,8 +25,7 @@ from me2e_compress.simulator.scene import ActorKind, Event, EventKind, Scene
 from me2e_compress.simulator.traffic.network import ANNOUNCED_M
 from me2e_compress.simulator.world import World
 
-NEAR_M = 50.0
-"""Range of the vehicles whose speed the ego's is compared with."""
+NEAR_M = 50.0  # range of the vehicles whose speed the ego's is compared with
 
 VEHICLES = (
     ActorKind.CAR,

@@ -36,12 +36,10 @@ from me2e_compress.version import __version__
 if TYPE_CHECKING:
     from me2e_compress.simulator.pictures import Moment
 
-EVERY_US = 200_000
-"""Simulated time between two frames of an animation."""
-STRIP = 4
-"""Moments of the strip."""
+EVERY_US = 200_000  # simulated time between two frames of an animation
+STRIP = 4  # moments of the strip
+# Frames of a route, by those of its type in `EXPERT_S`, which knows no traffic
 LONGER = 1.5
-"""Frames of a route, by those of its type in `EXPERT_S`, which knows no traffic."""
 
 
 @dataclass(frozen=True)

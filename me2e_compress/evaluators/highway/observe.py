@@ -18,10 +18,10 @@ from me2e_compress.simulator.scene import ActorKind, Ego, Scene
 from me2e_compress.simulator.world import World
 
 APART_M = 50.0
+# The most metres of route between two nodes, and how near one counts as reached:
+# Bench2Drive's leaderboard thins the plan to 50 m, its agents' RoutePlanner(4.0, 50.0)
+# takes nodes off at 4 m
 REACHED_M = 4.0
-"""The most metres of route between two nodes, and how near one counts as reached:
-Bench2Drive's leaderboard thins the plan to 50 m, its agents' RoutePlanner(4.0, 50.0)
-takes nodes off at 4 m."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -97,8 +97,8 @@ class ObservationBuilder:
         )
 
 
+# Actors that a tracker would follow
 ROAD_USERS = {*ActorKind} - {ActorKind.DOOR, ActorKind.CONE, ActorKind.BARRIER}
-"""Actors that a tracker would follow."""
 
 
 def road_users(scene: Scene) -> npt.NDArray[np.float64]:

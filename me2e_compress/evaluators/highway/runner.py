@@ -37,8 +37,7 @@ from me2e_compress.simulator.routes import Route
 from me2e_compress.simulator.scene import Control, Ego, Scene
 from me2e_compress.simulator.world import World
 
-TIMEOUT_US = 200_000_000
-"""4000 ticks of 50 ms; the leaderboard's own limits are longer."""
+TIMEOUT_US = 200_000_000  # 4000 ticks of 50 ms; the leaderboard's own limits are longer
 DEVIATION_M = 30.0
 ASTRAY_M = 15.0
 ASTRAY_SHARE = 0.3
@@ -91,18 +90,14 @@ class PolicyFailedError(Exception):
 
 @dataclass(frozen=True)
 class Listeners:
-    """Callbacks while a route is driven; none of them changes the drive.
+    """Callbacks while a route is driven; none of them changes the drive."""
 
-    Args:
-        on_query: Called with the world before the policy is called.
-        on_answer: Called when the policy has returned.
-        on_moment: Called at every frame with the data of a picture. The plan is
-            relative to the ego now, None for a policy that answers controls. Makes the
-            cameras render for any policy.
-    """
-
+    # Called with the world before the policy is called
     on_query: Callable[[World], None] = lambda world: None
-    on_answer: Callable[[], None] = lambda: None
+    on_answer: Callable[[], None] = lambda: None  # called when the policy has returned
+    # Called at every frame with the data of a picture. The plan is relative to the ego
+    # now, None for a policy that answers controls. Makes the cameras render for any
+    # policy.
     on_moment: Callable[[Moment], None] | None = None
 
 

@@ -24,23 +24,21 @@ from me2e_compress.study.study_result import StudyResult
 INK, MUTED, RULE = "#1d2127", "#6b7480", "#d9dde3"
 ACCENT, BASELINE = "#2a6fb0", "#1d2127"
 STYLE = Path(__file__).with_name("report.mplstyle")
+# Text stays text: matplotlib measures one font, the page shows its own
 PAGE_FONT = "Inter, 'Segoe UI', 'Helvetica Neue', Arial, sans-serif"
-"""Text stays text: matplotlib measures one font, the page shows its own."""
-WIDTH_IN = 9.2
-"""Width of the page's column."""
+WIDTH_IN = 9.2  # width of the page's column
+# Height of a row, of one of many, and of titles and axes
 ROW_IN, LOW_ROW_IN, FRAME_IN = 0.42, 0.33, 0.72
-"""Height of a row, of one of many, and of titles and axes."""
 MANY_ROWS = 8
+# With more drives than this, the first figure has those of one condition alone
 MOST_DRIVES = 14
-"""With more drives than this, the first figure has those of one condition alone."""
-LONGEST_NAME = 20
-"""Characters of a name on one line."""
+LONGEST_NAME = 20  # characters of a name on one line
+# Title, largest value there can be, and score of each panel of the road
 SCORES: tuple[tuple[str, float | None, Callable[[Scores], Estimate]], ...] = (
     ("Success rate, %", 100.0, lambda scores: scores.success_rate),
     ("Room kept to others, %", 100.0, lambda scores: scores.safety.room_kept),
     ("Speed, % of the traffic's", None, lambda scores: scores.efficiency),
 )
-"""Title, largest value there can be, and score of each panel of the road."""
 
 
 def styled() -> AbstractContextManager[None]:
@@ -81,19 +79,14 @@ class Mark:
 
 @dataclass(frozen=True)
 class Panel:
-    """The marks of one number on an axis that begins at zero.
-
-    Attributes:
-        bars: Whether values are bars, not dots.
-        most: The largest value there can be; None if there is no such.
-        signed: Whether values are differences around zero.
-    """
+    """The marks of one number on an axis that begins at zero."""
 
     title: str
     marks: Sequence[Mark]
-    bars: bool = False
+    bars: bool = False  # whether values are bars, not dots
+    # The largest value there can be; None if there is no such
     most: float | None = None
-    signed: bool = False
+    signed: bool = False  # whether values are differences around zero
 
 
 def answer(outcome: StudyResult) -> Markup:

@@ -40,24 +40,19 @@ class Section:
 
 @dataclass(frozen=True)
 class Page:
-    """All that a page shows: the answer first, the details folded.
-
-    Attributes:
-        findings: What a reader should remember: a name and a sentence.
-        made: How it was made, by name.
-        variants: Name of each variant, what it was made of, and its sha256.
-        answer: The picture that stands before everything else.
-    """
+    """All that a page shows: the answer first, the details folded."""
 
     title: str
     lede: str
     sections: Sequence[Section]
-    made: Sequence[tuple[str, str]]
+    made: Sequence[tuple[str, str]]  # how it was made, by name
+    # Name of each variant, what it was made of, and its sha256
     variants: Sequence[tuple[str, str, str | None]]
+    # What a reader should remember: a name and a sentence
     findings: Sequence[tuple[str, str]] = ()
     findings_note: str = ""
     alerts: Sequence[str] = ()
-    answer: Drawing | None = None
+    answer: Drawing | None = None  # the picture that stands before everything else
 
     def html(self) -> str:
         """Write it as HTML that needs no other file."""
