@@ -57,8 +57,9 @@ def demo(
             results[name] = result = step(listener)
         if not printing.json:
             seconds = time.monotonic() - begun
-            compressed = isinstance(result, CompressResult)
-            text = result.size if compressed else result.headline
+            text = result.headline
+            if isinstance(result, CompressResult):
+                text = result.size
             say(f"{name:<10}{seconds:4.0f} s   {text}")
             if printing.verbose:
                 show(result)

@@ -4,7 +4,7 @@ import dataclasses
 import json
 import sys
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from typing import Literal
 
@@ -136,22 +136,38 @@ def print_table(content: Table) -> None:
     Where the words do not fit side by side, a row becomes a few lines, so that no name
     is broken.
     """
-    content = content.escape_controls()
-    # intervals are shown if the terminal is wide, or the table narrow
-    spare = console.width - _border(content) - sum(_lengths(content, True, False))
-    intervals = _is_wide() or spare >= 0
-    widths = _column_widths(content, intervals)
+    # Intervals are shown if the terminal is wide, or the table narrow
+    content, wide = content.escape_controls(), console.width >= WIDE
+    count = len(content.columns)
+    spare = console.width - (3 * count + 1 if wide else 3 * (count - 1))  # of rules
+    intervals = wide or sum(_lengths(content, True, str.splitlines)) <= spare
+    least = _lengths(content, intervals, str.split)
+    fits = sum(least) <= spare
     console.print(Text(content.title, "bold"), soft_wrap=True)
-    if widths is not None:
-        console.print(_rich_table(content, widths, intervals))
-    # each row as its name and, indented, its other cells
-    for first, *others in content.rows if widths is None else ():
+    if fits:
+        # Spare characters go to narrow columns first: only long sentences wrap
+        most = _lengths(content, intervals, str.splitlines)
+        wanted = [high - low for low, high in zip(least, most, strict=True)]
+        spare -= sum(least)
+        for done, at in enumerate(sorted(range(count), key=wanted.__getitem__)):
+            extra = min(wanted[at], spare // (count - done))
+            least[at], spare = least[at] + extra, spare - extra
+        grid = RichTable()
+        grid.show_edge = grid.pad_edge = wide  # four characters that numbers can use
+        for at, (name, width) in enumerate(zip(content.columns, least, strict=True)):
+            side: Literal["left", "right"] = "left" if at < content.words else "right"
+            grid.add_column(Text(name), justify=side, overflow="fold", width=width)
+        for row in content.rows:
+            grid.add_row(*(_rich_text(cell, intervals) for cell in row))
+        console.print(grid)
+    # Each row as its name and, indented, its other cells
+    for first, *others in () if fits else content.rows:
         console.print(Text(first.text), soft_wrap=True)
         for name, cell in zip(content.columns[1:], others, strict=True):
             if cell.text:
-                label = f"{name}: " if name and len(content.columns) > 2 else ""
+                label = f"{name}: " if name and count > 2 else ""
                 console.print(Text(f"    {label}{cell.text}"), soft_wrap=True)
-    # what the table leaves out is said below it
+    # Notes on what the table leaves out
     if content.note:
         console.print(Text(content.note, "dim"))
     if not intervals and any(cell.detail for row in content.rows for cell in row):
@@ -162,59 +178,20 @@ def print_table(content: Table) -> None:
         console.print(Text(shown, "dim"), soft_wrap=True)
 
 
-def _border(content: Table) -> int:
-    """Return the characters of a line that rules and padding take."""
-    count = len(content.columns)
-    return 3 * count + 1 if _is_wide() else 3 * (count - 1)
+def _lengths(
+    content: Table, intervals: bool, parts: Callable[[str], list[str]]
+) -> list[int]:
+    """Return the length of the longest part, a word or a line, of every column."""
+    lengths = list[int]()
+    for at, name in enumerate(content.columns):
+        texts = [_rich_text(row[at], intervals).plain for row in content.rows]
+        words = (part for text in (name, *texts) for part in parts(text))
+        lengths.append(max(map(len, words), default=1))
+    return lengths
 
 
-def _lengths(content: Table, intervals: bool, words: bool) -> list[int]:
-    """Return the length of the longest line, or word, of every column."""
-    columns = [
-        [name, *(_rich_text(row[at], intervals).plain for row in content.rows)]
-        for at, name in enumerate(content.columns)
-    ]
-    return [
-        max(
-            (len(w) for t in texts for w in (t.split() if words else t.splitlines())),
-            default=1,
-        )
-        for texts in columns
-    ]
-
-
-def _column_widths(content: Table, intervals: bool) -> list[int] | None:
-    """Return column widths that break no word; None if the terminal is too narrow."""
-    least = _lengths(content, intervals, True)
-    most = _lengths(content, intervals, False)
-    spare = console.width - _border(content) - sum(least)
-    if spare < 0:
-        return None
-    # spare characters go to narrow columns first, so that only long sentences wrap
-    wanted = [high - low for low, high in zip(least, most, strict=True)]
-    for done, at in enumerate(sorted(range(len(wanted)), key=wanted.__getitem__)):
-        extra = min(wanted[at], spare // (len(wanted) - done))
-        least[at], spare = least[at] + extra, spare - extra
-    return least
-
-
-def _rich_table(content: Table, widths: Sequence[int], intervals: bool) -> RichTable:
-    grid = RichTable()
-    grid.show_edge = grid.pad_edge = _is_wide()  # four characters that numbers can use
-    for at, (name, width) in enumerate(zip(content.columns, widths, strict=True)):
-        side: Literal["left", "right"] = "left" if at < content.words else "right"
-        grid.add_column(Text(name), justify=side, overflow="fold", width=width)
-    for row in content.rows:
-        grid.add_row(*(_rich_text(cell, intervals) for cell in row))
-    return grid
-
-
-def _is_wide() -> bool:
-    return console.width >= WIDE
-
-
-def _rich_text(cell: Cell, wide: bool) -> Text:
-    if cell.detail and wide:
+def _rich_text(cell: Cell, intervals: bool) -> Text:
+    if cell.detail and intervals:
         return Text.assemble(cell.text, "\n", (cell.detail, "dim"))
     return Text(cell.text)
 

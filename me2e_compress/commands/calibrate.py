@@ -2,7 +2,6 @@
 
 import dataclasses
 import gc
-from collections.abc import Sequence
 from pathlib import Path
 
 from me2e_compress.base import atomic
@@ -31,24 +30,6 @@ from me2e_compress.manager import recipe
 from me2e_compress.quantization.decision import keep_readers, overrides_text
 
 
-def checkpoint_beside(output: Path) -> Path:
-    """Return the file of a calibration's progress."""
-    return output.with_name(output.name + ".checkpoint")
-
-
-def overrides_beside(output: Path) -> Path:
-    """Return the file of overrides for what an imported cache lacks."""
-    return output.with_name(f"{output.stem}.overrides.toml")
-
-
-def written_files(output: Path, options: CalibrateOptions) -> list[Path]:
-    """List the files that :func:`calibrate` may write."""
-    files = [output, checkpoint_beside(output)]
-    if options.imported is not None:
-        files.append(overrides_beside(output))
-    return files
-
-
 @dataclasses.dataclass(frozen=True, repr=False)
 class CalibrateResult(Result):
     """The range of every tensor.
@@ -66,26 +47,28 @@ class CalibrateResult(Result):
     def view(self) -> View:
         """Return the ranges that deserve a look, and how to keep floats."""
         ranges = self.ranges
-        how = f"compress --ranges {self.output} --overrides {self.overrides}"
         headline = (
             f"{self.output}: {plural(len(ranges.tensors), 'tensor')}, {ranges.method},"
             f" {plural(ranges.frames, 'frame')}"
         )
-        return View(
-            headline,
-            lines=(headline, *_texts(self.findings, "note")),
-            alerts=(
-                *_texts(self.findings, "warning"),
-                *([] if self.overrides is None else [f"These floats: {how}"]),
-            ),
-        )
+        lines, alerts = [headline], list[str]()
+        for finding in self.findings:
+            place = alerts if finding.severity == "warning" else lines
+            place.append(str(finding))
+        if self.overrides is not None:
+            how = f"compress --ranges {self.output} --overrides {self.overrides}"
+            alerts.append(f"These floats: {how}")
+        return View(headline, lines=lines, alerts=alerts)
 
     def to_json(self) -> object:
         """Return the ranges and the tensors that are always zero."""
-        ranges = self.ranges
-        own = {**dataclasses.asdict(ranges), "dead": ranges.dead}
-        own |= {"outliers": ranges.outliers, "findings": self.findings}
-        return {**own, "overrides": self.overrides}
+        return {
+            **dataclasses.asdict(self.ranges),
+            "dead": self.ranges.dead,
+            "outliers": self.ranges.outliers,
+            "findings": self.findings,
+            "overrides": self.overrides,
+        }
 
 
 def calibrate(
@@ -117,18 +100,34 @@ def calibrate(
             " its scales); ranges are never made up"
         )
     named = (options.recipe, options.module_map, options.imported, options.adapter)
-    outputs = written_files(output, options)
     inputs = (source, frames, *named)
+    # Progress, and overrides for tensors that an imported cache lacks, lie beside
+    checkpoint = output.with_name(output.name + ".checkpoint")
+    overrides = output.with_name(f"{output.stem}.overrides.toml")
+    outputs = [output, checkpoint]
+    outputs += [] if options.imported is None else [overrides]
     with writing(outputs, inputs, force=options.force):
         prepared, part = _prepare(source, frames, options, listener)
         gc.collect()  # 150 MB of VAD-tiny as it was read; graphs are cycles
         with atomic.all_or_none():
-            missing, overrides = list[str](), overrides_beside(output)
+            missing = list[str]()
             if options.imported is not None:
                 ranges, missing = _import(prepared, part, options)
             else:
+                # A run that was killed goes on from the checkpoint
                 assert part is not None
-                ranges = _measure(prepared, part, output, options, listener)
+                method = options.method or prepared.method
+                calibrator = Calibrator(
+                    method,
+                    options.threads,
+                    checkpoint=checkpoint,
+                    provider=options.runs_on,
+                )
+                report = listener.counting("calibrate", method)
+                statistics = calibrator.collect(
+                    prepared.model, prepared.tensors(), part, report
+                )
+                ranges = Ranges.of(statistics, OBSERVERS.parse(method))
             ranges.save(output)
             # what an imported cache has no range for stays in float
             cache = Path(options.imported or "")
@@ -170,27 +169,6 @@ def _prepare(
     return PreparedGraph.of(source, loaded, options.module_map, passes), part
 
 
-def _measure(
-    prepared: PreparedGraph,
-    part: CalibrationSet,
-    output: Path,
-    options: CalibrateOptions,
-    listener: Listener,
-) -> Ranges:
-    """Measure the ranges on the frames, going on from a checkpoint if there is one."""
-    tensors = prepared.tensors()
-    # a checkpoint lets a run that was killed go on
-    method, provider = options.method or prepared.method, options.runs_on
-    checkpoint = checkpoint_beside(output)
-    calibrator = Calibrator(
-        method, options.threads, checkpoint=checkpoint, provider=provider
-    )
-    seen = calibrator.collect(
-        prepared.model, tensors, part, listener.counting("calibrate", method)
-    )
-    return Ranges.of(seen, OBSERVERS.parse(method))
-
-
 def _import(
     prepared: PreparedGraph, part: CalibrationSet | None, options: CalibrateOptions
 ) -> tuple[Ranges, list[str]]:
@@ -201,10 +179,6 @@ def _import(
     if part is not None:
         few = part.part(part.places[:2])
         calibrator = Calibrator(threads=options.threads, provider=options.runs_on)
-        seen = calibrator.collect(prepared.model, tuple(ranges.tensors), few)
-        ranges = dataclasses.replace(ranges, rms=rms_of(seen))
+        statistics = calibrator.collect(prepared.model, tuple(ranges.tensors), few)
+        ranges = dataclasses.replace(ranges, rms=rms_of(statistics))
     return ranges, [name for name in tensors if name not in ranges.tensors]
-
-
-def _texts(findings: Sequence[RangeFinding], severity: str) -> tuple[str, ...]:
-    return tuple(str(each) for each in findings if each.severity == severity)

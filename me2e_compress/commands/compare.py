@@ -2,7 +2,7 @@
 
 import dataclasses
 import itertools
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -84,28 +84,34 @@ class CompareResult(Comparison, Result):
     not_finite: tuple[str, ...]
 
     def view(self) -> View:
-        """Return how far outputs, agents and the plan moved, and what is dead."""
+        """Return how far outputs, agents and the plan moved, and dead outputs."""
+        # How far the plan moves, if it is known
         fidelity, liveness = self.fidelity, self.liveness
-        title = f"Fidelity over {plural(fidelity.frames, 'frame')}"
-        outputs = outputs_table(title, fidelity, self.agents)
-        faults = () if liveness is None else liveness.faults
-        dead = "; ".join(faults)
-        return View(
-            _plan_text(fidelity),
-            (
-                outputs,
-                *([liveness.table()] if liveness and liveness.outputs else []),
-            ),
-            (
-                *filter(None, [self.known]),
-                _plan_text(fidelity),
-                *(() if liveness is None else liveness.lines()),
-                *(() if self.runtime is None else self.runtime.lines()),
-                *(f"{name}: {why}" for name, why in self.slow_here.items()),
-            ),
-            (*fidelity.stray_texts, *self.not_finite, *faults),
-            EvaluationError(f"{self.candidate}: {dead}") if dead else None,
-        )
+        frames = plural(fidelity.frames, "frame")
+        headline = f"plan displacement: not measured ({fidelity.plan_reason})"
+        if fidelity.plan is not None:
+            headline = (
+                f"plan displacement: mean {fidelity.plan.mean_m:.4f} m, largest"
+                f" {fidelity.plan.max_m:.4f} m over {frames}"
+            )
+            if fidelity.same_choice is not None:
+                share = f"{fidelity.same_choice:.1%} of them"
+                headline += f"; the same candidate on {share}"
+        # How far outputs are apart, and whether they move
+        tables = [outputs_table(f"Fidelity over {frames}", fidelity, self.agents)]
+        lines = [self.known, headline] if self.known else [headline]
+        faults: Sequence[str] = ()
+        if liveness is not None:
+            tables += [liveness.table()] if liveness.outputs else []
+            lines += liveness.lines()
+            faults = liveness.faults
+        # Where onnxruntime answers otherwise, or is slow
+        lines += () if self.runtime is None else self.runtime.lines()
+        lines += (f"{name}: {why}" for name, why in self.slow_here.items())
+        alerts = (*fidelity.stray_texts, *self.not_finite, *faults)
+        dead = f"{self.candidate}: {'; '.join(faults)}"
+        error = EvaluationError(dead) if faults else None
+        return View(headline, tables, lines, alerts, error)
 
 
 def outputs_table(
@@ -118,41 +124,25 @@ def outputs_table(
     matched, n = {} if agents is None else agents.sqnr_db, 4 + (floors is not None)
     rows = [
         (
-            each.name,
-            f"{matched.get(each.name, each.sqnr_db):z.1f}",
-            "matched agents" if each.name in matched else each.by_frame,
-            "" if each.name in matched else f"{each.error:.1e}",
-            *([] if floors is None else [floors.get(each.name, "above")]),
+            output.name,
+            f"{matched.get(output.name, output.sqnr_db):z.1f}",
+            "matched agents" if output.name in matched else output.by_frame,
+            "" if output.name in matched else f"{output.error:.1e}",
+            *([] if floors is None else [floors.get(output.name, "above")]),
         )
-        for each in fidelity.outputs
+        for output in fidelity.outputs
     ]
     columns = ("output", "SQNR dB", "by frame", "max|a-b|/max|a|", "floor")[:n]
     rows += [(name, "removed", *[""] * (n - 2)) for name in fidelity.missing]
-    return table(title, columns, rows, _agents_note(agents))
-
-
-def _plan_text(fidelity: Fidelity) -> str:
-    if fidelity.plan is None:
-        return f"plan displacement: not measured ({fidelity.plan_reason})"
-    line = (
-        f"plan displacement: mean {fidelity.plan.mean_m:.4f} m, largest"
-        f" {fidelity.plan.max_m:.4f} m over {plural(fidelity.frames, 'frame')}"
-    )
-    if fidelity.same_choice is None:
-        return line
-    return f"{line}; the same candidate on {fidelity.same_choice:.1%} of them"
-
-
-def _agents_note(sets: SetFidelity | None) -> str:
-    """Describe how outputs that are sets are compared; empty without any."""
-    if sets is None:
-        return ""
-    agents = plural(sets.agents, "agent")
-    return (
-        "matched: agents with a score of 0.5 or more, each against the nearest. The"
-        f" first graph has {agents} of such scores, the second one within 2 m of"
-        f" {sets.matched} of them."
-    )
+    # Outputs that are sets are compared agent by agent
+    note = ""
+    if agents is not None:
+        note = (
+            "matched: agents with a score of 0.5 or more, each against the nearest. The"
+            f" first graph has {plural(agents.agents, 'agent')} of such scores, the"
+            f" second one within 2 m of {agents.matched} of them."
+        )
+    return table(title, columns, rows, note)
 
 
 def compare(
@@ -188,8 +178,8 @@ def compare(
     }
     slow = {
         path.name: why
-        for path, each in graphs.items()
-        if (why := slow_here(each.model, provider))
+        for path, opening in graphs.items()
+        if (why := slow_here(opening.model, provider))
     }
     total = len(recording)
 
@@ -211,27 +201,30 @@ def compare(
         sets = SetTally.of(left, right)
     except GraphError as error:
         raise GraphError(f"{paths[0]}: {error}") from error
-    # what onnxruntime's int8 answers, beside the nodes as they stand
-    kernels, judged = None, graphs[paths[1]].model
-    if not options.as_it_stands and has_int8_kernels(judged, provider):
+    # onnxruntime's int8, beside the nodes as they stand
+    kernels, model = None, graphs[paths[1]].model
+    if not options.as_it_stands and has_int8_kernels(model, provider):
         kernels = session(paths[1], stock=True)
     shown_frames, bad_frame = map(with_progress, recording), _BadFrame()
     comparison = compare_sessions(
-        left, right, shown_frames, judged, kernels, sets, bad_frame, alive=options.alive
+        left, right, shown_frames, model, kernels, sets, bad_frame, alive=options.alive
     )
+    # Name the nodes that make NaN or infinity, once
     makers = dict[str, str]()
-    for path, each in zip(paths, (left, right), strict=True):
-        if made := bad_frame.maker(graphs[path].model.clone(), each):
+    for path, opened_session in zip(paths, (left, right), strict=True):
+        if made := bad_frame.maker(graphs[path].model.clone(), opened_session):
             makers.setdefault(made, f"{path.name}: {made}")
-    known = "; ".join(dict.fromkeys(graphs[path].known for path in paths))
-    answers = (
+    return CompareResult(
         comparison.fidelity,
         comparison.liveness,
         comparison.runtime,
         comparison.agents,
+        reference=paths[0],
+        candidate=paths[1],
+        slow_here=slow,
+        known="; ".join(dict.fromkeys(graphs[path].known for path in paths)),
+        not_finite=tuple(makers.values()),
     )
-    bad = tuple(makers.values())
-    return CompareResult(*answers, *paths, slow_here=slow, known=known, not_finite=bad)
 
 
 class _BadFrame:
@@ -314,13 +307,12 @@ class FirstDifferenceResult(Result):
     def view(self) -> View:
         """Return the worst value that each module hands on."""
         worst: dict[str, BorderValue] = {}
-        for each in self.difference.values:
-            known = worst.setdefault(each.module, each)
-            if each.sqnr_db < known.sqnr_db:
-                worst[each.module] = each
+        for value in self.difference.values:
+            if value.sqnr_db < worst.setdefault(value.module, value).sqnr_db:
+                worst[value.module] = value
         rows = [
-            (each.module or "-", each.value, each.node, f"{each.sqnr_db:z.1f}")
-            for each in worst.values()
+            (value.module or "-", value.value, value.node, f"{value.sqnr_db:z.1f}")
+            for value in worst.values()
         ]
         columns = ("module", "worst value", "node", "SQNR dB")
         note = (
@@ -333,18 +325,13 @@ class FirstDifferenceResult(Result):
 
 def headline_of(difference: FirstDifference) -> str:
     """Return the line that names the first module that differs, if one does."""
+    floor_db, count = f"{difference.floor_db:g} dB", len(difference.values)
     if difference.first is not None:
-        return f"first below {difference.floor_db:g} dB: {difference.first}"
-    below = sum(each.sqnr_db < difference.floor_db for each in difference.values)
+        return f"first below {floor_db}: {difference.first}"
+    below = sum(value.sqnr_db < difference.floor_db for value in difference.values)
     if not below:
-        return (
-            f"no difference: {plural(len(difference.values), 'value')} at"
-            f" {difference.floor_db:g} dB or more"
-        )
-    return (
-        f"{below} of {plural(len(difference.values), 'value')} are below"
-        f" {difference.floor_db:g} dB, but no output is"
-    )
+        return f"no difference: {plural(count, 'value')} at {floor_db} or more"
+    return f"{below} of {plural(count, 'value')} are below {floor_db}, but no output is"
 
 
 def first_difference(

@@ -1,9 +1,7 @@
-"""Hold what an engine answered elsewhere against its graph, and split what was lost."""
+"""Compare an engine's dumped outputs with its graph, and split the loss."""
 
 import dataclasses
 from pathlib import Path
-
-import onnx_ir as ir
 
 from me2e_compress import graph
 from me2e_compress.base.display import format_number, plural, table
@@ -56,7 +54,7 @@ class DumpResult(Result):
 
     def view(self) -> View:
         """Return what every output lost to what, and where the inside differs."""
-        worst = min(self.outputs, key=lambda each: each.compilation_db)
+        worst = min(self.outputs, key=lambda output: output.compilation_db)
         verdict = "the engine answers as its graph does"
         if worst.compilation_db < SAME_DB:
             verdict = "compilation: the engine, or its host, does not answer as its"
@@ -64,13 +62,13 @@ class DumpResult(Result):
         headline = f"{verdict} (least: {worst.name}, {worst.compilation_db:.1f} dB)"
         rows = [
             (
-                each.name,
-                format_number(each.quantization_db, ".1f"),
-                format_number(each.compilation_db, ".1f"),
-                format_number(each.all_db, ".1f"),
-                format_number(each.moves, ".2f"),
+                output.name,
+                format_number(output.quantization_db, ".1f"),
+                format_number(output.compilation_db, ".1f"),
+                format_number(output.all_db, ".1f"),
+                format_number(output.moves, ".2f"),
             )
-            for each in self.outputs
+            for output in self.outputs
         ]
         source = (
             f"Quantization is not measured: {self.float_reason}."
@@ -81,7 +79,7 @@ class DumpResult(Result):
         columns = ("output", "quantization", "compilation", "all", "moves")
         title = f"What the engine lost over {plural(self.frames, 'frame')}"
         inside = [] if self.inner is None else [f"inside: {headline_of(self.inner)}"]
-        dead = tuple(each.dead for each in self.outputs if each.dead)
+        dead = tuple(output.dead for output in self.outputs if output.dead)
         return View(
             headline,
             [table(title, columns, rows, note + source)],
@@ -117,10 +115,25 @@ def compare_dump(
     path, options = model_path(model), options or CompareOptions()
     recording, engine = CalibrationSet(Path(frames)), EngineDump(dump)
     engine.check(recording)
-    notes, inner = _check_names(engine, path, graph.load(path)), None
+    # The dump must be of this graph; outputs may be missing
+    whole = graph.load(path)
+    outputs = [str(value.name) for value in whole.graph.outputs]
+    if not set(outputs) & set(engine.names):
+        raise EvaluationError(
+            f"{engine.path}: answers {', '.join(engine.names)}; {path} gives"
+            f" {', '.join(outputs)}: the dump is of another graph"
+        )
+    made = {value.name for node in whole.graph for value in node.outputs}
+    if unknown := [name for name in engine.names if name not in {*made, *outputs}]:
+        raise EvaluationError(
+            f"{engine.path}: {unknown[0]} is no tensor of {path}, whose outputs"
+            f" are {', '.join(outputs)}"
+        )
+    lacking = [name for name in outputs if name not in engine.names]
+    notes = (f"not dumped: {', '.join(lacking)}",) if lacking else ()
+    # Run the graph on the engine's state, and its float source beside it
     opening = opened(path, recording, options, listener)
-    loaded, metadata = opening.model, opening.metadata
-    provider = options.runs_on
+    metadata, provider = opening.metadata, options.runs_on
     session = Session(
         path, optimize=False, release=True, provider=provider, metadata=metadata
     )
@@ -129,13 +142,13 @@ def compare_dump(
     if float_graph is not None:
         source = model_path(float_graph)
         original = Session(source, release=True, provider=provider, metadata=metadata)
-    elif describe_quantized(loaded) is None:
+    elif describe_quantized(opening.model) is None:
         float_reason = f"{path.name} is not quantized"
     else:
         float_reason = "--float names no source"
     total = len(recording)
     try:
-        outputs = split_losses(
+        losses = split_losses(
             run,
             original,
             options.alive,
@@ -143,38 +156,24 @@ def compare_dump(
         )
     except EvaluationError as error:
         raise EvaluationError(f"{engine.path}: {error}") from error
+    # Tensors inside show where the engine begins to differ
+    inner = None
     if set(engine.names) - set(session.outputs):
-        named = stamp_modules(loaded)
+        named = stamp_modules(opening.model)
         inner = first_difference_of_engine(named, run, provider)
+    # State that the dump lacks is that of our own run
+    state, pairs = "none", session.recurrent
+    if pairs:
+        own = [name for name, output in pairs.items() if output not in run.names]
+        state = f"of our own run: {', '.join(own)}" if own else "the engine's own"
     return DumpResult(
-        *(path, engine.path, source, float_reason, total, _state_text(run)),
-        *(outputs, notes, inner),
+        graph=path,
+        dump=engine.path,
+        float_graph=source,
+        float_reason=float_reason,
+        frames=total,
+        state=state,
+        outputs=losses,
+        notes=notes,
+        inner=inner,
     )
-
-
-def _check_names(dump: EngineDump, path: Path, loaded: ir.Model) -> tuple[str, ...]:
-    """Return a note on outputs that are not dumped; an EvaluationError of others."""
-    outputs = [str(each.name) for each in loaded.graph.outputs]
-    if not set(outputs) & set(dump.names):
-        raise EvaluationError(
-            f"{dump.path}: answers {', '.join(dump.names)}; {path} gives"
-            f" {', '.join(outputs)}: the dump is of another graph"
-        )
-    made = {value.name for node in loaded.graph for value in node.outputs}
-    known = {*made, *outputs}
-    if unknown := [each for each in dump.names if each not in known]:
-        raise EvaluationError(
-            f"{dump.path}: {unknown[0]} is no tensor of {path}, whose outputs"
-            f" are {', '.join(outputs)}"
-        )
-    lacking = [each for each in outputs if each not in dump.names]
-    return (f"not dumped: {', '.join(lacking)}",) if lacking else ()
-
-
-def _state_text(run: EngineRun) -> str:
-    """Describe whose recurrent state the graph reads."""
-    pairs = run.session.recurrent
-    own = [name for name, output in pairs.items() if output not in run.names]
-    if not pairs:
-        return "none"
-    return f"of our own run: {', '.join(own)}" if own else "the engine's own"

@@ -41,20 +41,22 @@ _FOR_ALL = ("evaluator", "force")
 
 
 def drive_of(options: EvaluateOptions, evaluator: Evaluator) -> Drive:
-    """Read the words, for an evaluator that must take what they ask for.
+    """Parse options into a drive, for an evaluator that must take them.
 
     Raises:
         EvaluationError: An option is invalid, or not the evaluator's.
     """
-    usual, provider = EvaluateOptions(), options.runs_on
+    # Options that differ from the defaults must be the evaluator's
+    defaults, provider = EvaluateOptions(), options.runs_on
     for field in dataclasses.fields(options):
         name = field.name
-        asked = getattr(options, name) != getattr(usual, name)
+        asked = getattr(options, name) != getattr(defaults, name)
         if name == "provider":
             asked = provider != CPU
         if asked and name not in _FOR_ALL:
             flag = _FLAGS.get(name, name.replace("_", "-"))
             evaluator.check_takes([_ABILITIES.get(name, name)], f"--{flag}: ")
+    # Routes, weather, latency and workers
     routes: Sequence[RouteInfo] = ()
     set_size = 0
     if "routes" in evaluator.takes:
@@ -122,7 +124,7 @@ def evaluate(
         MissingExtraError: Driving in highway-env needs the extra ``highway``.
     """
     options, output = options or EvaluateOptions(), Path(output)
-    # every word is read before anything is written
+    # Every option is parsed before anything is written
     evaluator = evaluator_named(options.evaluator)
     drives = "policy" in evaluator.takes
     if policy is None and drives:
@@ -131,50 +133,39 @@ def evaluate(
         )
     if policy is not None and not drives:
         raise EvaluationError(f"{evaluator.name} drives no policy: leave out {policy}")
-    # a trace that is no file is harmless here
+    # The folder must be none of the inputs; a trace that is no file is harmless
     trace = options.latency.removeprefix("trace:")
     read = (policy, str(options.routes), trace, options.adapter, options.module_map)
-    values = [getattr(evaluator, each.name) for each in options_of(type(evaluator))]
-    files = [value for value in values if isinstance(value, Path)]
+    own = [getattr(evaluator, option.name) for option in options_of(type(evaluator))]
+    files = [value for value in own if isinstance(value, Path)]
     check_folder(output, (*read, *files), (MANIFEST,))
     with writing([log_beside(output)], folders=[output], force=options.force):
-        return _drive(evaluator, policy, output, options, listener)
-
-
-def _drive(
-    evaluator: Evaluator,
-    policy: str | Path | None,
-    output: Path,
-    options: EvaluateOptions,
-    listener: Listener,
-) -> EvaluateResult:
-    """Drive the routes that are left, score all, and draw the one that is asked for."""
-    drive = drive_of(options, evaluator)
-    pictured: Sequence[RouteInfo] = ()
-    if options.render is not None:  # of those that are driven; it reads their ids alone
-        pictured = pick_routes(cast("Sequence[Route]", drive.routes), options.render)
-    # find the driver, and open its graph in a process of its own first
-    driver = None
-    if policy is not None:
-        driver = driver_of(str(policy), options)
-    if isinstance(driver, OnnxDriver):
-        file = driver.path
-        try_first(file, file.name, listener=listener, provider=options.runs_on)
-    # drive, or go on where an earlier run stopped
-    episodes = drive_routes(evaluator, driver, drive, output, listener)
-    # score over the whole set, though only a part of it was asked for
-    set_size = max(drive.set_size or evaluator.set_size, len(episodes))
-    scores = score_episodes(episodes, set_size)
-    pictures = tuple(
-        file
-        for route in pictured
-        if driver is not None
-        for file in evaluator.render(driver, drive, route, output)
-    )
-    late = charged(episodes, measured=drive.latency.measured)
-    slow = None
-    if isinstance(driver, OnnxDriver):
-        slow = slow_here(graph.load(driver.path), options.runs_on)
+        drive = drive_of(options, evaluator)
+        pictured: Sequence[RouteInfo] = ()
+        if options.render is not None:  # of those that are driven, by their ids
+            known = cast("Sequence[Route]", drive.routes)
+            pictured = pick_routes(known, options.render)
+        # Find the driver, and open its graph in a process of its own first
+        driver, slow = None, None
+        if policy is not None:
+            driver = driver_of(str(policy), options)
+        if isinstance(driver, OnnxDriver):
+            provider, file = options.runs_on, driver.path
+            try_first(file, file.name, listener=listener, provider=provider)
+        # Drive, or go on where an earlier run stopped
+        episodes = drive_routes(evaluator, driver, drive, output, listener)
+        # Score over the whole set, though only a part of it was asked for
+        set_size = max(drive.set_size or evaluator.set_size, len(episodes))
+        scores = score_episodes(episodes, set_size)
+        pictures = tuple(
+            file
+            for route in pictured
+            if driver is not None
+            for file in evaluator.render(driver, drive, route, output)
+        )
+        late = charged(episodes, measured=drive.latency.measured)
+        if isinstance(driver, OnnxDriver):
+            slow = slow_here(graph.load(driver.path), options.runs_on)
     name = evaluator.name if policy is None else str(policy)
     return EvaluateResult(name, output, scores, pictures, late, slow)
 
@@ -214,13 +205,12 @@ class ModelCheck(Result):
 
     def view(self) -> View:
         """Return every port of the graph, and whether it could drive."""
-        ports = [("input", each) for each in self.inputs]
-        ports += [("output", each) for each in self.outputs]
         rows = list[tuple[str, ...]]()
-        for kind, each in ports:
-            shape = str([side or "?" for side in each.shape]).replace("'", "")
-            use = each.problem or each.use or "-"
-            rows.append((kind, each.name, shape, each.type, use))
+        for kind, ports in (("input", self.inputs), ("output", self.outputs)):
+            for port in ports:
+                shape = str([side or "?" for side in port.shape]).replace("'", "")
+                use = port.problem or port.use or "-"
+                rows.append((kind, port.name, shape, port.type, use))
         columns = ("", "name", "shape", "type", "fed by, or used as")
         tables = [table(self.policy, columns, rows, words=5)] if rows else []
         if not self.problems:
@@ -267,8 +257,8 @@ def check_model(
     recurrent = recurrent_of(session, read)
     inputs = input_uses(session, read, recurrent)
     outputs, unread = output_uses(session, read, recurrent)
-    # problems are listed once each; only a model without any is run
-    texts = [*(each.problem for each in inputs), unread]
+    # Problems are listed once each; only a model without any is run
+    texts = [*(port.problem for port in inputs), unread]
     problems = dict.fromkeys(filter(None, texts))
     if not problems:
         try:

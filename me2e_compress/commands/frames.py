@@ -110,16 +110,37 @@ def _record(
     # frames come from a log, or from the shipped driver's driving
     about: dict[str, str | int] = {"stack": str(source)}
     if log is not None:
-        count, length, provider = options.count, options.scene_length, options.runs_on
-        request = LogRequest(model, count, length, adapter, provider)
+        request = LogRequest(
+            model, options.count, options.scene_length, adapter, options.runs_on
+        )
         frames_from: Source = partial(log.frames, request)
         pixels, about["log"] = log.pixels(request), LOGS.text(log)
     else:
         try_first(model, model.name, listener=listener, provider=options.runs_on)
         metadata = adapted(load(model), None, options.module_map)
         digests += f" {metadata}" if metadata else ""
-        frames_from = _drive_source(model, adapter, metadata, options)
         about["seed"] = options.seed
+        # The driver drives, and the policy says how the model reads the world
+        require_extra("highway", "recording frames of a driver")
+        from me2e_compress.evaluators.highway.driven_frames import driven_frames
+
+        loaded = None if adapter is None else Adapter.load(adapter)
+        policy = OnnxPolicy.open(model, loaded, options.runs_on, metadata=metadata)
+        driver = OnnxPolicy.open(shipped_model("highway"))
+        length = options.scene_length
+
+        def drive(begin: Begin) -> Iterator[Frame]:
+            return driven_frames(
+                policy,
+                driver,
+                options.count,
+                seed=options.seed,
+                scene_length=DRIVEN_SCENE_LENGTH if length is None else length,
+                done=begin.frame,
+                first=begin.place,
+            )
+
+        frames_from = drive
 
     def with_progress(begin: Begin) -> Iterator[Frame]:
         for frame in frames_from(begin):
@@ -129,28 +150,3 @@ def _record(
 
     key = f"{__version__} {digests} {options.count} {options.scene_length}"
     return write_recording(folder, with_progress, about, key, pixels)
-
-
-def _drive_source(
-    model: Path,
-    adapter: Path | None,
-    metadata: Mapping[str, str],
-    options: FramesOptions,
-) -> Source:
-    """Return what drives the shipped driver and yields the model's inputs."""
-    require_extra("highway", "recording frames of a driver")
-    from me2e_compress.evaluators.highway.driven_frames import driven_frames
-
-    loaded = None if adapter is None else Adapter.load(adapter)
-    policy = OnnxPolicy.open(model, loaded, options.runs_on, metadata=metadata)
-    driver = OnnxPolicy.open(shipped_model("highway"))
-    length = options.scene_length
-    return lambda begin: driven_frames(
-        policy,
-        driver,
-        options.count,
-        seed=options.seed,
-        scene_length=DRIVEN_SCENE_LENGTH if length is None else length,
-        done=begin.frame,
-        first=begin.place,
-    )

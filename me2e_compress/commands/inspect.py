@@ -97,9 +97,19 @@ class InspectResult(Result):
             )
             for item in self.modules
         ]
-        # notes below the tables: placement, total MACs, recurrence
+        # All MACs, or why some are unknown
+        total = format_gmacs(self.macs, 0, ".3f")
+        if self.unknown_macs_nodes:
+            at_least = "" if self.macs is None else f"at least {total}, "
+            types = [f"{count} {op_type}" for op_type, count in self.uncounted.items()]
+            why = ", ".join(types[:_SHOWN]) + (", ..." if len(types) > _SHOWN else "")
+            if self.open_dimensions:
+                why += f"; --set-dim NAME=SIZE for {', '.join(self.open_dimensions)}"
+            nodes = plural(self.unknown_macs_nodes, "node")
+            total = f"{at_least}{nodes} not counted: {why}"
+        # Notes below the tables: placement and recurrence
         rules = ", ".join(f"{count} by {rule}" for rule, count in self.rules.items())
-        note = f"nodes placed: {rules}\nGMACs in all: {self._total_macs()}"
+        note = f"nodes placed: {rules}\nGMACs in all: {total}"
         pairs = [f"{to} as {name}" for name, to in self.recurrent.items()]
         back = f"fed back: {', '.join(pairs)}" if pairs else ""
         weights = self.weights and f"weights: {self.weights}"
@@ -112,19 +122,6 @@ class InspectResult(Result):
             ),
             filter(None, (self.hint, headline, weights)),
         )
-
-    def _total_macs(self) -> str:
-        total = format_gmacs(self.macs, 0, ".3f")
-        if not self.unknown_macs_nodes:
-            return total
-        known = "" if self.macs is None else f"at least {total}, "
-        types = [f"{count} {op_type}" for op_type, count in self.uncounted.items()]
-        why = ", ".join(types[:_SHOWN]) + (", ..." if len(types) > _SHOWN else "")
-        ways = ""
-        if self.open_dimensions:
-            ways = f"; --set-dim NAME=SIZE for {', '.join(self.open_dimensions)}"
-        nodes = plural(self.unknown_macs_nodes, "node")
-        return f"{known}{nodes} not counted: {why}{ways}"
 
 
 _SHAPES = "import-normalize,fold-constants{through_compute=false}"
@@ -150,7 +147,8 @@ def inspect(model: str | Path, options: InspectOptions | None = None) -> Inspect
     items = itemise(loaded, modules, placed.module_of)
     # MACs need shapes, and folded shape arithmetic
     folded = _fold_shapes(loaded, modules)
-    costs = {item.module: item for item in _module_costs(folded, modules)}
+    weighed = itemise(folded, modules, provenance.module_of, macs_counter(folded))
+    costs = {item.module: item for item in weighed}
     items = tuple(
         dataclasses.replace(
             item, macs=cost.macs, unknown_macs_nodes=cost.unknown_macs_nodes
@@ -192,7 +190,8 @@ def inspect(model: str | Path, options: InspectOptions | None = None) -> Inspect
 
 def weigh(model: ir.Model, modules: ModuleMap) -> tuple[Item, ...]:
     """Return nodes, bytes and MACs by module, after shape arithmetic is folded."""
-    return _module_costs(_fold_shapes(model, modules), modules)
+    folded = _fold_shapes(model, modules)
+    return itemise(folded, modules, provenance.module_of, macs_counter(folded))
 
 
 def _fold_shapes(model: ir.Model, modules: ModuleMap) -> ir.Model:
@@ -202,7 +201,3 @@ def _fold_shapes(model: ir.Model, modules: ModuleMap) -> ir.Model:
         model = manager.run(model, Context(modules)).model
     graph.infer_shapes(model)
     return model
-
-
-def _module_costs(model: ir.Model, modules: ModuleMap) -> tuple[Item, ...]:
-    return itemise(model, modules, provenance.module_of, macs_counter(model))

@@ -33,7 +33,7 @@ from me2e_compress.targets.tensorrt.rtx_check import BuildResult, check
 
 @dataclasses.dataclass(frozen=True)
 class RuleSummary:
-    """What one rule found: in how many nodes, the first of them, and what of it."""
+    """Findings of one rule: number of nodes, and the first of them."""
 
     severity: Severity
     rule: str
@@ -68,7 +68,7 @@ class LintResult(Result):
 
     def _first(self, severity: Severity, what: str) -> str | None:
         """Return the count of a severity's findings and the first; None without any."""
-        matches = [each for each in self.findings if each.severity == severity]
+        matches = [e for e in self.findings if e.severity == severity]
         if not matches:
             return None
         first, noun = matches[0], "error" if severity == "error" else "finding"
@@ -82,16 +82,17 @@ class LintResult(Result):
 
         A note counts the others; lines say what TensorRT-RTX answers.
         """
-        # a rule that fails everywhere would bury the others
+        # A rule that fails everywhere would bury the others
         rows, more, shown = list[tuple[str, ...]](), list[str](), None if every else 3
         for row in self.summary():
             key = row.severity, row.rule
-            own = [each for each in self.findings if (each.severity, each.rule) == key]
-            rows += [(*key, each.node, each.message) for each in own[:shown]]
+            own = [e for e in self.findings if (e.severity, e.rule) == key]
+            rows += [(*key, finding.node, finding.message) for finding in own[:shown]]
             if shown is not None and row.nodes > shown:
                 more.append(f"{row.severity} {row.rule}: {row.nodes - shown} more")
         columns = ("", "rule", "node", "what")
         findings = table("Findings", columns, rows, "\n".join(more), words=4)
+        # What TensorRT-RTX answers
         answer = list[str]()
         if (build := self.build) is not None:
             built = "built" if build.built else "not built"
@@ -117,12 +118,12 @@ class LintResult(Result):
     @property
     def headline(self) -> str:
         """The number of findings of each severity, by our own rules and tables."""
-        counts = Counter(each.severity for each in self.findings)
+        counts = Counter(finding.severity for finding in self.findings)
         always = ("error", "warning")
         parts = [
-            plural(counts[each], each) if each in always else f"{counts[each]} {each}"
-            for each in SEVERITIES
-            if counts[each] or each in always
+            plural(counts[name], name) if name in always else f"{counts[name]} {name}"
+            for name in SEVERITIES
+            if counts[name] or name in always
         ]
         asked = self.options.target, self.options.target_version
         runtime = " ".join(filter(None, asked))
@@ -134,8 +135,8 @@ class LintResult(Result):
     def summary(self) -> tuple[RuleSummary, ...]:
         """Return one row per severity and rule, in the order of the findings."""
         rows: dict[tuple[Severity, str], list[LintFinding]] = {}
-        for each in self.findings:
-            rows.setdefault((each.severity, each.rule), []).append(each)
+        for finding in self.findings:
+            rows.setdefault((finding.severity, finding.rule), []).append(finding)
         return tuple(
             RuleSummary(*key, len(of_rule), of_rule[0].node, of_rule[0].message)
             for key, of_rule in rows.items()
@@ -167,9 +168,9 @@ def lint(
     target, provider = _target_of(options), options.runs_on
     findings = target.lint(loaded)
     if provider.native != CPU.native:  # the list of kernels is the CPU's
-        findings = tuple(each for each in findings if each.rule != "kernel")
-    # a graph that the rules refuse is not opened
-    if not any(each.severity == "error" for each in findings):
+        findings = tuple(e for e in findings if e.rule != "kernel")
+    # A graph that the rules refuse is not opened
+    if not any(finding.severity == "error" for finding in findings):
         if target.opens:
             try_first(loaded, path.name, listener=listener, provider=provider)
         findings = worst_first((*findings, *target.read_back(loaded, provider)))
@@ -207,7 +208,7 @@ def lint_written(
 
     Nothing is opened. `asked` is the target that the user named, if any.
     """
-    targets = [each.target for each in passes if isinstance(each, QuantizeInt8)]
+    targets = [step.target for step in passes if isinstance(step, QuantizeInt8)]
     if not targets:
         return None
     options = LintOptions(target=targets[-1])

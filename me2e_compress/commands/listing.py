@@ -1,4 +1,4 @@
-"""What can be named, and what this machine can do."""
+"""Names of everything that can be chosen, and abilities of this machine."""
 
 import contextlib
 import dataclasses
@@ -62,7 +62,7 @@ class ListResult(Result):
 
     def view(self) -> View:
         """Return a table of each kind: names, descriptions and options."""
-        headline = ", ".join(f"{len(each)} {kind}" for kind, each in self.kinds.items())
+        headline = ", ".join(f"{len(e)} {kind}" for kind, e in self.kinds.items())
         tables, by = list[Table](), "other packages add theirs by entry point: "
         for kind, entries in self.kinds.items():
             rows = list[tuple[str, str]]()
@@ -70,13 +70,13 @@ class ListResult(Result):
                 theirs = "" if entry.source == _OURS else f" ({entry.source})"
                 about = entry.error or f"{entry.doc}{theirs}".replace("`", "")
                 rows.append((entry.name, about))
-                # then the options: closely on rows of their own, else on one
+                # Then the options: closely on rows of their own, else on one
                 words = list[str]()
-                for each in entry.options:
+                for option in entry.options:
                     gap = " = " if self.closely else "="
-                    default = "" if each.default is None else f"{gap}{each.default}"
-                    text = f"{each.name}: {each.type}{default} {each.doc}"
-                    words.append(text if self.closely else f"{each.name}{default}")
+                    default = "" if option.default is None else f"{gap}{option.default}"
+                    text = f"{option.name}: {option.type}{default} {option.doc}"
+                    words.append(text if self.closely else f"{option.name}{default}")
                 if words and not self.closely:
                     words = [", ".join(words)]
                 rows += [("", text.replace("`", "")) for text in words]
@@ -188,51 +188,46 @@ def doctor() -> DoctorResult:
     """Look for everything that the toolkit can make use of."""
     memory = psutil.virtual_memory().total / 2**30
     enough = "" if memory >= 6 else "VAD-tiny needs 6 GiB to calibrate"
-    machine = (
+    checkups = [
         Checkup("cores", str(os.cpu_count())),
         Checkup("memory", f"{memory:.1f} GiB", enough),
         Checkup("platform", platform.platform()),
         Checkup("onnxruntime on", ", ".join(onnxruntime.get_available_providers())),
-    )
-    packages = [Checkup(name, version) for name, version in versions().items()]
+    ]
+    # Packages, ours and optional ones
+    checkups += [Checkup(name, version) for name, version in versions().items()]
     for module, extra, purpose in _EXTRAS:
-        if importlib.util.find_spec(module) is None:
-            advice = f"{purpose}: pip install 'me2e-compress[{extra}]'"
-            packages.append(Checkup(module, None, advice))
-            continue
-        version = "of unknown version"
-        with contextlib.suppress(importlib.metadata.PackageNotFoundError):
-            version = importlib.metadata.version(module.replace("_", "-"))
-        packages.append(Checkup(module, version))
-    # compiled kernels, or why there are none
-    why, names = why_not(), ", ".join(each.op_type for each in KERNELS)
+        version, advice = None, f"{purpose}: pip install 'me2e-compress[{extra}]'"
+        if importlib.util.find_spec(module) is not None:
+            version, advice = "of unknown version", ""
+            with contextlib.suppress(importlib.metadata.PackageNotFoundError):
+                version = importlib.metadata.version(module.replace("_", "-"))
+        checkups.append(Checkup(module, version, advice))
+    # Compiled kernels, or why there are none
+    why, names = why_not(), ", ".join(kernel.op_type for kernel in KERNELS)
     advice = f"fused operators run as their bodies: {why}" if why else ""
-    kernels = Checkup("compiled kernels", None if why else names, advice)
-    return DoctorResult((*machine, *packages, kernels, _check_gpu(), _check_energy()))
-
-
-def _check_energy() -> Checkup:
-    counter = open_counter()
-    if isinstance(counter, Absent):
-        advice = f"joules are not measured here: {counter.reason}"
-        return Checkup("energy counter", None, advice)
-    if isinstance(counter, EnergyRecording):
-        return Checkup("energy counter", counter.counter)
-    with contextlib.closing(counter):
-        what = f"{counter.counter} of {counter.device}: {counter.scope}"
-        return Checkup("energy counter", what)
-
-
-def _check_gpu() -> Checkup:
-    # a driver without a GPU fails later than a missing driver
+    checkups.append(Checkup("compiled kernels", None if why else names, advice))
+    # A GPU: a driver without one fails later than a missing driver
+    gpu, advice = None, ""
     try:
         pynvml.nvmlInit()
+        try:
+            gpu = str(pynvml.nvmlDeviceGetName(pynvml.nvmlDeviceGetHandleByIndex(0)))
+        except pynvml.NVMLError as error:
+            advice = f"the driver answers: {error}"
+        finally:
+            pynvml.nvmlShutdown()
     except pynvml.NVMLError as error:
-        return Checkup("NVIDIA GPU", None, f"no GPU is used ({error})")
-    try:
-        handle = pynvml.nvmlDeviceGetHandleByIndex(0)
-        return Checkup("NVIDIA GPU", str(pynvml.nvmlDeviceGetName(handle)))
-    except pynvml.NVMLError as error:
-        return Checkup("NVIDIA GPU", None, f"the driver answers: {error}")
-    finally:
-        pynvml.nvmlShutdown()
+        advice = f"no GPU is used ({error})"
+    checkups.append(Checkup("NVIDIA GPU", gpu, advice))
+    # A counter of energy, on the device or recorded
+    counter, scope, advice = open_counter(), None, ""
+    if isinstance(counter, Absent):
+        advice = f"joules are not measured here: {counter.reason}"
+    elif isinstance(counter, EnergyRecording):
+        scope = counter.counter
+    else:
+        with contextlib.closing(counter):
+            scope = f"{counter.counter} of {counter.device}: {counter.scope}"
+    checkups.append(Checkup("energy counter", scope, advice))
+    return DoctorResult(tuple(checkups))

@@ -70,7 +70,7 @@ class PreparedGraph:
         PreconditionError.
         """
         chosen = tuple(recipe.load("exact") if passes is None else passes)
-        readers = (each for each in chosen if isinstance(each, Quantizer))
+        readers = (step for step in chosen if isinstance(step, Quantizer))
         reader = next(readers, None)
         at = None if reader is None else chosen.index(reader)
         # what a plan quantized may only be rewritten, not quantized again
@@ -139,12 +139,14 @@ class PlanResult(Result):
         tables = list(self.plan.tables())
         if not every:
             return View(self.plan.headline, tables, lines)
+        # A row a node that could be int8, then the Concats of one scale
         rows = list[tuple[str, str]]()
-        for each in self.plan.decisions:
-            if each.could_be_int8:
-                of_module = f" of {each.module}" if each.module else ""
-                why = f"{each.dtype} by {each.rule}, {each.reason}"
-                rows.append((each.node or each.output, f"{each.op}{of_module}: {why}"))
+        for decision in self.plan.decisions:
+            if decision.could_be_int8:
+                of_module = f" of {decision.module}" if decision.module else ""
+                why = f"{decision.dtype} by {decision.rule}, {decision.reason}"
+                name = decision.node or decision.output
+                rows.append((name, f"{decision.op}{of_module}: {why}"))
         what = ("node", "what, by which rule, why")
         tables.append(table("Decisions", what, rows, words=2))
         groups = [
@@ -180,43 +182,36 @@ def plan(
     written = None if output is None else Path(output)
     inputs = (source, options.overrides, options.module_map)
     with writing([written], inputs, force=options.force):
-        # a file is a plan, carries one, or is a float graph to plan
-        read = _read_file(source)
-        if isinstance(read, QuantPlan):
-            # options that would change nothing
+        # A file is a plan, carries one, or is a float graph to plan
+        is_plan = source.suffix == ".json"
+        loaded = None if is_plan else load_graph(source)
+        known = load_plan(source) if loaded is None else plan_of(loaded)
+        if known is not None:
+            # Options that would change nothing
             names = ("overrides", "scheme", "rules", "target")
-            if option := next((each for each in names if getattr(options, each)), None):
+            if option := next((name for name in names if getattr(options, name)), None):
                 raise RecipeError(
                     f"--{option} is for a plan that is yet to be made, and {source} has"
                     " its own: give the float model"
                 )
-            result = PlanResult(read)
+            result = PlanResult(known)
         else:
-            result = _plan(source, read, options)
+            assert loaded is not None
+            # Plan the graph after the exact passes
+            quantizer = QuantizeInt8(
+                scheme=options.scheme or "full",
+                rules=options.rules or DEFAULT_RULES,
+                target=options.target or DEFAULT_TARGET,
+                overrides=None
+                if options.overrides is None
+                else Path(options.overrides),
+            )
+            adapted(loaded, None, options.module_map or map_name(source))
+            ready = PreparedGraph.of(source, loaded, options.module_map)
+            decided = quantizer.plan(ready.model, Context(ready.modules))
+            TARGETS.parse(quantizer.target).check_types(decided, ready.model)
+            hints = filter(None, (shortcomings(loaded), advice(loaded)))
+            result = PlanResult(decided, "; ".join(hints))
         if written is not None:
             save_plan(result.plan, written)
     return result
-
-
-def _read_file(path: Path) -> QuantPlan | ir.Model:
-    """Read the plan that a file is or carries, else its graph."""
-    if path.suffix == ".json":
-        return load_plan(path)
-    model = load_graph(path)
-    return plan_of(model) or model
-
-
-def _plan(file: Path, model: ir.Model, options: PlanOptions) -> PlanResult:
-    """Plan a float graph after the exact passes."""
-    quantizer = QuantizeInt8(
-        scheme=options.scheme or "full",
-        rules=options.rules or DEFAULT_RULES,
-        target=options.target or DEFAULT_TARGET,
-        overrides=None if options.overrides is None else Path(options.overrides),
-    )
-    adapted(model, None, options.module_map or map_name(file))
-    ready = PreparedGraph.of(file, model, options.module_map)
-    decided = quantizer.plan(ready.model, Context(ready.modules))
-    TARGETS.parse(quantizer.target).check_types(decided, ready.model)
-    hints = filter(None, (shortcomings(model), advice(model)))
-    return PlanResult(decided, "; ".join(hints))

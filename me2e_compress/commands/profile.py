@@ -55,7 +55,7 @@ class ProfileResult(Result):
 
     @property
     def deadlines(self) -> Deadlines:
-        """The samples held against the budget."""
+        """The samples compared with the budget."""
         return deadlines(self.trace.samples_us, self.budget_ms)
 
     def view(self) -> View:
@@ -73,16 +73,16 @@ class ProfileResult(Result):
             *modules,
             *(() if energy is None else energy.tables()),
         ]
-        # of many operators the first are shown, with a note on the others
+        # Of many operators the first are shown, with a note on the others
         if self.operators_us:
             rest = len(self.operators_us) - _SHOWN
-            every = shares_table(
-                "By operator, as it runs", "operator", self.operators_us
-            )
+            title = "By operator, as it runs"
+            every = shares_table(title, "operator", self.operators_us)
             more = f"{rest} more operators: --json" if rest > 0 else ""
             note = "; ".join(filter(None, (every.note, more)))
-            few = dataclasses.replace(every, rows=every.rows[:_SHOWN], note=note)
-            tables.append(few)
+            rows = every.rows[:_SHOWN]
+            tables.append(dataclasses.replace(every, rows=rows, note=note))
+        # How far the last percentile can be trusted, and what disturbed the times
         joules = "" if energy is None else energy.headline
         lines = [*filter(None, [self.known, joules])]
         count, needed = len(self.trace.samples_us), 100 * BEYOND_P99
@@ -100,6 +100,7 @@ class ProfileResult(Result):
     def to_json(self) -> object:
         """Return the trace, deadlines, shares, joules, and how busy the machine was."""
         load = self.trace.others
+        nobody = {"others_cores": None, "cores": None}
         return {
             **self.trace.to_json(),
             "deadlines": self.deadlines,
@@ -108,11 +109,7 @@ class ProfileResult(Result):
             "energy": self.energy,
             "slow_here": self.slow_here,
             "known": self.known,
-            **(
-                {"others_cores": None, "cores": None}
-                if load is None
-                else load.to_json()
-            ),
+            **(nobody if load is None else load.to_json()),
         }
 
 
@@ -157,6 +154,7 @@ def profile(
                 on_sample=listener.counting("profile", "inferences"),
             )  # fmt: skip
         trace = dataclasses.replace(trace, others=others.load)
+        # By module and operator, under a profiler
         operators: Microseconds = {}
         if options.by_module:
             placed = assign(loaded, load_map(options.module_map, loaded))
@@ -167,6 +165,7 @@ def profile(
             )  # fmt: skip
             trace = dataclasses.replace(trace, modules_us=parts.modules_us)
             operators = parts.operators_us
+        # Joules, over windows of many inferences
         energy, windows = None, listener.counting("energy", "windows")
         if options.energy is not None:
             energy = measure_energy(
@@ -181,7 +180,10 @@ def profile(
             if energy is not None and joules is not None:
                 energy.save(joules)
     return ProfileResult(
-        *(source, trace, written, operators),
+        source,
+        trace,
+        written,
+        operators,
         energy=energy,
         energy_output=joules,
         budget_ms=options.budget_ms,

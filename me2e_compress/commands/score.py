@@ -7,15 +7,16 @@ from pathlib import Path
 from me2e_compress.base.display import (
     Table,
     format_number,
+    format_significant,
     join_names,
     missing_note,
+    plural,
     table,
 )
 from me2e_compress.base.errors import EvaluationError
 from me2e_compress.base.listener import SILENT, Listener
-from me2e_compress.commands.options import check_number
+from me2e_compress.commands.options import Joules, check_number
 from me2e_compress.commands.result import Result, View
-from me2e_compress.commands.score_eer import EerScores, estimate_cells, score_eer
 from me2e_compress.evaluators.bench2drive.real_results import (
     Bench2DriveResults,
     CollectedResults,
@@ -25,16 +26,22 @@ from me2e_compress.evaluators.results import MANIFEST, ResultsFolder
 from me2e_compress.metrics import BUDGET_MS
 from me2e_compress.metrics import scores as metrics
 from me2e_compress.metrics.deadlines import Deadlines, charged, deadlines_table
+from me2e_compress.metrics.eer import MEASURES, EerResult, eer, route_measures
 from me2e_compress.metrics.episode import Episode
 from me2e_compress.metrics.measure import Estimate
+from me2e_compress.metrics.route_summary import RouteSummary
 from me2e_compress.metrics.scores import (
     LeaderboardScores,
     Quotients,
     Scores,
     leaderboard_scores,
 )
+from me2e_compress.runtime.energy import EnergyResult
 
-_NAMED = 5
+_NAMED = 5  # notes of a real run that are shown
+UNITS = ("%", "%", "ratio", "J")  # of `MEASURES`
+# Why a route is left out, listed beside the measures that may be missing
+UNPAIRED = "a drive in each"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -51,6 +58,7 @@ class RealRun:
 
         Each figure is shown over the whole set, and over what was driven.
         """
+        # Routes by what happened to their records
         collected, off_rate = self.collected, self.collected.off_rate
         broken, lists = tuple(collected.broken), self._route_lists()
         counts = [
@@ -70,13 +78,11 @@ class RealRun:
         ]
         rows = list[tuple[str, ...]]()
         for label, key, unit in figures:
-            both = [
-                each.get(key, Quotients()) for each in (board.given, board.computed)
-            ]
+            both = [one.get(key, Quotients()) for one in (board.given, board.computed)]
             if unit == "%":  # a missing route has no penalty
-                values = [format_number(each.set, ".4f") for each in both]
+                values = [format_number(quotient.set, ".4f") for quotient in both]
                 rows.append((label, "set", *values, str(board.set_size), unit))
-            values = [format_number(each.driven, ".4f") for each in both]
+            values = [format_number(quotient.driven, ".4f") for quotient in both]
             rows.append((label, "driven", *values, str(board.driven), unit))
         real = f"{name}: real runs, Bench2Drive's routes"
         words = "given by the simulator, and computed with Bench2Drive's penalties"
@@ -125,29 +131,16 @@ class RealRun:
         }
 
     def _route_lists(self) -> dict[str, Sequence[str]]:
-        names = (
-            *("crashed", "missing", "foreign", "repeated", "rerun"),
-            *("contradictory", "unrecorded"),
-        )
-        return {name: getattr(self.collected, name) for name in names}
-
-
-def score_real_run(
-    path: Path, metric_folder: Path | None = None, routes: Path | None = None
-) -> RealRun:
-    """Read and score the results of a real run.
-
-    `metric_folder` holds recordings (``metric_info.json``) that do not lie below that
-    of the results; `routes` is the routes file of a set of one's own.
-    """
-    collected = Bench2DriveResults(path, metric_folder, routes).collect()
-    episodes = collected.episodes
-    set_size = collected.set_size * collected.repetitions
-    return RealRun(
-        collected,
-        metrics.score(episodes, set_size),
-        leaderboard_scores(episodes, set_size),
-    )
+        collected = self.collected
+        return {
+            "crashed": collected.crashed,
+            "missing": collected.missing,
+            "foreign": collected.foreign,
+            "repeated": collected.repeated,
+            "rerun": collected.rerun,
+            "contradictory": collected.contradictory,
+            "unrecorded": collected.unrecorded,
+        }
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
@@ -158,7 +151,7 @@ class ScoreResult(Result):
     # details of the folders that hold real runs
     real: Mapping[str, RealRun] = dataclasses.field(default_factory=dict)
     # EER_AV of all of them together; None where it was not asked for
-    eer: EerScores | None = None
+    eer: EerResult | None = None
     # decision times against a budget, of folders whose decisions cost time
     late: Mapping[str, Deadlines] = dataclasses.field(default_factory=dict)
 
@@ -179,18 +172,19 @@ class ScoreResult(Result):
         headline = "; ".join(
             f"{name}: {driving_score(scores)}" for name, scores in self.scores.items()
         )
-        real = [line for name, each in self.real.items() for line in each.alerts(name)]
-        eer = self.eer
-        return View(
-            headline,
-            (*tables, *(() if eer is None else eer.tables())),
-            () if eer is None else eer.lines(),
-            (*alerts, *real),
-        )
+        for name, run in self.real.items():
+            alerts += run.alerts(name)
+        # EER_AV of all folders, and their order
+        lines = list[str]()
+        if self.eer is not None:
+            tables += _eer_tables(self.eer)
+            if self.eer.scale is not None:
+                lines.append(f"EER_AV, best first: {', '.join(self.eer.ranking)}")
+        return View(headline, tables, lines, alerts)
 
     def to_json(self) -> object:
         """Return the scores of every folder, and EER_AV of all together."""
-        collected = [
+        folders = [
             {
                 "results": name,
                 **self.real.get(name, scores).to_json(),
@@ -198,7 +192,14 @@ class ScoreResult(Result):
             }
             for name, scores in self.scores.items()
         ]
-        return {"folders": collected, "eer": self.eer}
+        if self.eer is None:
+            return {"folders": folders, "eer": None}
+        scale = None
+        if self.eer.scale is not None:
+            columns = dataclasses.asdict(self.eer.scale).items()
+            scale = {name: dict(zip(MEASURES, e, strict=True)) for name, e in columns}
+        eer = {"scores": self.eer.scores, "scale": scale, "left_out": self.eer.left_out}
+        return {"folders": folders, "eer": eer}
 
 
 def score(
@@ -224,14 +225,16 @@ def score(
     check_number("--budget-ms", budget_ms)
     scores, runs = dict[str, Scores](), dict[str, RealRun]()
     driven, measured = dict[str, Sequence[Episode]](), dict[str, int | None]()
-    named = [Path(each) for each in results if Path(each).suffix == ".xml"]
+    named = [path for path in map(Path, results) if path.suffix == ".xml"]
     if len(named) > 1:
         raise EvaluationError(f"{named[1]}: one routes file names the set")
-    # our own results have a manifest; anything else must be a real run
-    for path in (Path(each) for each in results if Path(each) not in named):
+    # Our own results have a manifest; anything else must be a real run
+    for path in (path for path in map(Path, results) if path not in named):
         if (path / MANIFEST).exists():
             folder = ResultsFolder.open(path)
-            driven[str(path)] = _episodes(folder, listener)
+            driven[str(path)] = tuple(folder.episodes().values())
+            for file, reason in folder.corrupt.items():
+                listener.on_warning(f"{file}: {reason}: left out")
             scores[str(path)] = metrics.score(driven[str(path)], folder.set_size)
             measured[str(path)] = folder.measured
             continue
@@ -243,9 +246,13 @@ def score(
                 "records of a leaderboard"
             )
         recordings = None if real_metrics is None else Path(real_metrics)
-        run = score_real_run(path, recordings, *named)
-        scores[str(path)], runs[str(path)] = run.scores, run
-        driven[str(path)] = run.collected.episodes
+        collected = Bench2DriveResults(path, recordings, *named).collect()
+        episodes = collected.episodes
+        set_size = collected.set_size * collected.repetitions
+        scores[str(path)] = metrics.score(episodes, set_size)
+        board = leaderboard_scores(episodes, set_size)
+        runs[str(path)] = RealRun(collected, scores[str(path)], board)
+        driven[str(path)] = episodes
     # it would be ignored without a word
     if real_metrics is not None and not runs:
         raise EvaluationError(
@@ -262,12 +269,90 @@ def score(
     return ScoreResult(scores, runs, score_eer(driven, joules or {}), late)
 
 
-def _episodes(folder: ResultsFolder, listener: Listener) -> tuple[Episode, ...]:
-    """Return a folder's episodes; warn of damaged files."""
-    episodes = tuple(folder.episodes().values())
-    for file, reason in folder.corrupt.items():
-        listener.on_warning(f"{file}: {reason}: left out")
-    return episodes
+def score_eer(
+    folders: Mapping[str, Sequence[Episode]], joules: Joules
+) -> EerResult | None:
+    """Return EER_AV of folders that hold the same routes; None without any joules.
+
+    Only real runs may lack routes, on which CARLA crashed.
+
+    Raises:
+        EvaluationError: Routes differ, or joules are of no folder.
+        EnergyError: A file of joules is not usable.
+    """
+    if not joules:
+        return None
+    # Routes that all folders hold, in the first folder's order
+    by_route = {
+        name: {episode.route: episode for episode in episodes}
+        for name, episodes in folders.items()
+    }
+    first = next(iter(by_route.values()), {})
+    shared = [route for route in first if all(route in e for e in by_route.values())]
+    # Differing routes are an error unless every folder is a real run
+    real = all(episode.given for one in folders.values() for episode in one)
+    for name, own in by_route.items():
+        unpaired = sorted({*own} ^ {*first})
+        if unpaired and not (real and shared):
+            raise EvaluationError(
+                f"{name}: route {unpaired[0]} is in one of the folders only: EER_AV "
+                "compares the same routes"
+            )
+    # Joules of an inference, as a number or of a file
+    measured = dict[str, float | None]()
+    for name, value in joules.items():
+        fitting = [path for path in folders if name in (path, Path(path).name)]
+        if len(fitting) != 1:
+            raise EvaluationError(
+                f"energy of {name}: {plural(len(fitting), 'folder')} of that name;"
+                f" there are {', '.join(folders)}"
+            )
+        if isinstance(value, (str, Path)):
+            measured[fitting[0]] = EnergyResult.load(Path(value)).j_per_frame
+        elif 0.0 <= value < float("inf"):
+            measured[fitting[0]] = value
+        else:
+            raise EvaluationError(
+                f"energy of {name}: {value} is not a number of joules"
+            )
+    # Score the shared routes, and count the others
+    variants = {
+        name: route_measures(
+            [RouteSummary.of(own[route]) for route in shared], measured.get(name)
+        )
+        for name, own in by_route.items()
+    }
+    result = eer(variants, types=[first[route].scenario for route in shared])
+    every = {route for own in by_route.values() for route in own}
+    if others := len(every) - len(shared):
+        left_out = {UNPAIRED: others, **result.left_out}
+        result = dataclasses.replace(result, left_out=left_out)
+    return result
+
+
+def _eer_tables(result: EerResult) -> Iterator[Table]:
+    """Yield the scores of EER_AV, and the weights of its measures."""
+    rows = [[n, *estimate_cells(score, ".2f")] for n, score in result.scores.items()]
+    why = {
+        f"EER_AV of {name}": score.measure.reason
+        for name, score in result.scores.items()
+        if score.value is None
+    }
+    columns = ("results", "EER_AV", "95 %", "95 %, other types", "n")
+    yield table("Driving and energy, points", columns, rows, missing_note(why))
+    if (scale := result.scale) is None:
+        return
+    # A measure is scaled so that its offset is 0 and offset plus span is 1
+    rows = [
+        [name, f"{weight:.3f}", *map(format_significant, (low, low + span)), unit]
+        for name, weight, low, span, unit in zip(
+            MEASURES, scale.weights, scale.offset, scale.span, UNITS, strict=True
+        )
+    ]
+    missing = [f"{n} for want of {name}" for name, n in result.left_out.items()]
+    note = f"Routes left out of all: {', '.join(missing)}." if missing else ""
+    columns = ("measure", "weight", "0 is", "1 is", "unit")
+    yield table("Weights by CRITIC, min-max", columns, rows, note)
 
 
 def driving_score(scores: Scores) -> str:
@@ -277,11 +362,11 @@ def driving_score(scores: Scores) -> str:
     if score.value is None:
         return f"driving score not measured ({score.measure.reason}); {routes}"
     room = scores.safety.room_kept
-    room_text = "" if room.value is None else f", room kept {_interval(room)} %"
-    return f"driving score {_interval(score)}{room_text}; {routes}"
+    room_text = "" if room.value is None else f", room kept {_interval_text(room)} %"
+    return f"driving score {_interval_text(score)}{room_text}; {routes}"
 
 
-def _interval(estimate: Estimate) -> str:
+def _interval_text(estimate: Estimate) -> str:
     low, high = format_number(estimate.low, ".1f"), format_number(estimate.high, ".1f")
     return f"{format_number(estimate.value, '.1f')} ({low} to {high})"
 
@@ -315,3 +400,16 @@ def _each(scores: Scores) -> Iterator[tuple[str, Estimate]]:
     yield "smallest PET", scores.safety.smallest_pet
     yield "smallest distance", scores.safety.smallest_distance
     yield "at-fault collisions", scores.safety.at_fault_collisions
+
+
+def estimate_cells(estimate: Estimate, form: str) -> tuple[str, str, str, str]:
+    """Return a value, its intervals and its number of routes, as a table shows them."""
+
+    def between(low: float | None, high: float | None) -> str:
+        if estimate.value is None or low is None or high is None:
+            return "-"
+        return f"{format_number(low, form)} to {format_number(high, form)}"
+
+    here = between(estimate.low, estimate.high)
+    anew = between(estimate.anew_low, estimate.anew_high)
+    return format_number(estimate.value, form), here, anew, str(estimate.n)

@@ -103,7 +103,7 @@ class TrialFiles:
 
     def write(self, choice: Int8Choice, options: TrialOptions) -> str:
         """Write the recipe, and return a line that says what it makes int8."""
-        before = [each.name for each in recipe.load("exact")]
+        before = [step.name for step in recipe.load("exact")]
         rules = options.rules or DEFAULT_RULES
         target = options.target or DEFAULT_TARGET
         overrides = write_recipe(self.output, choice, before, rules, target)
@@ -125,12 +125,12 @@ class SearchResult(Result):
         """Return the recipe, and what was tried, best first."""
         rows = [
             (
-                ", ".join(each.modules) or "none",
-                format_significant(None if each.score is None else each.score.loss),
-                format_significant(each.loss),
-                *map(format_significant, each.measured_costs or ()),
+                ", ".join(one.modules) or "none",
+                format_significant(None if one.score is None else one.score.loss),
+                format_significant(one.loss),
+                *map(format_significant, one.measured_costs or ()),
             )
-            for each in self.tried
+            for one in self.tried
         ]
         limits = " and ".join(
             f"{format_significant(limit, 6)} {unit}" for unit, limit in self.limits
@@ -172,6 +172,7 @@ def search(
         )
     files = TrialFiles(model_path(model), Path(frames), Path(output))
     with files.claim_outputs(options):
+        # Without a counter there are no joules
         if options.max_joules is not None:
             counter = open_counter()
             if isinstance(counter, Absent):
@@ -191,7 +192,7 @@ def search(
         report = partial(listener.on_progress, "modules")
         tried = find(trials, modules, budgets, progress=report)
         written = files.write(Int8Choice(tried[-1].modules), options)
-    limits = tuple((each.unit, each.limit) for each in budgets)
+    limits = tuple((budget.unit, budget.limit) for budget in budgets)
     return SearchResult(files.output, tried, limits, written)
 
 
@@ -235,18 +236,19 @@ class SensitivityResult(Result):
     def view(self) -> View:
         """Return what int8 costs by module, the nodes to blame, recipe and its loss."""
         sensitivity, unit = self.sensitivity, self.sensitivity.together.unit
+        # A row a module, then the nodes to blame and the recipe
         rows = [
-            (each.module, str(each.nodes), *_cells(each.score))
-            for each in sensitivity.findings
+            (module.module, str(module.nodes), *_cells(module.score))
+            for module in sensitivity.findings
         ]
         rows.append(("together", "", *_cells(sensitivity.together)))
         columns = ("module", "nodes", f"loss {unit}", "worst output, dB")
         size = format_mb(sensitivity.together.weight_bytes)
         note = f"{plural(sensitivity.trials, 'variant')} run; all together {size} MB"
         lines = [
-            f"{each.module}: {node}: {format_significant(alone)} {unit} alone"
-            for each in sensitivity.findings
-            for node, alone in each.blamed
+            f"{module.module}: {node}: {format_significant(alone)} {unit} alone"
+            for module in sensitivity.findings
+            for node, alone in module.blamed
         ]
         lines.append(self.written)
         if self.score is not None:

@@ -209,9 +209,8 @@ class Study:
     """
 
     title: str  # title of the report
-    # In the order of the tables
+    # Variants and conditions are in the order of the tables
     variants: Annotated[tuple[Variant, ...], Field(alias="variant")]
-    # In the order of the tables
     conditions: Annotated[tuple[Condition, ...], Field(alias="condition")]
     baseline: str  # name of the variant that the others are compared with
     # Empty only where the evaluator takes none
@@ -220,7 +219,6 @@ class Study:
     frames: File | None = None  # folder of recorded frames that passes calibrate on
     # Folder of other frames, for measuring fidelity and latency
     held_out: File | None = None
-    # How latencies are measured
     timing: Annotated[Timing, Field(alias="latency")] = field(default_factory=Timing)
     seed: Count = 0  # seed of bootstraps, of passes and of draws from traces
     provider: Provider = CPU  # execution provider for all models

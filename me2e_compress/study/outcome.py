@@ -42,19 +42,20 @@ class Clock:
     load: Load | None = None
 
     def latencies(self, prepared: PreparedVariant) -> dict[int, Measure]:
-        """Return percentiles on the device, ms; None without a trace long enough."""
-        trace = self.traces.get(prepared.name)
-        if prepared.model is None or trace is None:
-            why = self.reason or "not measured"
-            if prepared.model is None:
-                why = prepared.failure or "no model"
-            return dict.fromkeys(LATENCY_PERCENTILES, Measure(None, "ms", why))
-        latencies = dict[int, Measure]()
-        for percent in LATENCY_PERCENTILES:
-            why = too_few(percent, len(trace.samples_us))
-            ms = None if why else self.scale * trace.percentile_us(percent) / 1e3
-            latencies[percent] = Measure(ms, "ms", why)
-        return latencies
+        """Return percentiles of a variant in ms; without a model, the reason."""
+        if prepared.model is None:
+            unknown = Measure(None, "ms", prepared.failure or "no model")
+            return dict.fromkeys(LATENCY_PERCENTILES, unknown)
+        return {p: self.latency(prepared.name, p) for p in LATENCY_PERCENTILES}
+
+    def latency(self, variant: str, percent: float) -> Measure:
+        """Return a percentile on the device, ms; None without enough samples."""
+        if variant not in self.traces:
+            return Measure(None, "ms", self.reason or "not measured")
+        trace = self.traces[variant]
+        if why := too_few(percent, len(trace.samples_us)):
+            return Measure(None, "ms", why)
+        return Measure(self.scale * trace.percentile_us(percent) / 1e3, "ms")
 
     def source(
         self, variant: Variant, condition: Condition, seed: int

@@ -216,8 +216,14 @@ class _Case:
         want = dialect_reference(self.operator, self.dialect, call)
         set_output(node, self.operator, self.dialect)
         shape, kind = node.outputs[0].shape, node.outputs[0].dtype
-        fits = shape is None or _has_shape(tuple(shape), want.shape)
         declared = None if shape is None else list(shape)
+        fits = declared is None or (
+            len(declared) == want.ndim
+            and all(
+                dim == size or not isinstance(dim, int)
+                for dim, size in zip(declared, want.shape, strict=True)
+            )
+        )
         self._require(
             fits, f"the output is said to be {declared}, it is {list(want.shape)}"
         )
@@ -267,10 +273,3 @@ class _Case:
     def _require(self, holds: bool, why: str) -> None:
         call = f"{self.operator.name} in the dialect {self.dialect.name}, opset"
         require(holds, f"{call} {self.opset}: {why}")
-
-
-def _has_shape(declared: tuple[object, ...], shape: tuple[int, ...]) -> bool:
-    return len(declared) == len(shape) and all(
-        dim == size or not isinstance(dim, int)
-        for dim, size in zip(declared, shape, strict=True)
-    )

@@ -25,7 +25,7 @@ from me2e_compress.evaluators.bench2drive.result_files import (
     recordings_of,
 )
 from me2e_compress.evaluators.contract import Drive, Evaluator
-from me2e_compress.metrics.episode import EgoFrame, Episode
+from me2e_compress.metrics.episode import EgoFrame, Episode, InferenceRecord
 from me2e_compress.metrics.scores import FULL_SET
 
 _IDS = json.loads(Path(__file__).with_name("route_ids.json").read_bytes())
@@ -110,7 +110,8 @@ class CollectedResults:
             paths = recordings_of(record, files.recordings, files.results)
             logs = recordings_of(record, files.decisions, files.results)
             others = [path for path in others if path not in paths]
-            frames, decisions = made._frames(record, paths), ()
+            frames = made._frames(record, paths)
+            decisions: tuple[InferenceRecord, ...] = ()
             for path in logs:  # the first whole one
                 try:
                     decisions = read_decisions(path)
