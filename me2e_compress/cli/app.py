@@ -6,7 +6,7 @@ from typing import Annotated
 from cyclopts import App, Group, Parameter
 
 from me2e_compress.base.extras import missing_module
-from me2e_compress.cli import commands, driving
+from me2e_compress.cli import commands
 from me2e_compress.cli.console import printing
 from me2e_compress.version import __version__
 
@@ -74,9 +74,8 @@ def _main_app() -> App:
     root.register_install_completion_command()
     groups = {panel: Group(panel, sort_key=at) for at, panel in enumerate(_PANELS, 1)}
     for at, (name, panel) in enumerate(COMMANDS.items()):
-        # ``list`` is Python's own
-        home = driving if panel == "Drive" else commands
-        function = getattr(home, "list_entries" if name == "list" else name)
+        # `list` is Python's own
+        function = getattr(commands, "list_entries" if name == "list" else name)
         text, _, _ = (inspect.getdoc(function) or "").partition("\n\nArgs:")
         first, *rest = (" ".join(each.split()) for each in text.split("\n\n"))
         if name in _NEED_HIGHWAY and missing_module("highway"):

@@ -1,4 +1,4 @@
-"""Results of commands, the document of `--json`, and who is told of progress."""
+"""Results of commands: their printed form, and the document of `--json`."""
 
 import dataclasses
 import math
@@ -18,34 +18,29 @@ Status = Literal["ok", "warning", "refused"]
 
 @dataclasses.dataclass(frozen=True)
 class View:
-    """What people see of a result: tables, then lines, then alerts in bold."""
+    """The printed form of a result: tables, then lines, then alerts in bold."""
 
-    headline: str  # what it is, in one line
+    headline: str  # the result in one line
     tables: Iterable[Table] = ()
-    # None are the headline alone; empty where a table says everything
+    # None are the headline alone; empty where the tables have everything
     lines: Iterable[str] | None = None
-    alerts: Iterable[str] = ()  # what must not be overlooked
+    alerts: Iterable[str] = ()
     error: Me2eError | None = None  # why the command ends with 1 though it has a result
 
 
 class Result:
-    """The result of a workflow: its data, and by `shown` what is printed of them.
+    """The result of a command: a dataclass of its data, printed by its `view`."""
 
-    One of a single line gives its `headline` alone.
-
-    Class attributes:
-        keys: fields that JSON holds, all by default; those of ``*name`` stand flat.
-    """
-
+    # Fields that JSON has, all by default; those of `*name` stand flat
     keys: ClassVar[tuple[str, ...]] = ()
 
     def view(self) -> View:
-        """Return what is printed; by default the headline alone."""
+        """Return the printed form; by default the headline alone."""
         return View(self.headline)
 
     @property
     def headline(self) -> str:
-        """What it is, in one line."""
+        """The result in one line."""
         return self.view().headline
 
     def __repr__(self) -> str:
@@ -62,7 +57,7 @@ class Result:
         return (self.headline,) if lines is None else tuple(lines)
 
     def alerts(self) -> tuple[str, ...]:
-        """Return what must not be overlooked: printed last, in bold."""
+        """Return the warnings, which are printed last."""
         return tuple(self.view().alerts)
 
     def check(self) -> None:
@@ -72,13 +67,13 @@ class Result:
 
     @property
     def status(self) -> Status:
-        """What a program acts on: ``refused`` where the command's exit code is 1."""
+        """``refused`` where the command's exit code is 1, ``warning`` with alerts."""
         if self.view().error is not None:
             return "refused"
         return "warning" if self.alerts() else "ok"
 
     def to_json(self) -> object:
-        """Return everything, for `plain`: by default what the `keys` hold."""
+        """Return all data, for `plain`: by default the fields that `keys` name."""
         content, own = dict[str, object](), _fields(self)
         for key in self.keys or own:
             name = key.removeprefix("*")
@@ -86,7 +81,7 @@ class Result:
         return content
 
     def document(self) -> dict[str, object]:
-        """Return the ``--json`` document: version, status, the lines shown, everything.
+        """Return the ``--json`` document: version, status, printed lines, all data.
 
         Dataclasses and paths become objects and strings, numbers that are not finite
         null.
@@ -99,7 +94,8 @@ class Result:
 
 
 def _fields(value: Any) -> dict[str, object]:
-    return {each.name: getattr(value, each.name) for each in dataclasses.fields(value)}
+    names = (field.name for field in dataclasses.fields(value))
+    return {name: getattr(value, name) for name in names}
 
 
 def plain(value: object) -> Any:
@@ -112,9 +108,9 @@ def plain(value: object) -> Any:
     if dataclasses.is_dataclass(value):
         return plain(_fields(value))
     if isinstance(value, Mapping):
-        return {key: plain(each) for key, each in value.items()}
+        return {key: plain(item) for key, item in value.items()}
     if isinstance(value, (list, tuple)):
-        return [plain(each) for each in value]
+        return [plain(item) for item in value]
     if isinstance(value, float):
         return float(value) if math.isfinite(value) else None
     return str(value) if isinstance(value, Path) else value

@@ -28,15 +28,14 @@ Floats = npt.NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RouteMeasures:
-    """The measures of one variant on every route.
+    """The measures of one variant on every route, NaN if not measured.
 
-    ``table`` is [routes, 4], NaN if not measured: driving score and efficiency in
-    percent, comfort as a ratio, joules of the whole route. The driving score is never
-    NaN. ``crashed`` is [routes].
+    They are driving score and efficiency in percent, comfort as a ratio, and joules of
+    the whole route. The driving score is never NaN.
     """
 
-    table: Floats
-    crashed: npt.NDArray[np.bool_]
+    table: Floats  # (routes, 4)
+    crashed: npt.NDArray[np.bool_]  # (routes,)
 
 
 def route_measures(
@@ -81,14 +80,10 @@ ALIKE = 1e-9  # below this share, all measures are redundant
 
 @dataclass(frozen=True, slots=True)
 class EerScale:
-    """Normalization and weights: x = (value - offset) / span, and the weight of each x.
+    """Normalization and weights of `MEASURES`: x = (value - offset) / span."""
 
-    All tuples are in the order driving score, efficiency, comfort, energy; the weights
-    add up to 1, offset and span have the units %, %, ratio and joules.
-    """
-
-    weights: tuple[float, ...]
-    offset: tuple[float, ...]
+    weights: tuple[float, ...]  # of each x; they add up to 1
+    offset: tuple[float, ...]  # %, %, ratio and joules
     span: tuple[float, ...]
 
 

@@ -70,18 +70,13 @@ class Measure:
 
 @dataclass(frozen=True, slots=True)
 class Estimate:
-    """A mean over routes with its 95 % interval.
-
-    ``low`` and ``high`` bound the interval over these scenario types, ``anew_low`` and
-    ``anew_high`` the wider one over types drawn anew (`metrics.measure`); they are
-    None if n is too small or they were not computed.
-    """
+    """A mean over n routes with its 95 % intervals, None if n is too small."""
 
     measure: Measure
-    low: float | None
+    low: float | None  # the interval over these scenario types
     high: float | None
     n: int
-    anew_low: float | None = None
+    anew_low: float | None = None  # the wider one over types drawn anew
     anew_high: float | None = None
 
     @classmethod

@@ -143,19 +143,14 @@ PERCENT, SHARE = (0.0, 100.0), (0.0, 1.0)  # bounds of a route's values
 
 @dataclass(frozen=True)
 class RouteValues:
-    """Numbers of the routes that have one, and the scenario types of these routes.
-
-    Subtracting another drive's values leaves the routes that both have; bounds are the
-    smallest and largest value of a route, if there are any. ``missing`` says why no
-    route has a number.
-    """
+    """Numbers of the routes that have one; a difference is of routes that both have."""
 
     name: str
     unit: str
     by_route: Mapping[str, float]
-    types: Mapping[str, str]
-    bounds: Bounds | None
-    missing: str
+    types: Mapping[str, str]  # scenario types, by route
+    bounds: Bounds | None  # smallest and largest value of a route, if there are any
+    missing: str  # why no route has a number
 
     def __sub__(self, other: "RouteValues") -> "RouteValues":
         bounds = None

@@ -28,33 +28,28 @@ FULL_SET = 220  # routes of a whole benchmark: 44 scenario types with 5 variants
 class SafetyScores:
     """How near the routes came to collisions; None where it was not recorded.
 
-    ``room_kept`` grades a route from 0 to 100; ``ttc_exposure`` is the percentage of
-    frames with a time to collision below 1.5 s; the smallest values are means of the
-    routes' minima, in seconds or metres: TTC over routes on which a contact was ever
-    within 10 s, PET over routes with crossing paths.
+    The smallest values are means of the routes' minima, in seconds or metres.
     """
 
-    room_kept: Estimate
-    ttc_exposure: Estimate
-    smallest_ttc: Estimate
-    smallest_pet: Estimate
+    room_kept: Estimate  # a grade from 0 to 100
+    ttc_exposure: Estimate  # percent of frames with a time to collision below 1.5 s
+    smallest_ttc: Estimate  # over routes on which a contact was ever within 10 s
+    smallest_pet: Estimate  # over routes with crossing paths
     smallest_distance: Estimate
     at_fault_collisions: Estimate
 
 
 @dataclass(frozen=True, slots=True)
 class Scores:
-    """Means over the driven routes, each with its interval.
+    """Means over the driven routes, each with its interval, in percent.
 
-    Percentages, but for comfort: the share of smooth segments (equation 7, SI units).
-    The fields ``bench2drive_...`` follow Bench2Drive's own arithmetic. ``failures`` has
-    the reason for each route that the policy or the simulator ended by failing.
+    The fields ``bench2drive_...`` follow Bench2Drive's own arithmetic.
     """
 
     driving_score: Estimate
     success_rate: Estimate
     efficiency: Estimate
-    comfort: Estimate
+    comfort: Estimate  # the share of smooth segments (equation 7, SI units)
     abilities: Estimate
     each_ability: dict[str, Estimate]
     bench2drive_efficiency: Estimate
@@ -62,6 +57,7 @@ class Scores:
     safety: SafetyScores
     routes: int
     expected: int
+    # Why the policy or the simulator failed, by the route that this ended
     failures: Mapping[str, str] = field(default_factory=dict)
 
     @property

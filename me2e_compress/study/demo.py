@@ -31,26 +31,6 @@ DRIVER, FLOAT, RECIPE = "highway", "float", "full-fused"
 ROUTES = "5"  # what both drive: a number of routes, or their names
 
 
-def before_and_after(outcome: StudyResult) -> Table:
-    """Show size, time, plan and driving score, a row a drive."""
-    # A drive's costs are its variant's
-    rows = list[tuple[Cell, ...]]()
-    for drive in outcome.drives:
-        variant, gap = outcome.variant(drive.variant), drive.difference
-        fidelity, scores = variant.fidelity, drive.scores
-        measures = variant.size_mb, variant.latency_ms[50]
-        plan = fidelity.plan_mean, fidelity.plan_max
-        costs = map(measure_cell, (*measures, *plan), (".2f", ".1f", ".3f", ".2f"))
-        score = estimate_cell(scores.driving_score) if scores else Cell(MISSING)
-        moved = Cell(MISSING, reason="the baseline itself")
-        if gap is not None:
-            moved = estimate_cell(gap.driving_score, signed=True)
-        rows.append((Cell(outcome.label(drive)), *costs, score, moved))
-    columns = ("", "MB", "ms", "plan m", "at most", "driving score", "difference")
-    note = "ms: median of a decision; plan: metres that waypoints move."
-    return Table("Before and after", columns, tuple(rows), note)
-
-
 @dataclasses.dataclass(frozen=True, repr=False)
 class DriveResult(Result):
     """How the driver drives before and after compression."""
@@ -61,10 +41,27 @@ class DriveResult(Result):
 
     def view(self) -> View:
         """Return size, time, plan and driving, before and after, and the verdict."""
-        driven, whole = self.study.coverage
+        # A row a drive, whose costs are its variant's
+        rows, (driven, whole) = list[tuple[Cell, ...]](), self.study.coverage
+        for drive in self.study.drives:
+            variant, gap = self.study.variant(drive.variant), drive.difference
+            score, moved = Cell(MISSING), Cell(MISSING, reason="the baseline itself")
+            if drive.scores is not None:
+                score = estimate_cell(drive.scores.driving_score)
+            if gap is not None:
+                moved = estimate_cell(gap.driving_score, signed=True)
+            costs = (
+                measure_cell(variant.size_mb, ".2f"),
+                measure_cell(variant.latency_ms[50], ".1f"),
+                measure_cell(variant.fidelity.plan_mean, ".3f"),
+                measure_cell(variant.fidelity.plan_max, ".2f"),
+            )
+            rows.append((Cell(self.study.label(drive)), *costs, score, moved))
+        columns = ("", "MB", "ms", "plan m", "at most", "driving score", "difference")
+        note = "ms: median of a decision; plan: metres that waypoints move."
         return View(
             f"{driven} of {whole} routes, before and after",
-            [before_and_after(self.study)],
+            [Table("Before and after", columns, tuple(rows), note)],
             (*map(": ".join, findings(self.study)), limits(self.study), *self.ending),
             self.study.alerts(),
         )

@@ -69,9 +69,9 @@ class DriveRecord:
         episodes: Iterable[Episode],
     ) -> Self:
         """Summarize episodes; ``made_by`` loses its redundant list of routes."""
-        kept = {key: value for key, value in made_by.items() if key != "routes"}
+        origin = {key: value for key, value in made_by.items() if key != "routes"}
         routes = (RouteSummary.of(episode).rounded() for episode in episodes)
-        return cls(variant, condition, tuple(routes), kept)
+        return cls(variant, condition, tuple(routes), origin)
 
     @property
     def name(self) -> str:

@@ -143,8 +143,14 @@ class StudyCells:
         if not condition.mean_of:
             latency = self.clock.source(prepared.variant, condition, study.seed)
         else:
+            # The mean decision of a drive, which must be done
             if name not in self.means_us:
-                self.means_us[name] = self._mean_us(condition)
+                path = self.workspace.record(*study.drive_of(condition.mean_of))
+                done = DriveRecord.load(path) if path.is_file() else None
+                if done is None or done.mean_latency_us is None:
+                    words = f"{condition.mean_of} took no decision"
+                    raise StudyError(f"condition {name}: {words}")
+                self.means_us[name] = done.mean_latency_us
             latency = FixedLatency(self.means_us[name])
         if latency is None:
             return None
@@ -155,16 +161,6 @@ class StudyCells:
             routes=study.routes,
             set_size=study.set_size,
         )
-
-    def _mean_us(self, condition: Condition) -> int:
-        """Return the mean decision of a drive, which must be done."""
-        path = self.workspace.record(*self.study.drive_of(condition.mean_of))
-        mean_us = DriveRecord.load(path).mean_latency_us if path.is_file() else None
-        if mean_us is None:
-            raise StudyError(
-                f"condition {condition.name}: {condition.mean_of} took no decision"
-            )
-        return mean_us
 
     def _drive_cell(
         self, prepared: PreparedVariant, condition: Condition

@@ -188,7 +188,7 @@ def check_operator(
                 f"{name}: {which} has {word!r}, which is no letter of an operand,"
                 " attribute or number",
             )
-    # every dialect at every opset, on random calls
+    # Every dialect at every opset, on random calls
     make = draw_call if draw is None else draw
     for dialect in operator.all_dialects():
         random = np.random.default_rng(seed)
@@ -262,9 +262,8 @@ class _Case:
         )
 
     def _compare(self, what: str, result: NdArray, want: NdArray) -> None:
-        shapes = list(result.shape), list(want.shape)
-        mismatch = f"{what} gives {shapes[0]}, the reference {shapes[1]}"
-        self._require(shapes[0] == shapes[1], mismatch)
+        got, wanted = list(result.shape), list(want.shape)
+        self._require(got == wanted, f"{what} gives {got}, the reference {wanted}")
         scale = max(1.0, float(np.abs(want).max(initial=0.0)))
         error = float(np.abs(result - want).max(initial=0.0)) / scale
         text = f"{what} is off the reference by {error:.2g}, of {TOLERANCE:g} allowed"

@@ -35,20 +35,15 @@ class BrokenRecordingError(ValueError):
 
 @dataclass(frozen=True)
 class RecordedRoute:
-    """One recording in our conventions: x east, y north, angles counter-clockwise.
+    """One recording in our conventions: x east, y north, angles counter-clockwise."""
 
-    Positions and accelerations are [N, 2] in the world, other arrays [N]. The heading
-    is unwrapped; ``along_mps2`` and ``left_mps2`` are accelerations in the ego's frame,
-    ``steps`` the agent's own counts in the order of the file.
-    """
-
-    steps: npt.NDArray[np.int64]
-    position_m: Floats
-    acceleration_mps2: Floats
-    heading_rad: Floats
-    yaw_rate_radps: Floats
-    along_mps2: Floats
-    left_mps2: Floats
+    steps: npt.NDArray[np.int64]  # (n,) the agent's own counts, in the file's order
+    position_m: Floats  # (n, 2) in the world
+    acceleration_mps2: Floats  # (n, 2) in the world
+    heading_rad: Floats  # (n,) unwrapped
+    yaw_rate_radps: Floats  # (n,)
+    along_mps2: Floats  # (n,) acceleration in the ego's frame
+    left_mps2: Floats  # (n,)
 
     @property
     def in_order(self) -> bool:

@@ -57,15 +57,14 @@ BEYOND_M = 20.0  # straight extension of the curve, for lookahead beyond a short
 class AnchoredPlan:
     """A plan in the world frame, fixed at the pose where it was computed.
 
-    ``curve`` [M, 2] passes smoothly through the waypoints, sampled every 0.25 m, with a
-    straight extension of 20 m. ``travel_m`` and ``times_s`` [n + 1] are metres and
-    seconds at the start and at the waypoints.
+    The curve passes smoothly through the n waypoints, sampled every 0.25 m, with a
+    straight extension of 20 m.
     """
 
     time_us: int
-    curve: Floats
-    travel_m: Floats
-    times_s: Floats
+    curve: Floats  # (points, 2)
+    travel_m: Floats  # (n + 1,) metres at the start and at the waypoints
+    times_s: Floats  # (n + 1,) seconds
 
     @classmethod
     def of(cls, plan: Plan | Trajectory, ego: Ego, time_us: int) -> Self:

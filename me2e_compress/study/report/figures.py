@@ -142,16 +142,16 @@ def differences(outcome: StudyResult) -> Markup | None:
     }
     panels = list[Panel]()
     for title, estimates in gaps.items():
-        marks = [_difference_mark(place, gap) for place, gap in enumerate(estimates)]
+        marks = list[Mark]()
+        for place, gap in enumerate(estimates):
+            words = cell_text(estimate_cell(gap, signed=True))
+            colour, shown = ACCENT if gap.sign else MUTED, bool(gap.sign)
+            marks.append(
+                Mark(place, colour, words, gap.value, gap.low, gap.high, shown)
+            )
         panels.append(Panel(title, marks, signed=True))
     names = {outcome.label(drive): place for place, (drive, _) in enumerate(rows)}
     return _draw_panels(names, len(rows), panels)
-
-
-def _difference_mark(place: int, gap: Estimate) -> Mark:
-    words = cell_text(estimate_cell(gap, signed=True))
-    colour, ends = ACCENT if gap.sign else MUTED, (gap.low, gap.high)
-    return Mark(place, colour, words, gap.value, *ends, filled=bool(gap.sign))
 
 
 def _colour(outcome: StudyResult, variant: str) -> str:

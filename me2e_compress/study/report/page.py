@@ -95,6 +95,23 @@ def study_page(outcome: StudyResult, command: Sequence[str] = ()) -> Page:
         f"Drivers compared in closed loop on the same {share}{plural(whole, 'route')}"
         f" of {study.driven_by.label}. {described}."
     )
+    # How bars, dots and lines of the answer are read
+    frames = max(variant.fidelity.frames for variant in outcome.variants)
+    notes = [f"Black: {study.baseline}, which the others are compared with."]
+    if outcome.timed:
+        notes.append("Time: median of one inference.")
+    if frames:
+        notes.append(
+            "Plan: how far the planned waypoints are from those of"
+            f" {study.baseline}, mean over {plural(frames, 'frame')} (dot) and the"
+            " largest distance (end of the line)."
+        )
+    notes.append(
+        f"Driving score: mean over {plural(driven, 'route')} (dot) and its 95 %"
+        " interval (line and brackets)."
+    )
+    if len(outcome.drives) > MOST_DRIVES:
+        notes.append(f"Driving scores are those under {study.conditions[0].name}.")
     made = [
         ("Command", " ".join(command)),
         ("Machine", f"{outcome.machine}{load}"),
@@ -111,7 +128,7 @@ def study_page(outcome: StudyResult, command: Sequence[str] = ()) -> Page:
         findings(outcome),
         limits(outcome),
         outcome.alerts(),
-        Drawing(answer(outcome), _how_to_read(outcome)),
+        Drawing(answer(outcome), " ".join(notes)),
     )
 
 
@@ -141,29 +158,6 @@ def _sections(outcome: StudyResult) -> list[Section]:
         for name, theirs in tables.items()
         if theirs
     ]
-
-
-def _how_to_read(outcome: StudyResult) -> str:
-    """Say what the bars, dots and lines of the answer are."""
-    study = outcome.study
-    frames = max(variant.fidelity.frames for variant in outcome.variants)
-    notes = [f"Black: {study.baseline}, which the others are compared with."]
-    if outcome.timed:
-        notes.append("Time: median of one inference.")
-    if frames:
-        notes.append(
-            "Plan: how far the planned waypoints are from those of"
-            f" {study.baseline}, mean over {plural(frames, 'frame')} (dot) and the"
-            " largest distance (end of the line)."
-        )
-    routes = outcome.coverage[0]
-    notes.append(
-        f"Driving score: mean over {plural(routes, 'route')} (dot) and its 95 %"
-        " interval (line and brackets)."
-    )
-    if len(outcome.drives) > MOST_DRIVES:
-        notes.append(f"Driving scores are those under {study.conditions[0].name}.")
-    return " ".join(notes)
 
 
 def findings(outcome: StudyResult) -> tuple[tuple[str, str], ...]:

@@ -9,13 +9,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from me2e_compress.evaluators.highway.conflict_recorder import (
+from me2e_compress.evaluators.highway.episode_recorder import (
+    EpisodeRecorder,
     at_fault,
     conflicts_of,
     contact_of,
-)
-from me2e_compress.evaluators.highway.episode_recorder import (
-    EpisodeRecorder,
     junction_m,
 )
 from me2e_compress.metrics.episode import ConflictRecord, Contact, Ending
