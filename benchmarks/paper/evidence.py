@@ -237,7 +237,7 @@ def _eer(question: PaperQuestion, result: PaperDrives) -> Found:
     first, seed = ways_scored[Normalization.MIN_MAX], result.study.seed
     # the types of the routes that all normalizations keep
     types = [each.scenario for each in result.drive(one, condition).routes]
-    kinds = [kind for kind, kept in zip(types, first.kept, strict=True) if kept]
+    kinds = [kind for kind, kept in zip(types, first.is_scored, strict=True) if kept]
     gaps = {
         each: (found.routes[one] - found.routes[other]).tolist()
         for each, found in ways_scored.items()

@@ -36,7 +36,7 @@ def scored(variants: Mapping[str, RouteMeasures]) -> dict[Normalization, EerResu
     """Score variants under every normalization; without weights, say why."""
     first = eer(variants)
     tables = [
-        variants[name].table[first.kept]
+        variants[name].table[first.is_scored]
         for name, score in first.scores.items()
         if score.value is not None
     ]

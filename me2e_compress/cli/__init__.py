@@ -64,7 +64,7 @@ def _run(run: Callable[[], None]) -> int:
         except OSError as error:
             raise Me2eError(f"the current folder: {error.strerror}") from error
         for word in sys.argv[1:]:
-            if any("\ud800" <= each <= "\udfff" for each in word):
+            if any("\ud800" <= letter <= "\udfff" for letter in word):
                 raise Me2eError(f"{word!a} is not UTF-8: rename the file")
         run()
     except (CycloptsError, Me2eError, OSError, ImportError) as error:

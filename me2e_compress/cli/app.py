@@ -13,6 +13,12 @@ from me2e_compress.version import __version__
 
 def build_app(name: str, about: str = "") -> App:
     """Build an application without a command, with the options that all have."""
+
+    def default_text(default: object) -> str | None:
+        # Defaults that --help shows are numbers and words
+        shown = isinstance(default, int | float | str) and default
+        return str(default) if shown else None
+
     app = App(
         name,
         help=about or None,
@@ -20,7 +26,7 @@ def build_app(name: str, about: str = "") -> App:
         version_flags="--version",
         help_format="plaintext",
         default_parameter=Parameter(
-            negative=(), show_default=_default_text, allow_repeating=True
+            negative=(), show_default=default_text, allow_repeating=True
         ),
         result_action="return_value",
         exit_on_error=False,
@@ -49,11 +55,6 @@ def build_app(name: str, about: str = "") -> App:
     return app
 
 
-def _default_text(default: object) -> str | None:
-    """Return the text of a default that ``--help`` shows: a number or a word."""
-    return str(default) if isinstance(default, int | float | str) and default else None
-
-
 # Commands in the order in which `--help` lists them
 _PANELS = {
     "Start here": "demo doctor list",
@@ -77,7 +78,7 @@ def _main_app() -> App:
         # `list` is Python's own
         function = getattr(commands, "list_entries" if name == "list" else name)
         text, _, _ = (inspect.getdoc(function) or "").partition("\n\nArgs:")
-        first, *rest = (" ".join(each.split()) for each in text.split("\n\n"))
+        first, *rest = (" ".join(part.split()) for part in text.split("\n\n"))
         if name in _NEED_HIGHWAY and missing_module("highway"):
             first += " Needs the extra highway."
         text = "\n\n".join([first, *rest])
@@ -88,7 +89,7 @@ def _main_app() -> App:
 def options_of(name: str) -> list[str]:
     """List the options of a command, by their first names."""
     arguments = app[name].assemble_argument_collection()
-    return [each.name for each in arguments if each.parse and each.name[:1] == "-"]
+    return [a.name for a in arguments if a.parse and a.name.startswith("-")]
 
 
 app = _main_app()

@@ -8,14 +8,8 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from typing import Literal
 
+from rich import progress
 from rich.console import Console
-from rich.progress import (
-    BarColumn,
-    Progress,
-    TextColumn,
-    TimeElapsedColumn,
-    TimeRemainingColumn,
-)
 from rich.table import Table as RichTable
 from rich.text import Text
 
@@ -61,13 +55,13 @@ def listening(*, stages: bool = False) -> Iterator[Listener]:
         yield Listener(ProgressLines(tell, stages=stages).on_progress, _warn)
         return
     # a terminal shows one bar, which starts again with every stage
-    bar = Progress(
-        TextColumn("{task.description}", markup=False),
-        BarColumn(bar_width=20),
-        TextColumn("{task.fields[what]}", markup=False),
-        TimeElapsedColumn(),
-        TextColumn("left"),
-        TimeRemainingColumn(),
+    bar = progress.Progress(
+        progress.TextColumn("{task.description}", markup=False),
+        progress.BarColumn(bar_width=20),
+        progress.TextColumn("{task.fields[what]}", markup=False),
+        progress.TimeElapsedColumn(),
+        progress.TextColumn("left"),
+        progress.TimeRemainingColumn(),
         console=errors,
         transient=True,
     )
@@ -109,8 +103,8 @@ def show(result: Result, tables: Iterable[Table] | None = None) -> None:
         print_json(result.document())
         return
     # tables first, so that the verdict stays in sight at the end
-    for each in result.tables() if tables is None else tables:
-        print_table(each)
+    for table in result.tables() if tables is None else tables:
+        print_table(table)
     for line in result.lines():
         say(line)
     for line in result.alerts():

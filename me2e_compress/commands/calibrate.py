@@ -107,7 +107,27 @@ def calibrate(
     outputs = [output, checkpoint]
     outputs += [] if options.imported is None else [overrides]
     with writing(outputs, inputs, force=options.force):
-        prepared, part = _prepare(source, frames, options, listener)
+        # Inputs are checked, and the graph is opened, before any pass runs
+        loaded = read_graph(source, listener, options.adapter, options.module_map)
+        if options.imported is not None:
+            read_cache(Path(options.imported))
+        part = None
+        if frames is not None:
+            recording = CalibrationSet(frames)
+            recording.check(loaded)
+            part = draw(recording, options.count, 0)
+        try_first(
+            loaded,
+            source.name,
+            listener=listener,
+            file=source,
+            frames=part,
+            provider=options.runs_on,
+        )
+        # Run the passes before int8; ranges are of the graph that they leave
+        passes = recipe.load(options.recipe)
+        prepared = PreparedGraph.of(source, loaded, options.module_map, passes)
+        del loaded
         gc.collect()  # 150 MB of VAD-tiny as it was read; graphs are cycles
         with atomic.all_or_none():
             missing = list[str]()
@@ -139,34 +159,6 @@ def calibrate(
     findings = (*missing_ranges(cache, missing), *review(ranges))
     written = overrides if missing else None
     return CalibrateResult(output, ranges.frames, ranges, findings, written)
-
-
-def _prepare(
-    source: Path,
-    frames: str | Path | None,
-    options: CalibrateOptions,
-    listener: Listener,
-) -> tuple[PreparedGraph, CalibrationSet | None]:
-    """Read the graph and its frames, and run the passes before int8, for its ranges."""
-    loaded = read_graph(source, listener, options.adapter, options.module_map)
-    # what is read is checked, and the graph is opened, before any pass runs
-    if options.imported is not None:
-        read_cache(Path(options.imported))
-    part = None
-    if frames is not None:
-        recording = CalibrationSet(frames)
-        recording.check(loaded)
-        part = draw(recording, options.count, 0)
-    try_first(
-        loaded,
-        source.name,
-        listener=listener,
-        file=source,
-        frames=part,
-        provider=options.runs_on,
-    )
-    passes = recipe.load(options.recipe)
-    return PreparedGraph.of(source, loaded, options.module_map, passes), part
 
 
 def _import(

@@ -239,7 +239,7 @@ class _BadFrame:
     ) -> None:
         """Look at a frame's outputs of two graphs."""
         floats = [v for v in (*left.values(), *right.values()) if v.dtype.kind == "f"]
-        if not self._is_bad and not all(np.isfinite(each).all() for each in floats):
+        if not self._is_bad and not all(np.isfinite(array).all() for array in floats):
             self._frame, self._is_bad = frame, True
         self._frame = self._frame or frame
 
@@ -281,7 +281,7 @@ def compare_sessions(
     runtime = None if kernels is None else RuntimeTally(kernels, for_kernels, sets)
     del for_kernels  # tee would store every frame that it has not read
     tallies = (sets, bad_frame, liveness, runtime)
-    watchers = [each.add for each in tallies if each is not None]
+    watchers = [tally.add for tally in tallies if tally is not None]
     fidelity = measure(reference, candidate, frames, watchers)
     agents = None if sets is None else sets.result()
     return Comparison(

@@ -79,7 +79,7 @@ class JoinResult(Result):
     def view(self) -> View:
         """Return the file, its size and parts, and what feeds every input of a part."""
         size, parts = format_mb(self.file_bytes), plural(len(self.parts), "part")
-        rows = [dataclasses.astuple(each) for each in self.fed]
+        rows = [dataclasses.astuple(feed) for feed in self.fed]
         columns = ("part", "input", "fed by", "form")
         return View(
             f"{self.output}: {size} MB, {parts}: {', '.join(self.parts)}",
@@ -98,10 +98,11 @@ def join(stack: str | Path, output: str | Path, *, force: bool = False) -> JoinR
     """
     source, output = Path(stack), Path(output)
     joined = JoinedStack.load(source)
+    # External weights lie beside the graph
     outputs = (output, *data_names(output))
     with writing(outputs, (source, *joined.paths), force=force):
         graph.save(joined.model, output)
-    inputs = tuple(FedInput(*each) for each in joined.feeds())
+    inputs = tuple(FedInput(*feed) for feed in joined.feeds())
     return JoinResult(output, graph.file_bytes(output), joined.order, inputs)
 
 
@@ -122,7 +123,7 @@ class SplitResult(Result):
         names = ", ".join(path.name for path in self.files.values())
         return View(
             f"{self.output}: {plural(len(self.files), 'file')}: {names}",
-            alerts=[f"{each}: no output is left of it" for each in self.missing],
+            alerts=[f"{part}: no output is left of it" for part in self.missing],
         )
 
 
@@ -147,8 +148,9 @@ def split(
         raise GraphError(f"{source}: {error}") from error
     if not parts:
         raise GraphError(f"{source}: gives none of the outputs of {toml}")
+    # Every part is a file of the folder, perhaps with weights beside it
     files = {part: output / joined.parts[part].file for part in parts}
-    named = [each for path in files.values() for each in (path, *data_names(path))]
+    named = [name for path in files.values() for name in (path, *data_names(path))]
     inputs = (source, toml, *joined.paths)
     check_folder(output, inputs)
     with atomic.writing_errors(output, GraphError):
@@ -157,5 +159,5 @@ def split(
     with writing(named, inputs, force=force), atomic.all_or_none():
         for part, path in files.items():
             graph.save(parts[part], path)
-    missing = tuple(each for each in joined.parts if each not in files)
+    missing = tuple(part for part in joined.parts if part not in files)
     return SplitResult(output, files, missing)

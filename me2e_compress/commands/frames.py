@@ -14,7 +14,6 @@ from me2e_compress.calibration.dataset import PixelInput
 from me2e_compress.calibration.recording import (
     LOGS,
     Begin,
-    DriveLog,
     LogRequest,
     Source,
     partial_folder,
@@ -89,64 +88,59 @@ def record_frames(
         raise FramesError(f"{folder}: name a folder of its own: it is written anew")
     check_folder(folder, (source, options.adapter))
     with writing(trees=[folder], folders=[partial_folder(folder)], force=options.force):
-        return _record(source, folder, log, options, listener)
-
-
-def _record(
-    source: str | Path,
-    folder: Path,
-    log: DriveLog | None,
-    options: FramesOptions,
-    listener: Listener,
-) -> Path:
-    """Write the frames of a log or of a drive; return the folder."""
-    model, digests = model_path(source), sha256_of(model_path(source))
-    adapter = None
-    pixels: Mapping[str, PixelInput] = {}
-    # a recording is continued only if the sources and the adapter are the same
-    if options.adapter is not None:
-        adapter = adapter_file(Path(options.adapter))
-        digests += f" {sha256_of(adapter)}"
-    # frames come from a log, or from the shipped driver's driving
-    about: dict[str, str | int] = {"stack": str(source)}
-    if log is not None:
-        request = LogRequest(
-            model, options.count, options.scene_length, adapter, options.runs_on
-        )
-        frames_from: Source = partial(log.frames, request)
-        pixels, about["log"] = log.pixels(request), LOGS.text(log)
-    else:
-        try_first(model, model.name, listener=listener, provider=options.runs_on)
-        metadata = adapted(load(model), None, options.module_map)
-        digests += f" {metadata}" if metadata else ""
-        about["seed"] = options.seed
-        # The driver drives, and the policy says how the model reads the world
-        require_extra("highway", "recording frames of a driver")
-        from me2e_compress.evaluators.highway.driven_frames import driven_frames
-
-        loaded = None if adapter is None else Adapter.load(adapter)
-        policy = OnnxPolicy.open(model, loaded, options.runs_on, metadata=metadata)
-        driver = OnnxPolicy.open(shipped_model("highway"))
-        length = options.scene_length
-
-        def drive(begin: Begin) -> Iterator[Frame]:
-            return driven_frames(
-                policy,
-                driver,
-                options.count,
-                seed=options.seed,
-                scene_length=DRIVEN_SCENE_LENGTH if length is None else length,
-                done=begin.frame,
-                first=begin.place,
+        model = model_path(source)
+        digests, adapter = sha256_of(model), None
+        pixels: Mapping[str, PixelInput] = {}
+        # A recording goes on only if its sources and the adapter are the same
+        if options.adapter is not None:
+            adapter = adapter_file(Path(options.adapter))
+            digests += f" {sha256_of(adapter)}"
+        about: dict[str, str | int] = {"stack": str(source)}
+        if log is not None:
+            # Frames of a log, laid out as the model takes them
+            request = LogRequest(
+                model, options.count, options.scene_length, adapter, options.runs_on
             )
+            frames_from: Source = partial(log.frames, request)
+            pixels, about["log"] = log.pixels(request), LOGS.text(log)
+        else:
+            # Frames of a drive: the shipped driver drives, the model looks on
+            try_first(model, model.name, listener=listener, provider=options.runs_on)
+            metadata = adapted(load(model), None, options.module_map)
+            digests += f" {metadata}" if metadata else ""
+            about["seed"] = options.seed
+            frames_from = _drive_source(model, adapter, metadata, options)
 
-        frames_from = drive
+        def with_progress(begin: Begin) -> Iterator[Frame]:
+            for frame in frames_from(begin):
+                yield frame
+                done = frame.index + 1
+                listener.on_progress("frames", done, options.count, folder.name)
 
-    def with_progress(begin: Begin) -> Iterator[Frame]:
-        for frame in frames_from(begin):
-            yield frame
-            done = frame.index + 1
-            listener.on_progress("frames", done, options.count, folder.name)
+        key = f"{__version__} {digests} {options.count} {options.scene_length}"
+        return write_recording(folder, with_progress, about, key, pixels)
 
-    key = f"{__version__} {digests} {options.count} {options.scene_length}"
-    return write_recording(folder, with_progress, about, key, pixels)
+
+def _drive_source(
+    model: Path,
+    adapter: Path | None,
+    metadata: Mapping[str, str],
+    options: FramesOptions,
+) -> Source:
+    """Return what drives the shipped driver and yields the model's inputs."""
+    require_extra("highway", "recording frames of a driver")
+    from me2e_compress.evaluators.highway.driven_frames import driven_frames
+
+    loaded = None if adapter is None else Adapter.load(adapter)
+    policy = OnnxPolicy.open(model, loaded, options.runs_on, metadata=metadata)
+    driver = OnnxPolicy.open(shipped_model("highway"))
+    length = options.scene_length
+    return lambda begin: driven_frames(
+        policy,
+        driver,
+        options.count,
+        seed=options.seed,
+        scene_length=DRIVEN_SCENE_LENGTH if length is None else length,
+        done=begin.frame,
+        first=begin.place,
+    )

@@ -179,7 +179,7 @@ def lint(
 
 
 def retarget(model: ir.Model, options: LintOptions) -> LintOptions:
-    """Return options with the target named, or the plan's, or tensorrt; or refuse."""
+    """Return options with a target: the user's, the plan's, or tensorrt; or refuse."""
     if options.target is None:
         plan = None if options.of_tensorrt else plan_of(model)
         written_for = "" if plan is None else plan.target

@@ -115,7 +115,7 @@ REGISTRIES: Mapping[str, Registry[Any]] = {
 
 # The functions that find the entries of a kind
 KINDS: Mapping[str, Callable[[], tuple[Entry, ...]]] = {
-    **{kind: partial(describe, each) for kind, each in REGISTRIES.items()},  # pyright: ignore[reportArgumentType]
+    **{kind: partial(describe, registry) for kind, registry in REGISTRIES.items()},  # pyright: ignore[reportArgumentType]
     "recipes": lambda: tuple(
         _toml_entry(path)
         for path in sorted(
@@ -128,8 +128,8 @@ KINDS: Mapping[str, Callable[[], tuple[Entry, ...]]] = {
         _toml_entry(adapter_file(Path(name))) for name in shipped_adapters()
     ),
     "module-maps": lambda: tuple(
-        Entry(each.name, _OURS, ", ".join(each.names()))
-        for each in map(ModuleMap.load, (*presets(), "whole"))
+        Entry(modules.name, _OURS, ", ".join(modules.names()))
+        for modules in map(ModuleMap.load, (*presets(), "whole"))
     ),
     "stacks": lambda: tuple(
         Entry(name, _OURS, "trained; ships with the package") for name in SHIPPED
@@ -174,8 +174,8 @@ class DoctorResult(Result):
 
     def view(self) -> View:
         """Return what was found, and what to do for the rest."""
-        count = sum(each.found is not None for each in self.checkups)
-        rows = [(each.what, each.found or "no", each.advice) for each in self.checkups]
+        count = sum(checkup.found is not None for checkup in self.checkups)
+        rows = [(one.what, one.found or "no", one.advice) for one in self.checkups]
         columns = ("what", "found", "to have it")
         return View(
             f"{count} of {len(self.checkups)} things found",

@@ -24,16 +24,16 @@ if TYPE_CHECKING:  # onnxruntime takes a tenth of a second to import
 else:
     Provider = str  # as the command line has it
 
+# The largest number of an option: beyond, milliseconds are no whole microseconds
 LARGEST = 1e15
-"""The largest number of an option: beyond, milliseconds are no whole microseconds."""
+# Most threads of a session: onnxruntime starts all of them, beyond the cores too
 MOST_THREADS = 1024
-"""Most threads of a session: onnxruntime starts all of them, beyond the cores too."""
+# Most frames that are made up, all of them in memory
 MOST_DRAWN = 1000
-"""Most frames that are made up, all of them in memory."""
+# Most inferences that can be asked for: at a millisecond each, a fortnight
 MOST_SAMPLES = 10**9
-"""Most inferences that can be asked for: at a millisecond each, a fortnight."""
+# Most digits of a dimension's size, which must fit into a 64-bit integer
 _MOST_DIGITS = 18
-"""Most digits of a dimension's size, which must fit into a 64-bit integer."""
 
 
 def check_number(
@@ -75,7 +75,7 @@ def _pairs(option: str, form: str, words: Iterable[str]) -> Iterator[tuple[str, 
 def _sizes(type_: Any, tokens: Sequence[Token]) -> dict[str, int]:
     """Parse sizes of open dimensions, such as ``batch=1`` or ``image:0=1``."""
     form, parsed = "NAME=SIZE, e.g. batch=1", dict[str, int]()
-    for name, size in _pairs("--set-dim", form, (each.value for each in tokens)):
+    for name, size in _pairs("--set-dim", form, (token.value for token in tokens)):
         if not size.isdecimal() or len(size) > _MOST_DIGITS:
             raise RecipeError(f"--set-dim is '{name}={size}': write {form}")
         parsed[name] = int(size)
@@ -85,7 +85,7 @@ def _sizes(type_: Any, tokens: Sequence[Token]) -> dict[str, int]:
 def _joules(type_: Any, tokens: Sequence[Token]) -> dict[str, str | Path | float]:
     """Parse ``NAME=JOULES`` or ``NAME=FILE``."""
     form, parsed = "NAME=JOULES or NAME=FILE", dict[str, str | Path | float]()
-    for name, value in _pairs("--joules", form, (each.value for each in tokens)):
+    for name, value in _pairs("--joules", form, (token.value for token in tokens)):
         try:
             parsed[name] = float(value)
         except ValueError:
@@ -146,12 +146,7 @@ class ProviderOptions:
 
     @property
     def runs_on(self) -> Provider:
-        """The provider.
-
-        Raises:
-            ProviderError: There is no such provider, option or library, or it is not
-                installed.
-        """
+        """The provider; a ProviderError if it does not exist or is not installed."""
         from me2e_compress.runtime.providers import provider_named
 
         if isinstance(self.provider, str):
@@ -213,11 +208,7 @@ class PlanOptions(WriteOptions, MapOptions, Int8Options):
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class CalibrateOptions(WriteOptions, GraphOptions):
-    """How ranges are measured or imported.
-
-    Raises:
-        RecipeError: The method or a number is not valid.
-    """
+    """How ranges are measured or imported."""
 
     recipe: Annotated[File, Parameter(name=["--recipe", "-r"])] = "exact"
     """a TOML file, or a shipped recipe's name; its passes before int8 are run"""
@@ -270,11 +261,7 @@ class CompressOptions(WriteOptions, GraphOptions, Int8Options):
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class LintOptions(ProviderOptions):
-    """The runtime that is asked, and how.
-
-    Raises:
-        RecipeError: An option is given for a target that it does not serve.
-    """
+    """The runtime whose rules are checked, and how."""
 
     target: str | None = None
     """runtime of the graph: onnxruntime or tensorrt; None: whom it was written for"""
@@ -393,10 +380,7 @@ class WorkerOptions:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class EvaluateOptions(WorkerOptions, GraphOptions, WriteOptions):
-    """Which routes are driven, and under which conditions, in words.
-
-    An evaluator takes those that it declares; ``evaluator`` and ``force`` are for all.
-    """
+    """Which routes are driven, and how; an evaluator takes those that it declares."""
 
     routes: str = "all"
     """routes: all, a number, ID,ID; or a file of routes"""

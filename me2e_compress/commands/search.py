@@ -77,10 +77,11 @@ class TrialFiles:
         rules = RULE_SETS.parse(options.rules or DEFAULT_RULES)
         place = TARGETS.parse(options.target or DEFAULT_TARGET)
         recording = CalibrationSet(self.frames)
+        # Modules of the scheme
         loaded = opened(self.model, recording, options, listener).model
         modules = load_map(options.module_map, loaded)
         scheme = QuantScheme.named(options.scheme or "full", modules)
-        # the graph is prepared once; every trial starts from there
+        # The graph is prepared once; every trial starts from there
         ready = PreparedGraph.of(self.model, loaded, options.module_map)
         model, tensors, provider = ready.model, ready.tensors(), options.runs_on
         if options.ranges is not None:

@@ -3,7 +3,6 @@
 import hashlib
 import json
 import os
-from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Self
@@ -15,7 +14,6 @@ from me2e_compress.base.listener import Listener
 from me2e_compress.driving.policies import Driver
 from me2e_compress.evaluators.contract import Drive, Driven, Evaluator
 from me2e_compress.metrics.episode import Episode
-from me2e_compress.metrics.route_scores import route_score
 from me2e_compress.simulator.routes import VERSION, check_version, is_route_id
 
 MANIFEST = "evaluation.json"
@@ -209,7 +207,7 @@ def drive_routes(
     # Keep and report each route as soon as it is driven
     missing = replace(drive, routes=[e for e in drive.routes if e.id not in done])
     total = len(routes) or evaluator.set_size
-    _report(listener, stage, done, total)
+    listener.on_progress(stage, len(done), total, "routes")
     if missing.routes or not routes:
         for episode in evaluator.episodes(policy, missing, folder, listener):
             route, yields = episode.route, f"{evaluator.name} yields route"
@@ -225,7 +223,7 @@ def drive_routes(
             done[route] = episode
             if results is not None:
                 results.keep(episode)
-            _report(listener, stage, done, max(total, len(done)))
+            listener.on_progress(stage, len(done), max(total, len(done)), "routes")
     # Routes that the evaluator alone knows are kept once all are driven
     if lost := [route for route in routes if route not in done]:
         raise EvaluationError(f"{evaluator.name} did not drive route {lost[0]}")
@@ -238,16 +236,3 @@ def drive_routes(
         for episode in done.values():
             results.keep(episode)
     return tuple(done[route] for route in routes or done)
-
-
-def _report(
-    listener: Listener, stage: str, done: Mapping[str, Episode], total: int
-) -> None:
-    """Report progress with the mean scores so far."""
-    words = ""
-    if done:
-        episodes = done.values()
-        score = sum(route_score(one).composed for one in episodes) / len(done)
-        success = 100.0 * sum(one.succeeded for one in episodes) / len(done)
-        words = f"DS {score:.1f}  SR {success:.1f} %"
-    listener.on_progress(stage, len(done), total, words)

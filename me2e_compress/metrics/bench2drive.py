@@ -16,18 +16,9 @@ from statistics import fmean
 
 import numpy as np
 
+from me2e_compress.metrics import route_scores as ours
 from me2e_compress.metrics.episode import EgoFrame, Episode, InfractionKind
 from me2e_compress.metrics.measure import Measure
-from me2e_compress.metrics.route_scores import (
-    CHECKPOINTS,
-    DONE_PERCENT,
-    OUTLIER_PERCENT,
-    PERCENT,
-    WINDOW,
-    Floats,
-    beside_traffic,
-    filtered,
-)
 
 BLOCK_FRAMES = 20
 DELTA_S = 0.1
@@ -48,10 +39,10 @@ def success(episode: Episode) -> bool:
 
 def efficiency(episode: Episode) -> Measure:
     """Return the mean percentage of the check points that are at most 1000 %."""
-    ratios = [ratio for ratio in speed_ratios(episode) if ratio <= OUTLIER_PERCENT]
+    ratios = [ratio for ratio in speed_ratios(episode) if ratio <= ours.OUTLIER_PERCENT]
     if not ratios:
-        return Measure(None, PERCENT, "no check point below 1000 %")
-    return Measure(fmean(ratios), PERCENT)
+        return Measure(None, ours.PERCENT, "no check point below 1000 %")
+    return Measure(fmean(ratios), ours.PERCENT)
 
 
 def speed_ratios(episode: Episode) -> tuple[float, ...]:
@@ -64,13 +55,13 @@ def speed_ratios(episode: Episode) -> tuple[float, ...]:
         return episode.speed_ratios_percent
 
     def percent(stretch: list[EgoFrame]) -> float:
-        ego, traffic, count = beside_traffic(stretch)
+        ego, traffic, count = ours.beside_traffic(stretch)
         if traffic == 0.0:
             return 100.0
         return round(100.0 * (ego / count) / (traffic / count), 2)
 
     # Cut the frames at the check points
-    spacing_m = episode.route_length_m / CHECKPOINTS
+    spacing_m = episode.route_length_m / ours.CHECKPOINTS
     ratios, passed_m, stretch = list[float](), 0, list[EgoFrame]()
     for frame in episode.frames:
         stretch.append(frame)
@@ -78,7 +69,7 @@ def speed_ratios(episode: Episode) -> tuple[float, ...]:
             ratios.append(percent(stretch))
             passed_m, stretch = int(frame.route_m), []
     # The original reports the rest twice
-    if episode.completion_percent > DONE_PERCENT:
+    if episode.completion_percent > ours.DONE_PERCENT:
         ratios += 2 * [percent(stretch)]
     return tuple(ratios)
 
@@ -104,8 +95,8 @@ def smoothness(episode: Episode) -> Measure:
     blocks = len(frames) // length
     cut = columns[:, : blocks * length].reshape(len(columns), blocks, length)
 
-    def smoothed(values: Floats, derivative: int = 0) -> Floats:
-        return filtered(values, DELTA_S, derivative, min(WINDOW, length))
+    def smoothed(values: ours.Floats, derivative: int = 0) -> ours.Floats:
+        return ours.filtered(values, DELTA_S, derivative, min(ours.WINDOW, length))
 
     a_along, a_across, a_norm = map(smoothed, cut[:3])  # (blocks, length) each
     # As the original: degrees are unwrapped as if they were radians

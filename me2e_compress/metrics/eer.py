@@ -99,7 +99,7 @@ class EerResult:
     scale: EerScale | None  # none if nothing could be scored
     # Number of routes left out of all variants, by the missing measure
     left_out: Mapping[str, int]
-    kept: npt.NDArray[np.bool_]  # [all routes] whether each was scored
+    is_scored: npt.NDArray[np.bool_]  # (all routes,)
 
     @property
     def ranking(self) -> tuple[str, ...]:
@@ -136,14 +136,14 @@ def eer(
         missing[name] = f"{' and '.join(lacks)}: not measured" if lacks else ""
     able = {name: measures for name, measures in variants.items() if not missing[name]}
     # Find the routes that have all measures of all of them; count the others' gaps
-    kept, left_out = np.zeros(0, np.bool_), dict[str, int]()
+    is_scored, left_out = np.zeros(0, np.bool_), dict[str, int]()
     if able:
         gone = np.any([np.isnan(measures.table) for measures in able.values()], axis=0)
-        kept, gaps = ~gone.any(axis=1), gone.sum(axis=0).tolist()
+        is_scored, gaps = ~gone.any(axis=1), gone.sum(axis=0).tolist()
         left_out = {m: n for m, n in zip(MEASURES, gaps, strict=True) if n}
-    tables = {name: measures.table[kept] for name, measures in able.items()}
+    tables = {name: measures.table[is_scored] for name, measures in able.items()}
     # Normalize each measure by min-max, and weigh it, unless a scale is given
-    reason = "" if kept.any() else "no route has all four measures"
+    reason = "" if is_scored.any() else "no route has all four measures"
     if not reason and scale is None:
         rows = np.concatenate(list(tables.values()))  # (variants * routes, 4)
         offset, span = rows.min(axis=0), np.ptp(rows, axis=0)
@@ -156,7 +156,7 @@ def eer(
             reason = str(error)
     # Estimate every variant's score, or say why there is none
     scores, routes = dict[str, Estimate](), dict[str, Floats]()
-    kinds = types or [str(i) for i in range(len(kept))]
+    kinds = types or [str(i) for i in range(len(is_scored))]
     for name, measures in variants.items():
         why = missing[name] or reason
         if why or scale is None:
@@ -167,11 +167,11 @@ def eer(
             scale.span
         )  # (routes, 4)
         terms = x * np.array(scale.weights) * SIGNS
-        safe = np.where(measures.crashed[kept], 0.0, terms[:, 1:].sum(axis=1))
+        safe = np.where(measures.crashed[is_scored], 0.0, terms[:, 1:].sum(axis=1))
         routes[name] = np.asarray(100.0 * (terms[:, 0] + safe))
-        own_kinds = [kind for kind, keep in zip(kinds, kept, strict=True) if keep]
+        own_kinds = [kind for kind, keep in zip(kinds, is_scored, strict=True) if keep]
         scores[name] = mean_estimate(routes[name].tolist(), own_kinds, POINTS, seed)
-    return EerResult(scores, routes, None if reason else scale, left_out, kept)
+    return EerResult(scores, routes, None if reason else scale, left_out, is_scored)
 
 
 def critic_weights(rows: Floats) -> Floats:

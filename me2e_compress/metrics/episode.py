@@ -121,11 +121,10 @@ class Encounter:
     actor: int
     kind: str
     time_us: int  # when the second of the two arrived
-    # Post-encroachment time (Allen, Shin and Cooper 1978; SAE J2944): from the moment
-    # when the first left a place until the second arrived, the minimum over all places;
-    # 0 in a collision. A multiple of the frame interval.
+    # Post-encroachment time (Allen, Shin and Cooper 1978; SAE J2944): from when the
+    # first left a place until the second arrived, the least of all places
     pet_s: Quantity
-    # Angle between their headings, 0 (same direction) to pi (oncoming)
+    # Between their headings: 0 is the same direction, pi oncoming
     angle_rad: Annotated[float, Field(ge=0.0, le=3.15)]
     ego_first: bool
 
@@ -135,16 +134,14 @@ class Encounter:
 class ConflictRecord:
     """Distances and times to collision for each frame, and all encounters."""
 
-    # Metres from the ego's outline to that of the nearest actor, 0 if they overlap,
-    # None if there is no actor
+    # Metres between the outlines of ego and nearest actor; None if there is none
     nearest_m: tuple[Quantity | None, ...]
-    # Time to collision: seconds until the ego's box and an actor's touch if both keep
-    # heading and speed, the minimum over all actors; None above 10 s (`TTC_HORIZON_S`).
-    # Defined as in nuPlan and NAVSIM, but exact where they try steps of 0.1 and 0.3 s,
+    # Time to collision: seconds until the ego's box and any actor's touch if both keep
+    # heading and speed; None above `TTC_HORIZON_S`. As in nuPlan and NAVSIM, but exact,
     # and including actors from behind.
     ttc_s: tuple[Quantity | None, ...]
-    # Those of at most 5 s (`PET_HORIZON_S`), in order of time; an actor has at most one
-    # with crossing or merging paths and one in the ego's direction
+    # In order of time; an actor has at most one with crossing or merging paths and one
+    # in the ego's direction
     encounters: tuple[Encounter, ...]
 
 
@@ -186,11 +183,9 @@ class EgoFrame:
     acceleration_mps2: Number
     lateral_acceleration_mps2: Number
     yaw_rate_radps: Number
-    # Angle of the front wheels, left positive; None if not reported
-    steering_rad: Number | None
+    steering_rad: Number | None  # of the front wheels, left positive, if reported
     route_m: Number  # metres of the route passed; never decreases
-    # Mean speed of nearby vehicles, None if there are none
-    traffic_speed_mps: Number | None
+    traffic_speed_mps: Number | None  # mean of nearby vehicles, if there are any
     # Norm of the acceleration in the plane if a simulator recorded it separately; None
     # if it follows from the two components
     acceleration_norm_mps2: Number | None = None
@@ -227,24 +222,20 @@ class Episode:
 
     route: str
     scenario: str
-    # The abilities it tests, one or two of Bench2Drive's five
-    abilities: tuple[str, ...]
+    abilities: tuple[str, ...]  # one or two of Bench2Drive's five
     route_length_m: Quantity
-    # Share of the route that was passed, 0 to 100
     completion_percent: Annotated[float, Field(ge=0.0, le=100.0)]
     ending: Ending
     failure: str | None  # how the policy failed, if that ended the route
     infractions: tuple[Infraction, ...]  # in order of time
     frames: tuple[EgoFrame, ...]
     decisions: tuple[InferenceRecord, ...]  # one record per inference
-    # Metres to the first junction, None if the route has none
-    junction_m: Number | None = None
+    junction_m: Number | None = None  # metres to the first junction, if there is one
     # Ego speed over traffic speed at the check points, if the simulator reported them;
     # None if they follow from the frames
     speed_ratios_percent: tuple[Number, ...] | None = None
     given: Given | None = None  # what the simulator itself scored, if anything
-    # How close the ego came to others; None if it was not recorded
-    conflicts: ConflictRecord | None = None
+    conflicts: ConflictRecord | None = None  # None if it was not recorded
 
     @property
     def succeeded(self) -> bool:

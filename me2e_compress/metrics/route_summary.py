@@ -55,7 +55,7 @@ class RouteSummary:
     completion: float
     succeeded: bool  # whether the whole route was driven without an infraction
     ending: str
-    # Kind, microseconds if known, and the other party or obstacle
+    # Kind, microseconds if known, and the other party
     infractions: tuple[tuple[str, int | None, str], ...]
     efficiency: float | None  # none if no traffic moved, or the ego did not
     comfort: float | None  # share of smooth segments; None if there was no whole one
@@ -63,11 +63,9 @@ class RouteSummary:
     decisions: int
     latency_us: tuple[int, ...]  # `PERCENTS` of the decisions' latencies on the vehicle
     latency_sum_us: int
-    # Share of the frames with a time to collision below 1.5 s
-    ttc_exposure: float | None = None
+    ttc_exposure: float | None = None  # percent of frames with TTC below 1.5 s
     smallest_ttc: float | None = None
-    # Post-encroachment time of crossing paths, seconds
-    smallest_pet: float | None = None
+    smallest_pet: float | None = None  # seconds, of crossing paths
     smallest_distance: float | None = None
     at_fault: bool | None = None
     # Efficiency in the arithmetic of Bench2Drive's tools; the earliest files lack it,

@@ -46,31 +46,27 @@ def check_evaluator(
     except EvaluationError as error:
         raise VerificationError(str(error)) from error
     size: object = evaluator.set_size
-    if not isinstance(size, int):
-        raise VerificationError(f"{name}: set_size is no property of a number")
+    require(isinstance(size, int), f"{name}: set_size is no property of a number")
     if "routes" in evaluator.takes:
         picked, set_size = evaluator.routes(routes)
         drive = replace(drive, routes=picked, set_size=set_size)
     # episodes, each of its own route, that can be stored
     first = _episodes(evaluator, policy, drive)
-    for each in first:
-        _check_storable(name, each)
+    for episode in first:
+        _check_storable(name, episode)
     # the same again
     second = _episodes(evaluator, policy, drive)
-    if [each.route for each in second] != [each.route for each in first]:
+    if [e.route for e in second] != [e.route for e in first]:
         raise VerificationError(f"{name} yields other routes, or in another order")
     for one, other in zip(first, second, strict=True):
-        if one != other:
-            raise VerificationError(
-                f"two runs of {name} give different episodes for {one.route}"
-            )
+        words = f"two runs of {name} give different episodes for {one.route}"
+        require(one == other, words)
     if "latency" in evaluator.takes:
         late = replace(drive, latency=FixedLatency(LATENCY_US))
-        for each in _episodes(evaluator, policy, late):
-            if {LATENCY_US} != {decision.latency_us for decision in each.decisions}:
-                raise VerificationError(
-                    f"{name} declares latency, and does not charge it on {each.route}"
-                )
+        for episode in _episodes(evaluator, policy, late):
+            charged = {decision.latency_us for decision in episode.decisions}
+            words = f"{name} declares latency, and does not charge it on"
+            require(charged == {LATENCY_US}, f"{words} {episode.route}")
     return first
 
 
@@ -82,20 +78,18 @@ def _episodes(
     with tempfile.TemporaryDirectory() as folder:
         results = Path(folder) / "results"
         episodes = tuple(evaluator.episodes(policy, drive, results, SILENT))
-    if not episodes:
-        raise VerificationError(f"{name} yields no episode")
-    strange = [each for each in episodes if not isinstance(each, Episode)]
+    require(episodes, f"{name} yields no episode")
+    strange = [e for e in episodes if not isinstance(e, Episode)]
     if strange:
         raise VerificationError(f"{name} yields {strange[0]!r}, no episode")
-    route, count = Counter(each.route for each in episodes).most_common(1)[0]
-    if count > 1:
-        raise VerificationError(f"{name} yields route {route} {count} times")
+    route, count = Counter(episode.route for episode in episodes).most_common(1)[0]
+    require(count == 1, f"{name} yields route {route} {count} times")
     if not drive.routes:
         return episodes
     wanted = [route.id for route in drive.routes]
-    if sorted(wanted) != sorted(each.route for each in episodes):
+    if sorted(wanted) != sorted(episode.route for episode in episodes):
         raise VerificationError(f"{name} yields other routes than were asked for")
-    return tuple(sorted(episodes, key=lambda each: wanted.index(each.route)))
+    return tuple(sorted(episodes, key=lambda episode: wanted.index(episode.route)))
 
 
 def _check_storable(name: str, episode: Episode) -> None:

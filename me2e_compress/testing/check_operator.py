@@ -51,12 +51,12 @@ def draw_call(dialect: Dialect, random: np.random.Generator) -> DrawnCall:
     integers 0 to 4; an attribute is one of its choices, or its default.
     """
     sizes: dict[str, int] = {}
-    inputs = {each.name: _array(each, sizes, random) for each in dialect.operands}
+    inputs = {o.name: _array(o, sizes, random) for o in dialect.operands}
     attributes = {
-        each.name: each.choices[random.integers(len(each.choices))]
-        if each.choices
-        else each.default
-        for each in dialect.attributes
+        attribute.name: attribute.choices[random.integers(len(attribute.choices))]
+        if attribute.choices
+        else attribute.default
+        for attribute in dialect.attributes
     }
     return DrawnCall(inputs, attributes)
 
@@ -136,7 +136,7 @@ def _evaluate(
     graph: ir.Graph, values: Sequence[ir.Value], inputs: Mapping[str, NdArray]
 ) -> list[NdArray | None]:
     """Compute values of a graph, of which some may be its inputs or constants."""
-    computed = [each for each in values if each.producer()]
+    computed = [value for value in values if value.producer()]
     graph.outputs[:] = computed
     model = ir.Model(graph, ir_version=9)
     import_domains(model)
@@ -179,8 +179,8 @@ def check_operator(
         f" be {OWN_DOMAIN!r}",
     )
     # sizes that nobody gives would count as unknown for ever
-    sizes = {letter for each in own.operands for letter in each.letters}
-    sizes |= {each.name for each in own.attributes}
+    sizes = {letter for operand in own.operands for letter in operand.letters}
+    sizes |= {attribute.name for attribute in own.attributes}
     for which, text in (("output", operator.output), ("work", operator.work)):
         for word in text.split():
             require(
@@ -192,7 +192,7 @@ def check_operator(
     make = draw_call if draw is None else draw
     for dialect in operator.all_dialects():
         random = np.random.default_rng(seed)
-        for opset in (each for each in OPSETS if each >= operator.opset):
+        for opset in (opset for opset in OPSETS if opset >= operator.opset):
             for _ in range(calls):
                 case = _Case(operator, dialect, opset)
                 case.check_call(make(dialect, random))
@@ -250,7 +250,7 @@ class _Case:
                 model.graph[0], self.dialect, opset=self.opset, by=_PASS, known=before
             )
             (node,) = (
-                each for each in model.graph if each.op_type == self.dialect.op_type
+                node for node in model.graph if node.op_type == self.dialect.op_type
             )
             expand(node, opset=self.opset, by=_PASS, known=after)
         except PreconditionError:

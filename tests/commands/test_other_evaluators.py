@@ -50,7 +50,7 @@ def test_a_plug_in_drives_with_routes_adapter_latency_and_progress(
     assert result.deadlines.measures["max_ms"].value == 250.0
     driving = [report for report in reports if report[0] == "evaluate"]
     assert [report[1:3] for report in driving] == [(0, 2), (1, 2), (2, 2)]
-    assert driving[-1][3] == "DS 50.0  SR 0.0 %"
+    assert driving[-1][3] == "routes"
     manifest = json.loads((tmp_path / "r" / "evaluation.json").read_text())
     assert manifest["routes"] == ["lane_0", "lane_1"]
     assert manifest["latency"] == {"fixed_us": 250_000}

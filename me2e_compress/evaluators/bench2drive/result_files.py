@@ -262,12 +262,12 @@ def _files(folder: Path) -> Iterator[Path]:
     """Yield every JSON file once; links to folders are followed, not in circles."""
     if folder.is_file():
         yield folder
-    seen = set[str]()
+    visited = set[str]()
     for where, folders, names in os.walk(folder, followlinks=True):
-        if (place := os.path.realpath(where)) in seen:
+        if (place := os.path.realpath(where)) in visited:
             folders.clear()
             continue
-        seen.add(place)
+        visited.add(place)
         folders.sort()
         paths = (Path(where, name) for name in sorted(names))
         yield from (path for path in paths if ".json" in path.suffix and path.is_file())

@@ -106,14 +106,14 @@ def _feeds_of_scene(
     driver.reset(route)
     # Record every half second, from the first moment on; the driver drives
     policy.reset(route)
-    scene, left = world.scene(), length
-    while left and rules.ending(world, scene.ego.speed_mps) is None:
+    scene, missing = world.scene(), length
+    while missing and rules.ending(world, scene.ego.speed_mps) is None:
         since_us = scene.time_us - begin_us
         if since_us >= 0 and since_us % STEP_US == 0:
             observation = replace(watching.observe(scene), time_us=since_us)
             feeds = policy.inputs.feeds(observation)
-            yield {**feeds, **(policy.first.at(feeds) if left == length else {})}
-            left -= 1
+            yield {**feeds, **(policy.first.at(feeds) if missing == length else {})}
+            missing -= 1
         plan = driver.plan(driving.observe(scene))
         anchored = AnchoredPlan.of(plan, scene.ego, scene.time_us)
         world.step(anchored.control(scene.ego, scene.time_us))

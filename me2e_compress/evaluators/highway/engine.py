@@ -43,9 +43,9 @@ class RouteWorker:
 
     policy: Driver
     conditions: Drive
-    _process: SpawnProcess | None = field(default=None, init=False)
-    _heartbeat: Heartbeat | None = field(default=None, init=False)
-    _line: Line | None = field(default=None, init=False)
+    _running: tuple[SpawnProcess, Heartbeat, Line] | None = field(
+        default=None, init=False
+    )
 
     def drive(self, route: Route, stop: threading.Event | None = None) -> Driven | None:
         """Drive a route; a policy that hangs or crashes its process has failed.
@@ -56,7 +56,16 @@ class RouteWorker:
             EvaluationError: The process ended for another reason than the policy.
         """
         begun = time.perf_counter()
-        process, heartbeat, line = self._started()
+        if self._running is None:
+            # The child has only its own end of the pipe
+            context = spawn_context()
+            heartbeat, (line, theirs) = context.Array("d", 2), context.Pipe()
+            options = (theirs, heartbeat, self.policy, self.conditions)
+            child = context.Process(target=_serve, args=options, daemon=True)
+            child.start()
+            theirs.close()
+            self._running = child, heartbeat, line
+        process, heartbeat, line = self._running
         line.send(route)
         # Watch the heartbeat: one call must not take too long
         call, since, limit_s = 0.0, begun, self.conditions.frame_limit_s
@@ -68,50 +77,38 @@ class RouteWorker:
                 if heartbeat[0] != call:
                     call, since = heartbeat[0], time.perf_counter()
                 elif call and time.perf_counter() - since > limit_s:
-                    return self._lost(route, begun, f"no plan within {limit_s:g} s")
+                    return self._failed(route, begun, f"no plan within {limit_s:g} s")
             answer = line.recv()
-        # A closed pipe means that the process ended
+        # A closed pipe means that the process ended: during a call by the policy
         except (EOFError, BrokenPipeError, ConnectionResetError):
             process.join()
-            return self._lost(route, begun, self._cause(route, process))
+            code, killed = process.exitcode, process.exitcode == -signal.SIGKILL
+            if killed or not heartbeat[0]:
+                self.close()
+                how = f"ended with code {code}"
+                how = "was killed (out of memory?)" if killed else how
+                words = f"route {route.id}: its process {how}"
+                raise EvaluationError(words) from None
+            failure = f"the policy ended its process with code {code}"
+            return self._failed(route, begun, failure)
         if isinstance(answer, Me2eError):
             raise answer
         return answer
 
     def close(self) -> None:
         """End the process."""
-        if self._process is not None:
-            self._process.kill()
-            self._process.join()
-        if self._line is not None:
-            self._line.close()
-        self._process = self._heartbeat = self._line = None
+        if self._running is not None:
+            process, _, line = self._running
+            process.kill()
+            process.join()
+            line.close()
+        self._running = None
 
-    def _started(self) -> tuple[SpawnProcess, Heartbeat, Line]:
-        if self._process is None or self._heartbeat is None or self._line is None:
-            # The child keeps only its own end of the pipe
-            context = spawn_context()
-            heartbeat = context.Array("d", 2)
-            ours, theirs = context.Pipe()
-            options = (theirs, heartbeat, self.policy, self.conditions)
-            process = context.Process(target=_serve, args=options, daemon=True)
-            process.start()
-            theirs.close()
-            self._process, self._heartbeat, self._line = process, heartbeat, ours
-        return self._process, self._heartbeat, self._line
-
-    def _cause(self, route: Route, process: SpawnProcess) -> str:
-        code, killed = process.exitcode, process.exitcode == -signal.SIGKILL
-        if killed or not self._heartbeat or not self._heartbeat[0]:
-            self.close()
-            how = "was killed (out of memory?)" if killed else f"ended with code {code}"
-            raise EvaluationError(f"route {route.id}: its process {how}")
-        return f"the policy ended its process with code {code}"
-
-    def _lost(self, route: Route, begun: float, failure: str) -> Driven:
+    def _failed(self, route: Route, begun: float, failure: str) -> Driven:
+        """Return the episode of a route whose process is lost, with its progress."""
         from me2e_compress.evaluators.highway.episode_recorder import failed_episode
 
-        percent = self._heartbeat[1] if self._heartbeat else 0.0
+        percent = self._running[1][1] if self._running else 0.0
         self.close()
         episode = failed_episode(route, percent, failure)
         return Driven(episode, time.perf_counter() - begun, 0)

@@ -39,20 +39,20 @@ class RouteNodes:
         """Place the nodes of a route."""
         # Stations are the indices of the path's points, a metre apart
         changes = 1 + np.flatnonzero(np.diff(path.commands))
-        kept = [0, *changes.tolist(), len(path.points) - 1]
+        ends = [0, *changes.tolist(), len(path.points) - 1]
         places: list[int] = []
-        for begin, end in itertools.pairwise(kept):
+        for begin, end in itertools.pairwise(ends):
             parts = max(1, math.ceil((end - begin) / APART_M))
             places += [begin + (end - begin) * part // parts for part in range(parts)]
-        places = sorted({*places, kept[-1]})
+        places = sorted({*places, ends[-1]})
         return cls(np.array(places, float), np.asarray(path.points[places], float))
 
     def ahead(self, station_m: float, ego: Ego) -> npt.NDArray[np.float32]:
         """Return [2, 2] the next two nodes from an arc length, in the ego frame."""
         last = len(self.points) - 1
         index = int(np.searchsorted(self.stations_m, station_m + REACHED_M, "right"))
-        ends = self.points[[min(index, last), min(index + 1, last)]]
-        return ego.seen(*ends.T).astype(np.float32)
+        both = self.points[[min(index, last), min(index + 1, last)]]
+        return ego.seen(*both.T).astype(np.float32)
 
 
 def cameras_of(world: World, rig: CameraRig, weather: Weather = CLEAR) -> Cameras:

@@ -143,12 +143,11 @@ def differences(outcome: StudyResult) -> Markup | None:
     panels = list[Panel]()
     for title, estimates in gaps.items():
         marks = list[Mark]()
-        for place, gap in enumerate(estimates):
-            words = cell_text(estimate_cell(gap, signed=True))
-            colour, shown = ACCENT if gap.sign else MUTED, bool(gap.sign)
-            marks.append(
-                Mark(place, colour, words, gap.value, gap.low, gap.high, shown)
-            )
+        for place, mean in enumerate(estimates):
+            words = cell_text(estimate_cell(mean, signed=True))
+            colour, ends = ACCENT if mean.sign else MUTED, (mean.low, mean.high)
+            filled = bool(mean.sign)
+            marks.append(Mark(place, colour, words, mean.value, *ends, filled=filled))
         panels.append(Panel(title, marks, signed=True))
     names = {outcome.label(drive): place for place, (drive, _) in enumerate(rows)}
     return _draw_panels(names, len(rows), panels)
