@@ -18,9 +18,11 @@ class Listener:
     """
 
     on_progress: Callable[[str, int, int, str], None] = dataclasses.field(
-        default=_ignore, repr=False
+        default_factory=lambda: _ignore, repr=False
     )
-    on_warning: Callable[[str], None] = dataclasses.field(default=_ignore, repr=False)
+    on_warning: Callable[[str], None] = dataclasses.field(
+        default_factory=lambda: _ignore, repr=False
+    )
 
     def counting(self, stage: str, words: str = "") -> Callable[[int, int], None]:
         """Return a function of things done, and in all, that reports a stage."""

@@ -9,6 +9,15 @@ from typing import Annotated, Any
 
 from pydantic import ConfigDict, Field, TypeAdapter, with_config
 
+__all__ = [
+    "FRAME_US",
+    "EgoFrame",
+    "Ending",
+    "Episode",
+    "Given",
+    "InferenceRecord",
+]
+
 
 class InfractionKind(StrEnum):
     """The keys of `infractions` in a leaderboard record, and `GIVE_WAY`, our own."""
