@@ -103,12 +103,9 @@ class LintResult(Result):
             if cut := build.cut:
                 answer.append(f"cut at {len(cut)} plugins: {', '.join(cut[:5])}")
         reason = self.refusal or self.miscomputed
-        return View(
-            self.headline,
-            [findings] if rows else [],
-            (self.headline, *answer),
-            error=None if reason is None else PreconditionError(reason),
-        )
+        error = None if reason is None else PreconditionError(reason)
+        tables, lines = [findings] if rows else [], (self.headline, *answer)
+        return View(self.headline, tables, lines, error=error)
 
     @property
     def status(self) -> Status:
@@ -144,8 +141,11 @@ class LintResult(Result):
 
     def to_json(self) -> object:
         """Return the target, the findings, and the answer of TensorRT-RTX."""
-        asked, build = self.options.target, self.build
-        return {"target": asked, "findings": self.findings, "tensorrt_rtx": build}
+        return {
+            "target": self.options.target,
+            "findings": self.findings,
+            "tensorrt_rtx": self.build,
+        }
 
 
 def lint(

@@ -30,10 +30,7 @@ from me2e_compress.runtime.profile import WARM_UP
 from me2e_compress.runtime.profile import profile as measure
 from me2e_compress.targets.onnxruntime.convert import slow_here
 
-_SHOWN = 12  # number of operators in a table
-# Samples beyond the 99th percentile from which on it is steady: with fewer, one
-# disturbance more or less moves it
-BEYOND_P99 = 5
+_SHOWN = 12
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
@@ -59,11 +56,7 @@ class ProfileResult(Result):
         return deadlines(self.trace.samples_us, self.budget_ms)
 
     def view(self) -> View:
-        """Return percentiles, then modules, energy and operators.
-
-        Lines tell how far the last percentile can be trusted; alerts what puts joules
-        and times in doubt, and a form that is slow here.
-        """
+        """Return percentiles, then modules, energy and operators, and doubts."""
         headline = f"{self.output or self.model.name}: {self.trace.headline}"
         whole, *modules = self.trace.tables()
         energy, load = self.energy, self.trace.others
@@ -82,16 +75,9 @@ class ProfileResult(Result):
             note = "; ".join(filter(None, (every.note, more)))
             rows = every.rows[:_SHOWN]
             tables.append(dataclasses.replace(every, rows=rows, note=note))
-        # How far the last percentile can be trusted, and what disturbed the times
+        # Joules, and what puts joules and times in doubt
         joules = "" if energy is None else energy.headline
         lines = [*filter(None, [self.known, joules])]
-        count, needed = len(self.trace.samples_us), 100 * BEYOND_P99
-        if count < needed:
-            remedy = "" if load is None else f" (--samples {needed})"
-            lines.append(
-                f"p99 is steady from {needed} samples on, with {BEYOND_P99} beyond it;"
-                f" here are {count}{remedy}"
-            )
         busy = str(load) if load is not None and load.busy else None
         slow = self.slow_here and f"{self.model.name}: {self.slow_here}"
         doubts = () if energy is None else energy.alerts()

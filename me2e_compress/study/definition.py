@@ -233,10 +233,26 @@ class Study:
     plugins: tuple[File, ...] = ()  # libraries of operators for the provider
 
     def __post_init__(self) -> None:
-        # Names must be unique, and refer to something
-        check_unique("variant", (variant.name for variant in self.variants))
-        check_unique("condition", (condition.name for condition in self.conditions))
-        self._check_names()
+        # Names must be unique, and known where they are referred to
+        names = [variant.name for variant in self.variants]
+        conditions = [condition.name for condition in self.conditions]
+        check_unique("variant", names)
+        check_unique("condition", conditions)
+        check_known("baseline: no variant", self.baseline, names)
+        for block in self.blocks:
+            for name in block.variants:
+                check_known(f"block {block.name}: no variant", name, names)
+            for name in block.conditions:
+                check_known(f"block {block.name}: no condition", name, conditions)
+        drives = [f"{one}.{other}" for other in conditions for one in names]
+        for name in itertools.chain.from_iterable(self.pairs):
+            check_known("pair: no VARIANT.CONDITION", name, drives)
+        # A mean is of a drive before its condition
+        for number, condition in enumerate(self.conditions):
+            if condition.mean_of:
+                what = f"condition {condition.name}: mean_of: no VARIANT.CONDITION"
+                before = drives[: number * len(names)]
+                check_known(f"{what} before it", condition.mean_of, before)
         # Variants that name no policy take the study's
         variants = list[Variant]()
         for variant in self.variants:
@@ -247,7 +263,19 @@ class Study:
             own = variant if variant.policy else replace(variant, policy=self.policy)
             variants.append(own)
         object.__setattr__(self, "variants", tuple(variants))
-        self._check_evaluator()
+        # The evaluator must take all that variants and conditions ask for
+        try:
+            for variant in self.variants:
+                asked = ["policy"] if variant.adapter is None else ["policy", "adapter"]
+                self.driven_by.check_takes(asked, f"variant {variant.name}: ")
+            for condition in self.conditions:
+                asked = ["latency"] * (condition.latency != "none")
+                whose = f"condition {condition.name}: "
+                self.driven_by.check_takes([*asked, *condition.changed], whose)
+            if self.routes:
+                self.driven_by.check_takes(["routes"], "routes: ")
+        except EvaluationError as error:
+            raise StudyError(str(error)) from error
         if self.to_record is None:
             self._check_frames()
 
@@ -261,42 +289,6 @@ class Study:
         """Suffix of titles if only a part of the routes is driven; empty otherwise."""
         driven, whole = len(self.routes), self.set_size
         return f" (preview: {driven} of {whole} routes)" if 0 < driven < whole else ""
-
-    def _check_names(self) -> None:
-        """Check that all names are known; a mean is of a drive before its condition."""
-        variants = [variant.name for variant in self.variants]
-        conditions = [condition.name for condition in self.conditions]
-        check_known("baseline: no variant", self.baseline, variants)
-        # Names in blocks and pairs
-        for block in self.blocks:
-            for name in block.variants:
-                check_known(f"block {block.name}: no variant", name, variants)
-            for name in block.conditions:
-                check_known(f"block {block.name}: no condition", name, conditions)
-        drives = [f"{one}.{other}" for other in conditions for one in variants]
-        for name in itertools.chain.from_iterable(self.pairs):
-            check_known("pair: no VARIANT.CONDITION", name, drives)
-        # The drive of a mean has an earlier condition
-        for number, condition in enumerate(self.conditions):
-            if condition.mean_of:
-                what = f"condition {condition.name}: mean_of: no VARIANT.CONDITION"
-                before = drives[: number * len(variants)]
-                check_known(f"{what} before it", condition.mean_of, before)
-
-    def _check_evaluator(self) -> None:
-        """Check that the evaluator takes all that variants and conditions ask for."""
-        try:
-            for variant in self.variants:
-                asked = ["policy"] if variant.adapter is None else ["policy", "adapter"]
-                self.driven_by.check_takes(asked, f"variant {variant.name}: ")
-            for condition in self.conditions:
-                asked = ["latency"] * (condition.latency != "none")
-                whose = f"condition {condition.name}: "
-                self.driven_by.check_takes([*asked, *condition.changed], whose)
-            if self.routes:
-                self.driven_by.check_takes(["routes"], "routes: ")
-        except EvaluationError as error:
-            raise StudyError(str(error)) from error
 
     def _check_frames(self) -> None:
         """Check that there are frames for passes that calibrate and for latencies."""
