@@ -25,10 +25,9 @@ def main() -> int:
 
 
 def run_command(run: Callable[[], None], resume_hint: str = "") -> int:
-    """Run a command line; our own errors are one line and code 1, signals other codes.
+    """Run a command that reads ``sys.argv``; return its exit code.
 
-    `run` reads ``sys.argv``, and returns or raises ``SystemExit``; the `resume_hint` is
-    printed after an interruption.
+    Our own errors are one line and code 1; the hint is printed after a signal.
     """
     try:
         with handle_signals():

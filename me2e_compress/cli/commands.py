@@ -311,6 +311,7 @@ def compare(
     from me2e_compress.commands import compare as between
     from me2e_compress.commands import compare_dump as against_engine
 
+    # Options that do not go together
     options = options or CompareOptions()
     if first_difference and (options.as_it_stands or outputs is not None):
         raise RecipeError(
@@ -319,6 +320,7 @@ def compare(
         )
     if float_graph is not None and outputs is None:
         raise RecipeError("--float is for --outputs, which is not given")
+    # Against what an engine answered, or graph against graph
     if outputs is not None and frames is None:
         workflow = against_engine.compare_dump
         show_call(workflow, reference, outputs, candidate, float_graph, options)
@@ -353,6 +355,7 @@ def profile(
     from me2e_compress.commands import profile as workflow
     from me2e_compress.commands.profile import check_import, import_profile
 
+    # Read what another tool measured, or measure here
     options = options or ProfileOptions()
     with listening() as listener:
         if imported is not None:

@@ -44,13 +44,12 @@ WIDE = 120  # columns that a terminal must have for intervals beside the numbers
 def listening(*, stages: bool = False) -> Iterator[Listener]:
     """Yield a listener that shows progress and warnings on stderr; nothing if quiet.
 
-    On a terminal progress is a bar with the time left, elsewhere a line now and then,
-    and one for every new stage if `stages` is set.
+    A terminal has a bar, a log a line now and then, and for every stage if asked.
     """
     if printing.quiet:
         yield SILENT
         return
-    # a log gets lines, since it cannot show a bar
+    # A log gets lines, since it cannot show a bar
     if not errors.is_terminal:
         yield Listener(ProgressLines(tell, stages=stages).on_progress, _warn)
         return
@@ -95,10 +94,7 @@ def tell(line: str) -> None:
 
 
 def show(result: Result, tables: Iterable[Table] | None = None) -> None:
-    """Print a result as tables and lines, or as one JSON document if asked to.
-
-    `tables` are printed instead of the result's own.
-    """
+    """Print tables, the result's own or others, then lines and alerts; or JSON."""
     if printing.json:
         print_json(result.document())
         return
@@ -125,11 +121,7 @@ def say(line: str) -> None:
 
 
 def print_table(content: Table) -> None:
-    """Print a table and its note, with intervals where they fit.
-
-    Where the words do not fit side by side, a row becomes a few lines, so that no name
-    is broken.
-    """
+    """Print a table and its note; in a narrow terminal a row becomes a few lines."""
     # Intervals are shown if the terminal is wide, or the table narrow
     content, wide = content.escape_controls(), console.width >= WIDE
     count = len(content.columns)
@@ -138,6 +130,7 @@ def print_table(content: Table) -> None:
     least = _lengths(content, intervals, str.split)
     fits = sum(least) <= spare
     console.print(Text(content.title, "bold"), soft_wrap=True)
+    # Columns side by side, none of their words broken
     if fits:
         # Spare characters go to narrow columns first: only long sentences wrap
         most = _lengths(content, intervals, str.splitlines)
@@ -199,11 +192,7 @@ EVERY_S = 10.0  # seconds between two lines
 
 
 class ProgressLines:
-    """Writes the progress of a long run, seldom enough for a log.
-
-    A run of less than `EVERY_S` writes nothing, unless every new stage is written;
-    a stage of which a line was written gets one at its end.
-    """
+    """Writes progress to a log every `EVERY_S`, and at the end of a stage it shows."""
 
     def __init__(
         self,

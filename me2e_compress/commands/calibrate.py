@@ -32,16 +32,13 @@ from me2e_compress.quantization.decision import keep_readers, overrides_text
 
 @dataclasses.dataclass(frozen=True, repr=False)
 class CalibrateResult(Result):
-    """The range of every tensor.
-
-    `findings` say what of the ranges deserves a look. `overrides` is the file that
-    keeps in float what an imported cache has no range for; None where it has all.
-    """
+    """The range of every tensor."""
 
     output: Path
     frames: int
     ranges: Ranges
-    findings: tuple[RangeFinding, ...] = ()
+    findings: tuple[RangeFinding, ...] = ()  # ranges that deserve a look
+    # The file that leaves in float what an imported cache has no range for
     overrides: Path | None = None
 
     def view(self) -> View:

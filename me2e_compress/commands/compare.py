@@ -52,26 +52,18 @@ from me2e_compress.targets.onnxruntime.convert import slow_here
 
 @dataclasses.dataclass(frozen=True, repr=False)
 class Comparison:
-    """How a graph answers beside another: what `compare` says, and `compress`.
-
-    `agents` is None unless the metadata ``me2e.sets`` names outputs that both graphs
-    have. `liveness` is None if it was not asked for; `runtime`, what onnxruntime's
-    int8 answers otherwise, if there is none to ask.
-    """
+    """How far a graph is from another, over frames."""
 
     fidelity: Fidelity
-    liveness: Liveness | None
-    runtime: RuntimeLoss | None
+    liveness: Liveness | None  # None if it was not asked for
+    runtime: RuntimeLoss | None  # what onnxruntime's int8 answers otherwise, if any
+    # Of outputs that the metadata `me2e.sets` names and both graphs have
     agents: SetFidelity | None
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
 class CompareResult(Comparison, Result):
-    """How close a graph stays to another.
-
-    `slow_here` tells by file name of int8 whose form is slow on this CPU, `known` from
-    where state and plan are known, `not_finite` which node makes NaN first.
-    """
+    """How close a graph stays to another, and what puts that in doubt."""
 
     keys = (
         *("*fidelity", "agents", "liveness", "runtime"),
@@ -79,9 +71,9 @@ class CompareResult(Comparison, Result):
     )
     reference: Path
     candidate: Path
-    slow_here: Mapping[str, str]
-    known: str
-    not_finite: tuple[str, ...]
+    slow_here: Mapping[str, str]  # why int8 is slow on this CPU, by file name
+    known: str  # from where state and plan are known
+    not_finite: tuple[str, ...]  # which node is first to make NaN, by graph
 
     def view(self) -> View:
         """Return how far outputs, agents and the plan moved, and dead outputs."""
@@ -244,10 +236,7 @@ class _BadFrame:
         self._frame = self._frame or frame
 
     def maker(self, model: ir.Model, session: Session) -> str:
-        """Name the node that first makes NaN or infinity, in a sentence; else "".
-
-        State is that of a scene's beginning.
-        """
+        """Describe the first node that makes NaN or infinity in a scene; else ""."""
         graph.infer_shapes(model)  # untyped values are not looked at
         places, frame = index_inputs(model), self._frame
         if frame is None or not (places or self._is_bad):
@@ -276,6 +265,7 @@ def compare_sessions(
     `model` is the candidate's graph, `kernels` runs it by onnxruntime's int8; outputs
     of both are added to `sets` and `bad_frame`. With `alive` 0 no output is dead.
     """
+    # What is tallied, frame by frame, while both sessions run
     liveness = LivenessTally(reference, candidate) if alive else None
     frames, for_kernels = itertools.tee(frames)
     runtime = None if kernels is None else RuntimeTally(kernels, for_kernels, sets)
@@ -360,6 +350,7 @@ def first_difference(
         path: stamp_modules(opened(path, recording, options, listener, paths).model)
         for path in dict.fromkeys(paths)
     }
+    # Hold both graphs together on a frame that has a state
     shown = tuple(itertools.islice(recording, FRAMES))
     first, second = (models[path] for path in paths)
     difference = find_first_difference(first, second, shown, options.runs_on)
@@ -368,6 +359,7 @@ def first_difference(
 
 def stamp_modules(model: ir.Model) -> ir.Model:
     """Write every node's module into its metadata, if missing; return the model."""
+    # By the preset's map, or as one module where it does not fit
     if provenance.missing(model):
         try:
             placed = assign(model, map_of(model, None))

@@ -89,10 +89,7 @@ class EvaluateResult(Result):
     slow_here: str | None = None
 
     def view(self) -> View:
-        """Return every score with its interval, and the latencies charged.
-
-        Alerts are the routes that ended by a failure, and a form that is slow here.
-        """
+        """Return scores and latencies; alerts are failures, and a form slow here."""
         tables = [scores_table(self.policy, self.scores)]
         if self.deadlines is not None:
             tables.append(deadlines_table(self.policy, self.deadlines))
@@ -171,10 +168,7 @@ def evaluate(
 
 
 def driver_of(text: str, options: GraphOptions) -> Driver:
-    """Return the driver of a policy name, a path or a shipped model's name.
-
-    Policies other than graphs ignore the provider.
-    """
+    """Return the driver of a policy's name, a path or a shipped model's name."""
     if text in SHIPPED:  # by its path, which a file of that name may be instead
         text = str(model_path(text))
     driver = driver_named(text, options.adapter, options.module_map)

@@ -135,6 +135,7 @@ def inspect(model: str | Path, options: InspectOptions | None = None) -> Inspect
         PreconditionError: No input has such a dimension.
         ModuleMapError: The map does not exist.
     """
+    # Read the graph as its adapter, map and dimensions have it
     options, path = options or InspectOptions(), model_path(model)
     loaded = load_graph(path)
     adapted(loaded, options.adapter, options.module_map)

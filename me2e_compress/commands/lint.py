@@ -78,10 +78,7 @@ class LintResult(Result):
         )
 
     def view(self, every: bool = False) -> View:
-        """Return counts and findings, three nodes of each rule unless `every` is set.
-
-        A note counts the others; lines say what TensorRT-RTX answers.
-        """
+        """Return counts and findings, three nodes a rule unless `every` is set."""
         # A rule that fails everywhere would bury the others
         rows, more, shown = list[tuple[str, ...]](), list[str](), None if every else 3
         for row in self.summary():
@@ -162,6 +159,7 @@ def lint(
         RecipeError: The target does not exist.
         MissingExtraError: TensorRT-RTX is asked for and not installed.
     """
+    # Rules and operator tables of the target
     path = model_path(model)
     loaded = graph.load(path)
     options = retarget(loaded, options or LintOptions())
@@ -204,10 +202,7 @@ def _target_of(options: LintOptions) -> Target:
 def lint_written(
     model: ir.Model, passes: Sequence[Pass], output: Path, asked: str | None
 ) -> LintResult | None:
-    """Ask the rules of the target that passes wrote int8 for; None where none did.
-
-    Nothing is opened. `asked` is the target that the user named, if any.
-    """
+    """Lint a graph for the target that passes wrote int8 for; None without int8."""
     targets = [step.target for step in passes if isinstance(step, QuantizeInt8)]
     if not targets:
         return None

@@ -45,15 +45,12 @@ _MOST_RANGES = "paper{without=[fused-operator]}"
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class PreparedGraph:
-    """A graph in the state in which the pass that reads ranges finds it.
-
-    `reader` is that pass; None where the recipe has none.
-    """
+    """A graph as the pass that reads ranges gets it."""
 
     file: Path
     model: ir.Model
     modules: ModuleMap
-    reader: Quantizer | None
+    reader: Quantizer | None  # that pass, if the recipe has one
 
     @classmethod
     def of(
@@ -65,9 +62,10 @@ class PreparedGraph:
     ) -> Self:
         """Run the passes before the first that reads ranges, unverified.
 
-        A module map of None finds the preset; passes of None stand for the recipe
-        ``exact``. A graph that a plan quantized, and is to become int8, raises
-        PreconditionError.
+        A map of None finds the preset; passes of None are the recipe ``exact``.
+
+        Raises:
+            PreconditionError: A plan quantized the graph, and it is to become int8.
         """
         chosen = tuple(recipe.load("exact") if passes is None else passes)
         readers = (step for step in chosen if isinstance(step, Quantizer))
@@ -99,8 +97,8 @@ class PreparedGraph:
     def tensors(self) -> tuple[str, ...]:
         """Return every tensor that any scheme, rule set or target needs a range of.
 
-        For a quantized graph to be rewritten, these are the tensors without a range in
-        it. If there is none, PreconditionError is raised.
+        Raises:
+            PreconditionError: There is none, or a quantized graph lacks none.
         """
         context, names = Context(self.modules), dict[str, None]()
         if self.reader is not None and not self.reader.takes_float:
@@ -131,10 +129,7 @@ class PlanResult(Result):
     hint: str = ""  # what the graph lacks for more to be known, else empty
 
     def view(self, every: bool = False) -> View:
-        """Return how many nodes of each module became what by which rule.
-
-        With `every` a row a node that could be int8, and what was decided together.
-        """
+        """Return nodes by module and rule; with `every` also by decision and scale."""
         lines = filter(None, (self.hint, self.plan.headline))
         tables = list(self.plan.tables())
         if not every:

@@ -120,6 +120,7 @@ def profile(
         ModuleMapError: The map does not exist.
         ProviderError: The provider is not available.
     """
+    # Joules lie beside the trace
     options = options or ProfileOptions()
     source, written = model_path(model), None if output is None else Path(output)
     joules = None

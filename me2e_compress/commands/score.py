@@ -54,10 +54,7 @@ class RealRun:
     leaderboard: LeaderboardScores
 
     def tables(self, name: str) -> tuple[Table, ...]:
-        """Return the records, and the scores as given and as computed.
-
-        Each figure is shown over the whole set, and over what was driven.
-        """
+        """Return the records, and scores over the whole set and driven routes."""
         # Routes by what happened to their records
         collected, off_rate = self.collected, self.collected.off_rate
         broken, lists = tuple(collected.broken), self._route_lists()
@@ -156,10 +153,7 @@ class ScoreResult(Result):
     late: Mapping[str, Deadlines] = dataclasses.field(default_factory=dict)
 
     def view(self) -> View:
-        """Return a table a folder, records of real runs, EER_AV and its order.
-
-        Alerts are failures that ended routes, and wrong records of real runs.
-        """
+        """Return a table a folder, and EER_AV; alerts are failures and bad records."""
         tables, alerts = list[Table](), list[str]()
         for name, scores in self.scores.items():
             if name in self.real:
@@ -223,6 +217,7 @@ def score(
         RecipeError: The budget is not positive.
     """
     check_number("--budget-ms", budget_ms)
+    # A routes file is told from folders by its suffix
     scores, runs = dict[str, Scores](), dict[str, RealRun]()
     driven, measured = dict[str, Sequence[Episode]](), dict[str, int | None]()
     named = [path for path in map(Path, results) if path.suffix == ".xml"]
@@ -386,6 +381,7 @@ def scores_table(name: str, scores: Scores) -> Table:
 
 
 def _each(scores: Scores) -> Iterator[tuple[str, Estimate]]:
+    # The driver's grade, then its parts, then near misses
     yield "driving score", scores.driving_score
     yield "room kept", scores.safety.room_kept
     yield "success rate", scores.success_rate

@@ -104,6 +104,7 @@ class TrialFiles:
 
     def write(self, choice: Int8Choice, options: TrialOptions) -> str:
         """Write the recipe, and return a line that says what it makes int8."""
+        # The exact passes, then int8 of the choice
         before = [step.name for step in recipe.load("exact")]
         rules = options.rules or DEFAULT_RULES
         target = options.target or DEFAULT_TARGET
@@ -171,6 +172,7 @@ def search(
             f"--max-ms is measured on this CPU, where int8 for {options.target} is"
             f" slow: use --target {DEFAULT_TARGET}"
         )
+    # Nothing is measured before outputs and counter are known to be usable
     files = TrialFiles(model_path(model), Path(frames), Path(output))
     with files.claim_outputs(options):
         # Without a counter there are no joules

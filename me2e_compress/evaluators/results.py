@@ -26,10 +26,7 @@ LARGEST_SET = 1_000_000  # most routes of a set that a manifest may claim
 
 @dataclass
 class ResultsFolder:
-    """Results on disk; every file is complete or absent.
-
-    Routes of ``corrupt`` files, listed with the reason, count as not driven.
-    """
+    """Results on disk; routes of ``corrupt`` files count as not driven."""
 
     path: Path
     made_by: dict[str, Any]
@@ -41,8 +38,7 @@ class ResultsFolder:
     ) -> Self:
         """Create the folder, or resume one of the same evaluation; others are refused.
 
-        ``measured`` is the number of samples of the trace that latencies are drawn
-        from; None if none are drawn.
+        ``measured`` is the number of samples that latencies are drawn from, if any.
         """
         # Claim an empty folder
         with atomic.writing_errors(path, EvaluationError):

@@ -75,10 +75,7 @@ def speed_ratios(episode: Episode) -> tuple[float, ...]:
 
 
 def smoothness(episode: Episode) -> Measure:
-    """Return the share of smooth blocks of 20 frames ("Driving Smoothness").
-
-    Up to 20 frames form one block; with fewer than 3 the original raises an error.
-    """
+    """Return the share of smooth blocks of 20 frames ("Driving Smoothness")."""
     frames = episode.frames
     if len(frames) < 3:
         return Measure(None, "ratio", f"{len(frames)} frames, 3 are needed")

@@ -60,10 +60,7 @@ def charged(
     budget_ms: float = BUDGET_MS,
     measured: int | None = None,
 ) -> Deadlines | None:
-    """Compare the latencies charged in episodes with a budget; None if all are zero.
-
-    ``measured`` is that of :func:`deadlines`.
-    """
+    """Compare the latencies of episodes with a budget; None if all are zero."""
     latencies = [
         decision.latency_us for episode in episodes for decision in episode.decisions
     ]

@@ -165,10 +165,7 @@ def intervals(
 
 
 def unseen_share(n: int) -> float:
-    """Return the largest share that n draws without a hit leave open, with 95 %.
-
-    Exact, 1 - 0.05 ** (1 / n); the rule of three approximates it by 3 / n.
-    """
+    """Return the largest share that n draws without a hit leave open, with 95 %."""
     return float(1.0 - (1.0 - CONFIDENCE) ** (1.0 / n))
 
 
@@ -185,10 +182,7 @@ def unseen_interval(value: float, n: int, bounds: Bounds | None) -> Interval:
 
 
 def binomial_interval(successes: int, n: int) -> Interval:
-    """Return the exact (Clopper-Pearson) interval of a rate, in percent.
-
-    As if routes were independent of each other.
-    """
+    """Return the exact (Clopper-Pearson) interval of a rate, in percent."""
     from scipy.stats import binomtest  # takes a second to import
 
     if n == 0:
@@ -199,10 +193,7 @@ def binomial_interval(successes: int, n: int) -> Interval:
 
 @functools.lru_cache(maxsize=2)  # a page asks of the same routes hundreds of times
 def _weights(types: tuple[str, ...], seed: int) -> tuple[Floats, Floats]:
-    """Return two [resamples, routes] weights: drawn within types, and types anew.
-
-    Types with one route are one stratum together.
-    """
+    """Return two [resamples, routes] weights: drawn within types, and types anew."""
     names, type_of, sizes = np.unique(
         np.array(types, str), return_inverse=True, return_counts=True
     )

@@ -186,10 +186,7 @@ def filtered(
 
 
 def _blocked_frames(episode: Episode) -> npt.NDArray[np.bool_]:
-    """Mark the frames of every stop of 60 s, and of the stop that ended the route.
-
-    The last one may be a frame short on file: the rule is checked at finer steps.
-    """
+    """Mark the frames of every stop of 60 s, and of the stop that ended the route."""
     still = [frame.speed_mps <= BLOCKED_SPEED_MPS for frame in episode.frames]
     blocked = np.zeros(len(still), np.bool_)
     edges = np.flatnonzero(np.diff([False, *still, False]))

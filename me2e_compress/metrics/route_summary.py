@@ -244,8 +244,7 @@ class PairedDifference:
     def smallest_shown(self) -> float:
         """Smallest difference of driving scores that these routes can show, in points.
 
-        It is half the width of the interval under the usual scatter (`SCATTER`), or of
-        the actual interval if that is wider.
+        Half the interval's width, under the usual scatter (`SCATTER`) or more.
         """
         score, usual = self.driving_score, shown_by(self.driving_score.n)
         if score.low is None or score.high is None:

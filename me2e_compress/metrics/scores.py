@@ -98,10 +98,7 @@ class Scores:
 def score(
     episodes: Sequence[Episode], expected: int = FULL_SET, seed: int = 0
 ) -> Scores:
-    """Score a set of routes; their order affects nothing but the bootstrap.
-
-    ``expected`` is the number of routes of the whole set.
-    """
+    """Score a set of routes, of ``expected`` ones in the whole set."""
 
     def driving_score(episode: Episode) -> Measure:
         return Measure(route_scores.route_score(episode).composed, "%")
@@ -232,11 +229,7 @@ class Quotients:
 
 @dataclass(frozen=True, slots=True)
 class LeaderboardScores:
-    """Scores of a set of records, as given by the simulator and as computed here.
-
-    Driving scores, completion and success rate are percentages; a penalty is the
-    product of the factors of all infractions.
-    """
+    """Scores of records, as given by the simulator and as computed here."""
 
     set_size: int
     driven: int

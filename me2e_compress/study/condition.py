@@ -71,11 +71,7 @@ class Condition:
         return Drive.of_words(self.latency_model, self.dt_ms, self.weather)
 
     def source(self, seed: int) -> LatencySource:
-        """Return the latency source; one that lacks its trace waits for a model's.
-
-        ``seed`` applies if the text names none. A trace file is an error: it belongs to
-        a variant.
-        """
+        """Return the latency source, drawn by ``seed`` unless the text has one."""
         return with_draws(self._parsed, seed)
 
     @functools.cached_property

@@ -120,8 +120,7 @@ def _measure_traces(
 ) -> dict[str, LatencyTrace]:
     """Measure models in turn, or load the traces that were measured together before.
 
-    Models measured together share their noise, and a machine's speed varies from day to
-    day: traces are a set, of the same models, machine, samples and frames.
+    Models measured together share their noise: traces are stored as a set.
     """
     # Load the set if it is complete
     timing, frames = study.timing, CalibrationSet(held_out)
@@ -154,10 +153,7 @@ def compare_plans(
     prepared: PreparedVariant,
     listener: Listener,
 ) -> PlanFidelity:
-    """Run both models over the held-out frames, and compare their plans.
-
-    A model with another interface is not an error: the result has a reason instead.
-    """
+    """Compare the plans of both models on the held-out frames, or say why not."""
     # Reasons why there is nothing to compare
     if study.held_out is None:
         return PlanFidelity.unknown("no held-out frames were given")

@@ -165,10 +165,7 @@ class StudyCells:
     def _drive_cell(
         self, prepared: PreparedVariant, condition: Condition
     ) -> DriveRecord:
-        """Drive a variant under a condition, or resume it; record and score it.
-
-        A cell that cannot be driven has no routes but a reason.
-        """
+        """Drive a variant under a condition, or resume it; record and score it."""
         study, names = self.study, (prepared.name, condition.name)
         drive = self.drive(prepared, condition)
         if drive is None:

@@ -121,10 +121,7 @@ class StudyResult(Result):
         }
 
     def to_json(self) -> Any:
-        """Return a document; the same study and seed give the same bytes but latencies.
-
-        Latencies, and the scale derived from them, are below the keys ``latency``.
-        """
+        """Return a document: the same bytes of the same seed, but below ``latency``."""
         study, (driven, whole) = self.study, self.coverage
         content = {
             "title": study.title,

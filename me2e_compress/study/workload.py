@@ -61,10 +61,7 @@ class Workload(Result):
 
 
 def workload(study: Study, folder: str | Path, workers: int = 1) -> Workload:
-    """Count the missing routes, and estimate the hours.
-
-    A route costs world frames and decisions; the condition decides their ratio.
-    """
+    """Count the missing routes, and estimate the hours."""
     place, total = Workspace(Path(folder)), len(study.routes)
     drives = list[PlannedDrive]()
     for condition in study.conditions:

@@ -31,11 +31,7 @@ _LARGEST_SIZE, _LARGEST_RANK = 5, 4
 
 @dataclasses.dataclass(frozen=True)
 class DrawnCall:
-    """The inputs and attributes of one call of a fused operator, in some dialect.
-
-    ``inputs`` are by name, in the order of the dialect's operands; optional ones at the
-    end may be missing.
-    """
+    """The inputs, by name in the dialect's order, and attributes of one call."""
 
     inputs: Mapping[str, NdArray]
     attributes: Mapping[str, AttributeValue] = dataclasses.field(default_factory=dict)
@@ -171,6 +167,7 @@ def check_operator(
         VerificationError: it broke a promise; the message says which.
         Me2eError: it refused a call in a dialect of its own.
     """
+    # Its own form, the same for all operators
     check_form(operator, OPERATORS)
     name, own = operator.name, operator.own
     require(

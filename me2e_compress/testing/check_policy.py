@@ -40,6 +40,7 @@ def check_policy(driver: Driver) -> Answers:
         EvaluationError: it cannot be opened.
         MissingExtraError: the extra ``highway`` is not installed.
     """
+    # It is built from text, and has one fingerprint
     require_extra("highway", "check_policy")
     check_form(driver, POLICIES)
     name, prints = driver.name, {driver.fingerprint(), driver.fingerprint()}

@@ -140,9 +140,8 @@ class CollectedResults:
     def _chosen(self, route: str, records: Sequence[RouteRecord]) -> RouteRecord:
         """Choose one record of a route, so that uncertainty never improves a result.
 
-        A drive replaces a crash, as when Bench2Drive resumes. Among drives with
-        different results the lowest score counts: taking the best would bias the
-        evaluation.
+        A drive replaces a crash, as when Bench2Drive resumes; of different results the
+        lowest score counts.
         """
         # Identical copies count once
         distinct = list({record.content: record for record in records}.values())

@@ -51,11 +51,7 @@ class RecordedRoute:
         return bool((np.diff(self.steps) > 0).all())
 
     def frames(self, interval_s: float) -> tuple[EgoFrame, ...]:
-        """Return one frame per step.
-
-        The speed is the derivative of the position. Route progress is not recorded:
-        ``route_m`` is the distance driven.
-        """
+        """Return one frame per step; ``route_m`` is the distance driven."""
         # One column per field of a frame
         moved = _lengths(np.diff(self.position_m, axis=0))
         speeds = np.zeros(len(self.steps))
@@ -83,8 +79,8 @@ class RecordedRoute:
     def interval_s(self, duration_s: float | None = None) -> float:
         """Return the seconds from one step to the next.
 
-        That is the usual interval within 10 % of the route's duration divided by the
-        steps; without one, the agent's steps are taken as ticks.
+        That is the usual interval within 10 % of duration over steps, else the median
+        number of ticks.
         """
         if duration_s is not None:
             mean_s = duration_s / len(self.steps)

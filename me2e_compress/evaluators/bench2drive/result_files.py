@@ -71,10 +71,7 @@ class RouteRecord:
 
 
 def read_record(raw: object) -> RouteRecord:
-    """Read one parsed record; its numbers may be infinite or NaN.
-
-    An unfinished route raises a `BrokenRecordError`, too.
-    """
+    """Parse one finished record; a `BrokenRecordError` if it is not whole."""
     try:
         record = _Record.model_validate(raw)
     except ValidationError as error:
@@ -198,10 +195,7 @@ _RECORDING, _DECISIONS = "metric_info.json", "decisions.jsonl"
 
 @dataclass
 class ResultFile:
-    """One results file: a worker's checkpoint, or several merged.
-
-    ``whole`` is whether all of its records could be read.
-    """
+    """One results file; ``whole`` if all of its records could be read."""
 
     path: Path
     records: tuple[RouteRecord, ...] = ()
@@ -210,10 +204,7 @@ class ResultFile:
 
 @dataclass
 class RunFiles:
-    """Files of a run below a folder, ordered by path.
-
-    ``broken`` says why files, and records in files, could not be read.
-    """
+    """Files of a run below a folder, ordered by path, and why some are broken."""
 
     results: list[ResultFile] = field(default_factory=list)
     recordings: list[Path] = field(default_factory=list)

@@ -100,10 +100,7 @@ class AnchoredPlan:
         return float(x), float(y)
 
     def travel_at(self, seconds: float) -> float:
-        """Return how far (m) the plan has advanced some time after it was computed.
-
-        After the last waypoint the plan continues at its last speed.
-        """
+        """Return metres travelled after seconds; after the end at the last speed."""
         times = self.times_s
         last_speed = (self.travel_m[-1] - self.travel_m[-2]) / (times[-1] - times[-2])
         beyond = max(seconds - times[-1], 0.0) * last_speed
@@ -112,9 +109,7 @@ class AnchoredPlan:
     def control(self, ego: Ego, time_us: int) -> Control:
         """Return the control that follows the plan from the ego's present state.
 
-        The runner asks once per decision, at the frame of the observation; the latency
-        model says when the control acts and for how long (`driving.realtime`). It does
-        not steer between two decisions.
+        It is computed once per decision and does not steer between two of them.
         """
         # Acceleration: the least-squares fit to the positions in 0.5 s and 1 s
         age_s = (time_us - self.time_us) / 1e6
@@ -165,8 +160,7 @@ def _advance_only(points: Floats) -> tuple[Floats, Floats]:
 def _smooth(knots: Floats, course: float) -> Floats:
     """Return [M, 2] points every 0.25 m: cubic through the knots, then straight.
 
-    The curve leaves the first knot along ``course`` (rad, the direction of travel) and
-    has no curvature at the last.
+    ``course`` (rad) is the direction of travel at the first knot.
     """
     # A spline that starts along the course and ends straight
     tangent = np.array([math.cos(course), math.sin(course)])

@@ -196,10 +196,9 @@ CONNECT_TIMEOUT_S = 5.0
 
 @dataclass(frozen=True)
 class RayEngine:
-    """One Ray actor per worker; model files must be readable from every node.
+    """One Ray actor and CPU per worker; all nodes must be able to read the model.
 
-    Each worker takes one CPU of the cluster. Without an address, a cluster is started
-    on this machine for the duration of the evaluation.
+    Without an address, a cluster is started on this machine meanwhile.
     """
 
     workers: int = 1

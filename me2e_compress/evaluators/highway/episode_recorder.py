@@ -134,19 +134,13 @@ def failed_episode(route: Route, completion_percent: float, failure: str) -> Epi
 
 
 def completion_percent(world: World) -> float:
-    """Return how much of the route was passed while its goal is not reached.
-
-    It has two digits, as in the leaderboard; only reaching the goal makes it 100.
-    """
+    """Return the percentage of the route that was passed: 100 at the goal alone."""
     percent = round(100.0 * world.progress_m / world.path.goal_m, 2)
     return min(max(percent, 0.0), 99.99)
 
 
 def junction_m(path: RoutePath) -> float | None:
-    """Return where the first junction of a route begins, None if there is none.
-
-    Its command is announced 20 m ahead.
-    """
+    """Return metres to the first junction of a route, None if there is none."""
     for station, command in enumerate(path.commands):
         if station < path.goal_m and Command(int(command)) in TURNS:
             return station + ANNOUNCED_M
@@ -293,8 +287,7 @@ def at_fault(contact: Contact, ego: Ego, roadmap: Roadmap) -> bool:
     """Return whether the ego could have prevented a contact, as nuPlan judges it.
 
     It could if it ran into something that stood, or hit with its front; or if it was
-    hit at the side while not wholly in one lane (a lane and its successor count as
-    one).
+    hit at the side while not wholly in one lane.
     """
     if contact is not Contact.SIDE:
         return contact in AT_FAULT

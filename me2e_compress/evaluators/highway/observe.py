@@ -76,10 +76,7 @@ class ObservationBuilder:
         self._nodes = RouteNodes.along(self.world.path)
 
     def observe(self, scene: Scene) -> Observation:
-        """Return what the policy sees at this scene; call it once per decision.
-
-        The CAN bus counts metres and degrees since the last call.
-        """
+        """Return the observation at a scene; the CAN bus counts from the last call."""
         images = self.cameras.render(scene) if self.cameras is not None else None
         can_bus = can_bus_of(scene.ego, self._last)
         self._last = scene.ego

@@ -56,10 +56,7 @@ def svg(figure: Figure) -> Markup:
 
 @dataclass(frozen=True)
 class Mark:
-    """A number, the words above it, and a line from its low to its high end.
-
-    ``filled`` is whether the dot is; a difference that may be chance has an empty one.
-    """
+    """A number, the words above it, and a line from its low to its high end."""
 
     place: float
     colour: str
@@ -90,11 +87,7 @@ class Panel:
 
 
 def answer(outcome: StudyResult) -> Markup:
-    """Draw size, time, plan and driving score of every variant.
-
-    A row a variant, with a line for every condition in the panel of the driving score;
-    of too many drives those under the first condition alone.
-    """
+    """Draw size, time, plan and driving score, a row a variant."""
     names = [condition.name for condition in outcome.study.conditions]
     if len(outcome.drives) > MOST_DRIVES:
         names = names[:1]
