@@ -66,8 +66,13 @@ class CompareResult(Comparison, Result):
     """How close a graph stays to another, and what puts that in doubt."""
 
     keys = (
-        *("*fidelity", "agents", "liveness", "runtime"),
-        *("slow_here", "known", "not_finite"),
+        "*fidelity",
+        "agents",
+        "liveness",
+        "runtime",
+        "slow_here",
+        "known",
+        "not_finite",
     )
     reference: Path
     candidate: Path

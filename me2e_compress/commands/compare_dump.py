@@ -129,6 +129,7 @@ def compare_dump(
             f"{engine.path}: {unknown[0]} is no tensor of {path}, whose outputs"
             f" are {', '.join(outputs)}"
         )
+    del whole  # it is opened again, with the adapter's metadata
     lacking = [name for name in outputs if name not in engine.names]
     notes = (f"not dumped: {', '.join(lacking)}",) if lacking else ()
     # Run the graph on the engine's state, and its float source beside it
