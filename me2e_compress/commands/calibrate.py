@@ -146,7 +146,7 @@ def calibrate(
                 )
                 ranges = Ranges.of(statistics, OBSERVERS.parse(method))
             ranges.save(output)
-            # what an imported cache has no range for stays in float
+            # Tensors without a range in an imported cache stay in float
             cache = Path(options.imported or "")
             if missing:
                 absent = f"not in {cache.name}"

@@ -79,7 +79,7 @@ class EvaluateResult(Result):
     """How a policy drives."""
 
     keys = ("*scores", "deadlines", "slow_here")
-    policy: str  # the policy as named, or the evaluator where that drives none
+    policy: str  # its name, or the evaluator where that drives none
     output: Path
     scores: Scores
     pictures: tuple[Path, ...] = ()

@@ -40,9 +40,9 @@ class FramesResult(Result):
 
     stack: str
     output: Path
-    frames: int  # how many lie there: a log may have fewer than were asked for
-    seed: int | None = None  # none of a log
-    log: str | None = None  # the log that they were read from, as it is written
+    frames: int  # a log may have fewer than were asked for
+    seed: int | None = None  # None for a log
+    log: str | None = None  # the log that they are from, as text
 
     @classmethod
     def of(cls, stack: str, output: Path, options: FramesOptions) -> Self:

@@ -46,8 +46,8 @@ class RuleSummary:
 class LintResult(Result):
     """The findings of our rules, and TensorRT-RTX's answer."""
 
-    model: Path  # the file
-    options: LintOptions  # what was asked, and how
+    model: Path
+    options: LintOptions
     findings: tuple[LintFinding, ...]  # the worst first
     build: BuildResult | None = None  # TensorRT-RTX's answer; None if not asked
     asked: bool = True  # whether a user named the target; else a pass did

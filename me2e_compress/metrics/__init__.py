@@ -1,3 +1,3 @@
 """Scores of driven episodes, independent of any simulator, model or pass."""
 
-BUDGET_MS = 50.0  # what a decision may take: a frame at 20 Hz
+BUDGET_MS = 50.0  # limit of a decision: a frame at 20 Hz

@@ -96,7 +96,7 @@ class EerResult:
     scores: Mapping[str, Estimate]
     # [n] points per route by variant, for paired comparisons
     routes: Mapping[str, Floats]
-    scale: EerScale | None  # none if nothing could be scored
+    scale: EerScale | None  # None if nothing could be scored
     # Number of routes left out of all variants, by the missing measure
     left_out: Mapping[str, int]
     is_scored: npt.NDArray[np.bool_]  # (all routes,)

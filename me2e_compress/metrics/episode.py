@@ -243,7 +243,7 @@ class Episode:
     # Ego speed over traffic speed at the check points, if the simulator reported them;
     # None if they follow from the frames
     speed_ratios_percent: tuple[Number, ...] | None = None
-    given: Given | None = None  # what the simulator itself scored, if anything
+    given: Given | None = None  # scores of the simulator itself, if there are any
     conflicts: ConflictRecord | None = None  # None if it was not recorded
 
     @property

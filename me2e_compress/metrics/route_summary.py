@@ -57,7 +57,7 @@ class RouteSummary:
     ending: str
     # Kind, microseconds if known, and the other party
     infractions: tuple[tuple[str, int | None, str], ...]
-    efficiency: float | None  # none if no traffic moved, or the ego did not
+    efficiency: float | None  # None if no traffic moved, or the ego did not
     comfort: float | None  # share of smooth segments; None if there was no whole one
     duration_us: int  # time of the last frame
     decisions: int

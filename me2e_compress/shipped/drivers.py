@@ -55,7 +55,7 @@ class ModelCard(pydantic.BaseModel):
     bytes: int = pydantic.Field(gt=0)  # of the `.onnx`
     parameters: int = pydantic.Field(gt=0)  # number of trained parameters
     seed: int  # of the initial weights and of all random choices in training
-    data: TrainingData  # the training data
+    data: TrainingData
     # a description of the training, and a command that trains such a model
     command: str
     # of training, on the machine that the page of `command` names; None: not measured

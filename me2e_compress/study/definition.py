@@ -163,7 +163,7 @@ class Timing:
     """How latencies are measured, and which device they represent."""
 
     samples: AtLeastOne = 200  # timed inferences per model
-    threads: AtLeastOne = 1  # threads of onnxruntime
+    threads: AtLeastOne = 1
     # Median latency of the baseline on the target device; it sets one scale for all
     # models. None takes this machine as it is.
     baseline_median_s: Positive | None = None
@@ -187,7 +187,7 @@ class FramesToRecord:
     frames: AtLeastOne  # number of frames to calibrate on
     # Number of frames to measure fidelity and latency on, of the next seed
     held_out: AtLeastOne
-    seed: Count = 0  # seed of the routes
+    seed: Count = 0
 
 
 class Pair(NamedTuple):
@@ -208,7 +208,7 @@ class Study:
         EvaluationError: The evaluator or its routes are unknown.
     """
 
-    title: str  # title of the report
+    title: str
     # Variants and conditions are in the order of the tables
     variants: Annotated[tuple[Variant, ...], Field(alias="variant")]
     conditions: Annotated[tuple[Condition, ...], Field(alias="condition")]
@@ -228,7 +228,7 @@ class Study:
     # condition the baseline drives too.
     blocks: Annotated[tuple[StudyBlock, ...], Field(alias="block")] = ()
     pairs: Annotated[tuple[Pair, ...], Field(alias="pair")] = ()  # drives to compare
-    evaluator: str = "highway"  # who drives, `name{option=value}`
+    evaluator: str = "highway"  # `name{option=value}`
     policy: PolicyText = ""  # that of variants that name none
     plugins: tuple[File, ...] = ()  # libraries of operators for the provider
 

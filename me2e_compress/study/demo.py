@@ -28,7 +28,7 @@ from me2e_compress.targets import DEFAULT_TARGET
 CALIBRATION_FRAMES, HELD_OUT_FRAMES = 64, 24
 LATENCY_SAMPLES, WORKERS = 100, 2
 DRIVER, FLOAT, RECIPE = "highway", "float", "full-fused"
-ROUTES = "5"  # what both drive: a number of routes, or their names
+ROUTES = "5"  # a number of routes that both drive, or their names
 
 
 @dataclasses.dataclass(frozen=True, repr=False)

@@ -60,7 +60,7 @@ class PreparedVariant:
     source: str = ""  # name of the file that passes were applied to
     pipeline: str = ""  # the passes, as text; empty if the model is its own source
     sha256: str | None = None
-    size_bytes: int | None = None  # size of the model with its weights
+    size_bytes: int | None = None  # with its weights
     failure: str = ""  # why there is no model that can drive; empty if there is one
     weights: str = ""  # origin of the weights, such as a checkpoint; empty if unknown
     # Plan and state of adapter and map, as metadata of the graph

@@ -61,8 +61,8 @@ class RouteRecord:
     number: str  # the route's id in its routes file, such as `1711`
     recording: str | None  # name of the folder of its `metric_info.json`, if any
     duration_s: float | None  # simulated seconds; None if not stated
-    content: str  # result of the route, to tell a copy from another drive
-    notes: tuple[str, ...] = ()  # what could not be interpreted, one line each
+    content: str  # result of the route: equal for a copy of the record
+    notes: tuple[str, ...] = ()  # values that could not be interpreted, one line each
 
     @property
     def crashed(self) -> bool:
