@@ -16,7 +16,7 @@ from me2e_compress.metrics.measure import (
     Estimate,
     Floats,
     Measure,
-    drawn,
+    draw_weights,
     intervals,
     is_a_point,
     mean_estimate,
@@ -171,7 +171,7 @@ def drawn_anew(
         return np.zeros(0)
     sums = np.zeros((len(names), rows.shape[1]))
     np.add.at(sums, type_of, rows)
-    weights = drawn(np.random.default_rng(seed), len(names), TRIALS)
+    weights = draw_weights(np.random.default_rng(seed), len(names), TRIALS)
     return np.asarray(of_sums(weights @ sums))
 
 

@@ -24,7 +24,11 @@ from me2e_compress.evaluators.contract import Drive, Evaluator, evaluator_named
 from me2e_compress.evaluators.highway.drivers import OnnxDriver
 from me2e_compress.evaluators.highway.engine import engine_named
 from me2e_compress.evaluators.results import MANIFEST, drive_routes, log_beside
-from me2e_compress.metrics.deadlines import Deadlines, charged, deadlines_table
+from me2e_compress.metrics.deadlines import (
+    Deadlines,
+    charged_deadlines,
+    deadlines_table,
+)
 from me2e_compress.metrics.scores import Scores
 from me2e_compress.metrics.scores import score as score_episodes
 from me2e_compress.runtime.providers import CPU
@@ -160,7 +164,7 @@ def evaluate(
             if driver is not None
             for file in evaluator.render(driver, drive, route, output)
         )
-        late = charged(episodes, measured=drive.latency.measured)
+        late = charged_deadlines(episodes, measured=drive.latency.measured)
         if isinstance(driver, OnnxDriver):
             slow = slow_here(graph.load(driver.path), options.runs_on)
     name = evaluator.name if policy is None else str(policy)

@@ -25,7 +25,11 @@ from me2e_compress.evaluators.bench2drive.result_files import holds_records
 from me2e_compress.evaluators.results import MANIFEST, ResultsFolder
 from me2e_compress.metrics import BUDGET_MS
 from me2e_compress.metrics import scores as metrics
-from me2e_compress.metrics.deadlines import Deadlines, charged, deadlines_table
+from me2e_compress.metrics.deadlines import (
+    Deadlines,
+    charged_deadlines,
+    deadlines_table,
+)
 from me2e_compress.metrics.eer import MEASURES, EerResult, eer, route_measures
 from me2e_compress.metrics.episode import Episode
 from me2e_compress.metrics.measure import Estimate
@@ -242,12 +246,11 @@ def score(
             )
         recordings = None if real_metrics is None else Path(real_metrics)
         collected = Bench2DriveResults(path, recordings, *named).collect()
-        episodes = collected.episodes
         set_size = collected.set_size * collected.repetitions
-        scores[str(path)] = metrics.score(episodes, set_size)
-        board = leaderboard_scores(episodes, set_size)
+        scores[str(path)] = metrics.score(collected.episodes, set_size)
+        board = leaderboard_scores(collected.episodes, set_size)
         runs[str(path)] = RealRun(collected, scores[str(path)], board)
-        driven[str(path)] = episodes
+        driven[str(path)] = collected.episodes
     # it would be ignored without a word
     if real_metrics is not None and not runs:
         raise EvaluationError(
@@ -255,12 +258,12 @@ def score(
         )
     if named and not runs:
         raise EvaluationError(f"{named[0]}: it names the set of real runs: give one")
-    # folders whose decisions cost nothing have no deadlines
-    late = {
-        name: deadlines
-        for name, episodes in driven.items()
-        if (deadlines := charged(episodes, budget_ms, measured.get(name))) is not None
-    }
+    # Folders whose decisions cost nothing have no deadlines
+    late = dict[str, Deadlines]()
+    for name, episodes in driven.items():
+        charged = charged_deadlines(episodes, budget_ms, measured.get(name))
+        if charged is not None:
+            late[name] = charged
     return ScoreResult(scores, runs, score_eer(driven, joules or {}), late)
 
 

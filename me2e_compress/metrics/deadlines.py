@@ -55,7 +55,7 @@ def deadlines(
     return Deadlines(budget_ms, count, measures)
 
 
-def charged(
+def charged_deadlines(
     episodes: Iterable[Episode],
     budget_ms: float = BUDGET_MS,
     measured: int | None = None,

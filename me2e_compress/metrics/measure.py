@@ -202,14 +202,16 @@ def _weights(types: tuple[str, ...], seed: int) -> tuple[Floats, Floats]:
     random, within = np.random.default_rng(seed), np.zeros((RESAMPLES, len(stratum)))
     for name in np.unique(stratum):
         members = np.flatnonzero(stratum == name)
-        within[:, members] = drawn(random, len(members))
-    anew = drawn(np.random.default_rng(seed), len(names))[:, type_of]
+        within[:, members] = draw_weights(random, len(members))
+    anew = draw_weights(np.random.default_rng(seed), len(names))[:, type_of]
     within.setflags(write=False)
     anew.setflags(write=False)
     return within, anew
 
 
-def drawn(random: np.random.Generator, size: int, resamples: int = RESAMPLES) -> Floats:
+def draw_weights(
+    random: np.random.Generator, size: int, resamples: int = RESAMPLES
+) -> Floats:
     """Return [resamples, size] how often each was drawn, scaled to a sum of size."""
     # Count the draws of every resample at once: its own range of bins
     draws = max(size - 1, 1)

@@ -215,7 +215,7 @@ SCATTER = 26.0
 Z = 1.96  # standard score of a 95 % interval
 
 
-def shown_by(routes: int) -> float:
+def smallest_difference(routes: int) -> float:
     """Return the smallest difference that so many routes can show, in points."""
     return Z * SCATTER / math.sqrt(routes)
 
@@ -246,7 +246,7 @@ class PairedDifference:
 
         Half the interval's width, under the usual scatter (`SCATTER`) or more.
         """
-        score, usual = self.driving_score, shown_by(self.driving_score.n)
+        score, usual = self.driving_score, smallest_difference(self.driving_score.n)
         if score.low is None or score.high is None:
             return usual
         return max(usual, (score.high - score.low) / 2)
@@ -255,7 +255,7 @@ class PairedDifference:
     def verdict(self) -> str:
         """Say in a word or two what these routes show about the driving score."""
         score = self.driving_score
-        if abs(score.value or 0.0) < shown_by(score.n) or score.low is None:
+        if abs(score.value or 0.0) < smallest_difference(score.n) or score.low is None:
             return "too few routes"
         return ("no difference shown", "better", "worse")[score.sign]
 

@@ -159,7 +159,7 @@ class Comparison:
     success_rate: Estimate
 
 
-def compared(
+def compare_pairs(
     pairs: Sequence[tuple[str, str]], drives: Sequence[DriveRecord], seed: int
 ) -> tuple[Comparison, ...]:
     """Compare pairs of drives (``VARIANT.CONDITION``) if both were driven."""

@@ -16,7 +16,7 @@ from me2e_compress.runtime.providers import PROVIDERS
 from me2e_compress.study.cells import MISSING, anew_cell, estimate_cell, measure_cell
 from me2e_compress.study.condition import Condition
 from me2e_compress.study.definition import Study
-from me2e_compress.study.drive_record import Comparison, DriveRecord, compared
+from me2e_compress.study.drive_record import Comparison, DriveRecord, compare_pairs
 from me2e_compress.study.prepared import PreparedVariant
 
 SCORES = tuple(column.name for column in COLUMNS)
@@ -73,7 +73,7 @@ class StudyResult(Result):
     @cached_property
     def pairs(self) -> tuple[Comparison, ...]:
         """Comparisons of the pairs that the study names."""
-        return compared(self.study.pairs, self.drives, self.study.seed)
+        return compare_pairs(self.study.pairs, self.drives, self.study.seed)
 
     def variant(self, name: str) -> PreparedVariant:
         """Return a variant by its name."""

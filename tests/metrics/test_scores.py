@@ -10,7 +10,11 @@ from me2e_compress.commands.evaluate import EvaluateResult
 from me2e_compress.commands.result import Result, plain
 from me2e_compress.commands.score import ScoreResult, scores_table
 from me2e_compress.metrics.bench2drive import ABILITIES
-from me2e_compress.metrics.deadlines import charged, deadlines, deadlines_table
+from me2e_compress.metrics.deadlines import (
+    charged_deadlines,
+    deadlines,
+    deadlines_table,
+)
 from me2e_compress.metrics.episode import (
     ConflictRecord,
     Encounter,
@@ -249,9 +253,9 @@ def test_latencies_of_all_episodes_are_compared_unless_they_cost_nothing() -> No
     taken = tuple(InferenceRecord(0, latency_us) for latency_us in (10, 20))
     episode = replace(drive(), decisions=taken)
 
-    result = charged([episode, episode])
+    result = charged_deadlines([episode, episode])
 
     assert result is not None
     assert result.count == 4
     free = replace(drive(), decisions=(InferenceRecord(0, 0),))
-    assert charged([free]) is None  # decisions that cost nothing
+    assert charged_deadlines([free]) is None  # decisions that cost nothing

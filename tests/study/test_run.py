@@ -23,7 +23,7 @@ from me2e_compress.study import (
     run_study,
 )
 from me2e_compress.study.definition import FramesToRecord
-from me2e_compress.study.drive_record import DriveRecord, compared
+from me2e_compress.study.drive_record import DriveRecord, compare_pairs
 from me2e_compress.study.study_result import pair_table
 from tests.evaluators.highway.drivers import straight_on
 from tests.study.conftest import BLIND, IDEAL, ROUTES, SLOW, Make
@@ -318,19 +318,19 @@ DRIVES = (
 
 def test_a_pair_crosses_conditions_and_what_was_not_driven_is_left_out() -> None:
     asked = [("int8.fog", "float.ideal")]
-    [pair] = compared(asked, DRIVES, 0)
+    [pair] = compare_pairs(asked, DRIVES, 0)
     assert pair.driving_score.value == pytest.approx((-40 - 10 - 20 - 40) / 4)
     assert pair.driving_score.n == 4
     assert pair.success_rate.value == pytest.approx(-75.0)
     assert pair.room_kept.value == pytest.approx((-40 - 10 - 20 - 40) / 8)
-    assert compared(asked, DRIVES[:3], 0) == ()
+    assert compare_pairs(asked, DRIVES[:3], 0) == ()
 
 
 def test_a_table_of_pairs() -> None:
     class Outcome:
         """A study's outcome, so far as this table reads it."""
 
-        pairs = compared([("int8.fog", "float.ideal")], DRIVES, 0)
+        pairs = compare_pairs([("int8.fog", "float.ideal")], DRIVES, 0)
 
     table = pair_table(Outcome())  # type: ignore[arg-type]
 

@@ -13,7 +13,7 @@ from me2e_compress.base.atomic import MARK, write_bytes, write_document
 from me2e_compress.base.display import Table, escape_markdown, plural
 from me2e_compress.base.errors import StudyError
 from me2e_compress.commands.checks import writing
-from me2e_compress.metrics.route_summary import shown_by
+from me2e_compress.metrics.route_summary import smallest_difference
 from me2e_compress.study.cells import estimate_cell
 from me2e_compress.study.report.figures import MOST_DRIVES, answer, differences, road
 from me2e_compress.study.study_result import StudyResult
@@ -197,7 +197,9 @@ def limits(outcome: StudyResult) -> str:
     if not gaps:
         return ""
     (routes, whole), least = outcome.coverage, max(gap.smallest_shown for gap in gaps)
-    rest = f", all {whole} none below {shown_by(whole):.1f}" if routes < whole else ""
+    rest = ""
+    if routes < whole:
+        rest = f", all {whole} none below {smallest_difference(whole):.1f}"
     note = (
         f"Differences to {outcome.study.baseline} on the same routes, in brackets the"
         f" 95 % interval of the mean. {plural(routes, 'route')} cannot show a"
