@@ -1,11 +1,9 @@
 """Closed-loop evaluation in highway-env: routes that do not depend on one another."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
 from me2e_compress.base.errors import EvaluationError
 from me2e_compress.base.extras import require_extra
@@ -32,9 +30,6 @@ from me2e_compress.simulator.routes import (
     pick_routes,
 )
 from me2e_compress.version import __version__
-
-if TYPE_CHECKING:
-    from me2e_compress.simulator.pictures import Moment
 
 EVERY_US = 200_000  # simulated time between two frames of an animation
 STRIP = 4  # moments of the strip
@@ -130,7 +125,7 @@ class Highway(Evaluator):
         """
         from me2e_compress.evaluators.highway import runner
         from me2e_compress.simulator.cameras.ground import paint_texture
-        from me2e_compress.simulator.pictures import RoutePicture, write_picture
+        from me2e_compress.simulator.pictures import Moment, RoutePicture, write_picture
         from me2e_compress.simulator.world import World
 
         moments: list[Moment] = []
