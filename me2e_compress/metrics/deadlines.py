@@ -40,18 +40,21 @@ def deadlines(
     from; None if each was measured on its own.
     """
     # A percentile needs enough samples of its own
-    count, none = len(latencies_us), "no decision was taken"
+    count = len(latencies_us)
+    none, measures = "" if count else "no decision was taken", dict[str, Measure]()
     samples = count if measured is None else min(count, measured)
-    late = sum(latency_us > 1e3 * budget_ms for latency_us in latencies_us)
-    measures = dict[str, Measure]()
     for name, percent in PERCENTILES.items():
-        why = too_few(percent, samples) if count else none
+        why = none or too_few(percent, samples)
         value = None if why else percentile(latencies_us, percent) / 1e3
         measures[name] = Measure(value, "ms", why)
-    measures["mean_ms"] = _mean(latencies_us, none)
-    measures["max_ms"] = _mean([max(latencies_us)] if count else (), none)
-    over = Measure(100.0 * late / count, "%") if count else Measure(None, "%", none)
-    measures["over_budget_percent"] = over
+    # The mean, the largest, and the share that is late
+    late = sum(latency_us > 1e3 * budget_ms for latency_us in latencies_us)
+    values = {
+        "mean_ms": (fmean(latencies_us) / 1e3 if count else None, "ms"),
+        "max_ms": (max(latencies_us) / 1e3 if count else None, "ms"),
+        "over_budget_percent": (100.0 * late / count if count else None, "%"),
+    }
+    measures |= {name: Measure(*own, none) for name, own in values.items()}
     return Deadlines(budget_ms, count, measures)
 
 
@@ -65,12 +68,6 @@ def charged_deadlines(
         decision.latency_us for episode in episodes for decision in episode.decisions
     ]
     return deadlines(latencies, budget_ms, measured) if any(latencies) else None
-
-
-def _mean(latencies_us: Sequence[int], why: str) -> Measure:
-    if not latencies_us:
-        return Measure(None, "ms", why)
-    return Measure(fmean(latencies_us) / 1e3, "ms")
 
 
 def deadlines_table(title: str, deadlines: Deadlines) -> Table:

@@ -56,16 +56,13 @@ def check_policy(driver: Driver) -> Answers:
 
 
 def _equal(answers: Answers, others: Answers) -> bool:
-    return all(
-        np.array_equal(_answer_array(one), _answer_array(other))
-        for one, other in zip(answers, others, strict=True)
-    )
+    def array(answer: Trajectory | PedalsAndWheel) -> npt.NDArray[np.floating]:
+        if isinstance(answer, PedalsAndWheel):
+            return np.array(answer)
+        return np.column_stack([answer.points, answer.times_s])
 
-
-def _answer_array(answer: Trajectory | PedalsAndWheel) -> npt.NDArray[np.floating]:
-    if isinstance(answer, PedalsAndWheel):
-        return np.array(answer)
-    return np.column_stack([answer.points, answer.times_s])
+    pairs = zip(answers, others, strict=True)
+    return all(np.array_equal(array(one), array(other)) for one, other in pairs)
 
 
 def _answers(driver: Driver, policy: Policy) -> Answers:
