@@ -201,11 +201,7 @@ class Evaluator(abc.ABC):
         opened(policy)
 
     def made_by(self, policy: Driver | None, drive: Drive) -> dict[str, Any]:
-        """Return what decides the bytes of the results, but for the routes.
-
-        Raises:
-            EvaluationError: See `check_policy`.
-        """
+        """Return all that decides the results but the routes; see `check_policy`."""
         if policy is not None:
             self.check_policy(policy)
         made = {
@@ -227,11 +223,7 @@ class Evaluator(abc.ABC):
         raise NotImplementedError
 
     def check_takes(self, options: Iterable[str], whose: str = "") -> None:
-        """Refuse options (names of abilities, or flags) that it does not take.
-
-        Raises:
-            EvaluationError: It names the first of them.
-        """
+        """Raise an EvaluationError at the first option that it does not take."""
         for option in options:
             if option not in self.takes:
                 takes = ", ".join(name for name in ABILITIES if name in self.takes)
@@ -255,20 +247,12 @@ EVALUATORS: Registry[Evaluator] = Registry(
 
 
 def evaluator_named(text: str) -> Evaluator:
-    """Build an evaluator from ``name`` or ``name{option=value}``.
-
-    Raises:
-        EvaluationError: There is none, or it lacks what it declares.
-    """
+    """Build an evaluator from ``name{option=value}``; an EvaluationError if none fits."""
     return with_abilities(EVALUATORS.parse(text))
 
 
 def with_abilities(evaluator: Evaluator) -> Evaluator:
-    """Return an evaluator that has what it declares.
-
-    Raises:
-        EvaluationError: It lacks what it declares.
-    """
+    """Return the evaluator; an EvaluationError if it lacks what it declares."""
     name, cls = evaluator.name, type(evaluator)
     if not isinstance(evaluator, Evaluator):
         raise EvaluationError(

@@ -69,11 +69,7 @@ class ResultsFolder:
 
     @classmethod
     def open(cls, path: Path) -> Self:
-        """Open an existing folder.
-
-        Raises:
-            EvaluationError: Its manifest is missing or malformed.
-        """
+        """Open a folder; an EvaluationError if its manifest is missing or malformed."""
         with documents.reading(path / MANIFEST, EvaluationError, "not JSON"):
             made_by = documents.from_json(documents.read_bytes(path / MANIFEST))
         if not isinstance(made_by, dict) or not isinstance(made_by.get("routes"), list):

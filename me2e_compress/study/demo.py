@@ -85,13 +85,10 @@ class DriverDemo:
     """Compress the shipped driver and compare both, on frames and on the road.
 
     ``out`` is the folder of all files; ``force`` replaces files that we did not write.
-
-    Raises:
-        GraphError: The output folder is a file, or a user's file would be overwritten.
+    Outputs are checked first, since the work takes minutes.
     """
 
     def __init__(self, out: Path, force: bool = False) -> None:
-        """Check the outputs first: the work takes minutes."""
         self.out, self.force = out, force
         self._source = out / f"{DRIVER}.onnx"
         self._small = out / f"{DRIVER}.{RECIPE}.onnx"

@@ -63,12 +63,7 @@ class Highway(Evaluator):
         opened(policy)
 
     def made_by(self, policy: Driver | None, drive: Drive) -> dict[str, Any]:
-        """Return policy, image size, conditions and a digest of the routes.
-
-        Raises:
-            EvaluationError: The policy is none, or cannot be opened.
-            MissingExtraError: The extra ``highway`` is not installed.
-        """
+        """Return policy, image size, conditions and a digest of the routes."""
         if policy is None:
             raise EvaluationError(f"{self.name} drives a policy: name one")
         require_extra("highway", "driving")
