@@ -247,7 +247,7 @@ EVALUATORS: Registry[Evaluator] = Registry(
 
 
 def evaluator_named(text: str) -> Evaluator:
-    """Build an evaluator from ``name{option=value}``; an EvaluationError if none fits."""
+    """Build an evaluator from ``name{option=value}``, or raise EvaluationError."""
     return with_abilities(EVALUATORS.parse(text))
 
 
