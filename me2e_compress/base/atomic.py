@@ -16,20 +16,20 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+# What a file says, in a comment or as metadata of its format
 MARK = "me2e-compress wrote this file"
-"""What a file says, in a comment or as metadata of its format."""
+# The mark as the comment of a zip archive, or after the end of raw data
 BYTES = MARK.encode()
-"""The mark as the comment of a zip archive, or after the end of raw data."""
 IN_JSON = {"generator": MARK}
 IN_TOML = f"# {MARK}\n\n"
 IN_MARKDOWN = f"<!-- {MARK} -->\n\n"
 
+# What ONNX models name as the program that wrote them
 PRODUCER = "me2e-compress"
-"""What ONNX models name as the program that wrote them."""
+# ModelProto.producer_name is field 2, and stands before the graph (onnx.proto)
 _IN_ONNX = b"\x12" + bytes([len(PRODUCER)]) + PRODUCER.encode()
-"""ModelProto.producer_name is field 2, and stands before the graph (onnx.proto)."""
+# Bytes that are read at each end of a file, however large it is
 _END_BYTES = 4096
-"""Bytes that are read at each end of a file, however large it is."""
 
 
 def is_marked(path: Path) -> bool:
@@ -50,8 +50,8 @@ def is_marked(path: Path) -> bool:
     return _IN_ONNX in head or any(BYTES in each for each in ends)
 
 
+# Of each open block: the places where something was put, and what was there.
 _SETS: list[list[tuple[Path, Path]]] = []
-"""Of each open block: the places where something was put, and what was there."""
 
 
 def put_in_place(draft: Path, path: Path) -> None:

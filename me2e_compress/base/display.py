@@ -6,15 +6,15 @@ import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
+# The note of a table some of whose MACs are a lower bound
 LOWER_BOUND = "≥ or -: plugins and open shapes are not counted; inspect names them"
-"""The note of a table some of whose MACs are a lower bound."""
 
+# Control characters but the end of a line, marks that turn the direction of writing,
+# and halves of characters: they steer a terminal, or no file can hold them.
 _UNPRINTABLE = re.compile(
     "[\x00-\x09\x0b-\x1f\x7f-\x9f\u200b-\u200f\u2028-\u202e\u2060-\u206f"
     "\ud800-\udfff\ufeff\ufff9-\ufffb]"
 )
-"""Control characters but the end of a line, marks that turn the direction of writing,
-and halves of characters: they steer a terminal, or no file can hold them."""
 
 
 def escape_controls(text: str) -> str:

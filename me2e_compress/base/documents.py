@@ -20,17 +20,18 @@ from pydantic import ValidationError
 
 from me2e_compress.base.display import error_line
 
+# The largest document that is read; a plan of 30,000 nodes has 15 MB. Read, it may take
+# thirty times as much memory.
 LARGEST_BYTES = 64_000_000
-"""The largest document that is read; a plan of 30,000 nodes has 15 MB. Read, it may
-take thirty times as much memory."""
+# The largest file of documents that are read line by line
 LARGEST_LOG_BYTES = 256_000_000
-"""The largest file of documents that are read line by line."""
+# People write TOML, and Python reads a megabyte a second or less
 LARGEST_TOML_BYTES = 4_000_000
-"""People write TOML, and Python reads a megabyte a second or less."""
 
+# The most parts of a dotted TOML key
 KEY_PARTS = 64
-"""The most parts of a dotted TOML key."""
 
+# What numpy and zipfile raise on a file that holds no valid arrays
 NPZ_ERRORS = (
     OSError,
     EOFError,
@@ -43,7 +44,6 @@ NPZ_ERRORS = (
     zipfile.BadZipFile,
     zlib.error,
 )
-"""What numpy and zipfile raise on a file that holds no valid arrays."""
 
 
 def _reject_constant(word: str) -> None:

@@ -5,6 +5,7 @@ from importlib import util
 
 from me2e_compress.base.errors import BrokenPackageError, MissingExtraError
 
+# The modules that each extra brings, as they are imported
 MODULES = {
     "highway": ("highway_env", "gymnasium", "cv2", "jinja2", "matplotlib"),
     "fast": ("numba", "llvmlite"),
@@ -12,7 +13,6 @@ MODULES = {
     "bench": ("onnxslim",),
     "trt-check": ("tensorrt_rtx",),
 }
-"""The modules that each extra brings, as they are imported."""
 
 _EXTRA_OF = {
     module: extra for extra, modules in reversed(MODULES.items()) for module in modules

@@ -246,8 +246,8 @@ def fields_of(cls: type) -> tuple["dataclasses.Field[Any]", ...]:
     return tuple(sorted(fields, key=lambda field: field.kw_only is True))
 
 
+# Metadata of a field that a text names even at its default
 IN_TEXT: Mapping[str, bool] = {"written": True}
-"""Metadata of a field that a text names even at its default."""
 
 
 def is_in_text(field: "dataclasses.Field[Any]", value: object) -> bool:
@@ -294,8 +294,8 @@ def _all_entry_points(path: tuple[str, ...]) -> Mapping[str, tuple[EntryPoint, .
 # The entries of a registry, described: where from, and with which options.
 
 
+# The module before a name, in a type
 _PATH = re.compile(r"[A-Za-z_][\w.]*\.(?=[A-Za-z_])")
-"""The module before a name, in a type."""
 _SECTION = re.compile(r"\n(?:Attributes|Args):\n((?:[ \t]+.*\n?|\n)+)")
 _OPTION = re.compile(r"^    (\w+): ((?:.|\n(?=      ))+)", re.MULTILINE)
 

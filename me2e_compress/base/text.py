@@ -27,10 +27,10 @@ _INTEGER = re.compile(r"[+-]?[0-9]+(_[0-9]+)*")
 _FLOAT = re.compile(r"[+-]?[0-9]+(_[0-9]+)*(\.[0-9]+)?([eE][+-]?[0-9]+)?")
 _LITERALS = {"true": True, "false": False, "null": None}
 _MOST_QUOTED = 40
+# Most nested lists; our own options need one
 _MOST_NESTING = 32
-"""Most nested lists; our own options need one."""
+# The most characters of a number: the largest float64 has 309 digits.
 _MOST_DIGITS = 400
-"""The most characters of a number: the largest float64 has 309 digits."""
 
 
 class TextError(ValueError):

@@ -38,8 +38,8 @@ from me2e_compress.graph import array_of, static_shape
 from me2e_compress.graph.recurrence import not_fed_back, recurrent_inputs, sides
 from me2e_compress.runtime.frames import Array, Frame
 
+# The most bytes of all arrays of one file. Six full-size camera images have 0.1 GB.
 LARGEST_BYTES = 2 << 30
-"""The most bytes of all arrays of one file. Six full-size camera images have 0.1 GB."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -201,10 +201,10 @@ class PixelInputs(BaseModel):
 
 T = TypeVar("T", Array, Header)
 
+# Keys of `scenes.json`: two are read, the others say who wrote it.
 _KEYS = ("scenes", "pixels", "generator", "stack", "seed", "log", "count")
-"""Keys of ``scenes.json``: two are read, the others say who wrote it."""
+# Metadata key of a graph: JSON with a digest of every input that became constant.
 FROZEN_INPUTS = "me2e.static_inputs"
-"""Metadata key of a graph: JSON with a digest of every input that became constant."""
 
 
 class CalibrationSet:

@@ -12,8 +12,8 @@ from me2e_compress.base.errors import FramesError
 from me2e_compress.calibration.dataset import CalibrationSet, load_arrays, read_headers
 from me2e_compress.runtime.frames import Array
 
+# Most frames in memory: some are read again and again.
 _CACHED = 8
-"""Most frames in memory: some are read again and again."""
 
 
 class EngineDump:

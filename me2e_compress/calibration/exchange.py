@@ -16,8 +16,8 @@ from me2e_compress.calibration.observers import QUANT_MAX
 from me2e_compress.calibration.ranges import IMPORTED, LARGEST, Ranges
 from me2e_compress.graph import digest, provenance
 
+# Least share of the needed tensors that a cache of this graph has
 _LEAST_SHARE = 0.5
-"""Least share of the needed tensors that a cache of this graph has."""
 
 
 def read_cache(path: Path) -> Ranges:

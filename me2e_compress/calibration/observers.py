@@ -17,12 +17,12 @@ from me2e_compress.calibration.statistics import BINS, Statistics
 
 __all__ = ["OBSERVERS", "QUANT_MAX", "Bounds", "Observer", "scale_of"]
 
+# It drives no worse than max-min, and the plan moves less, from each of three
+# recordings, by a rule that was written down before the drives (tag `road-1`)
 DEFAULT_METHOD = "mse"
-"""It drives no worse than max-min, and the plan moves less, from each of three
-recordings, by a rule that was written down before the drives (tag ``road-1``)."""
 
+# Largest int8 magnitude in use: -128 is left out, so that the grid is symmetric.
 QUANT_MAX = 127
-"""Largest int8 magnitude in use: -128 is left out, so that the grid is symmetric."""
 
 
 def scale_of(low: float, high: float) -> np.float32:
@@ -44,8 +44,8 @@ def scale_of(low: float, high: float) -> np.float32:
     return step if step > 0 else np.float32(1)
 
 
+# The low or the high bound of the range of every tensor: float32 [tensors].
 Bounds: TypeAlias = npt.NDArray[np.float32]
-"""The low or the high bound of the range of every tensor: float32 [tensors]."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -92,14 +92,14 @@ class MaxMin(Observer):
         return seen.lows.min(axis=0), seen.highs.max(axis=0)
 
 
+# Number of magnitudes in each of the bins: int64 [bins].
 Counts: TypeAlias = npt.NDArray[np.int64]
-"""Number of magnitudes in each of the bins: int64 [bins]."""
 
+# Magnitudes of the int8 grid, 0 to 127: no tried threshold has fewer bins.
 LEVELS = 128
-"""Magnitudes of the int8 grid, 0 to 127: no tried threshold has fewer bins."""
 
+# Bins between tried thresholds: 240 of them instead of 1,920.
 _STRIDE = BINS // 256
-"""Bins between tried thresholds: 240 of them instead of 1,920."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -16,21 +16,21 @@ from me2e_compress.base.errors import FramesError
 from me2e_compress.calibration.observers import OBSERVERS, Observer
 from me2e_compress.calibration.statistics import ALL_ZERO, NOT_FINITE, Statistics
 
+# Crest factor (largest magnitude of the range over root mean square) from which a
+# tensor is reported: its int8 step then exceeds half its root mean square, so that most
+# elements round to 0, 1 or 2 steps.
 OUTLIER_CREST = 64
-"""Crest factor (largest magnitude of the range over root mean square) from which a
-tensor is reported: its int8 step then exceeds half its root mean square, so that most
-elements round to 0, 1 or 2 steps."""
 
+# The largest bound of a range: elements are float32.
 LARGEST = float(np.finfo(np.float32).max)
-"""The largest bound of a range: elements are float32."""
 
+# Method of ranges measured by another tool, on unknown frames
 IMPORTED = "imported"
-"""Method of ranges measured by another tool, on unknown frames."""
 
 
+# What an input or output did over a recording: its values differed between frames, were
+# the same in all, were zero in all, or had a NaN or infinity.
 Activity: TypeAlias = Literal["varies", "constant", "zero", "not finite"]
-"""What an input or output did over a recording: its values differed between frames,
-were the same in all, were zero in all, or had a NaN or infinity."""
 
 
 @dataclasses.dataclass(frozen=True, repr=False)

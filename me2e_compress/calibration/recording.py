@@ -36,8 +36,8 @@ class Begin:
     place: int = 0
 
 
+# Yields the frames from the beginning of a scene on
 Source: TypeAlias = Callable[[Begin], Iterable[Frame]]
-"""Yields the frames from the beginning of a scene on."""
 
 
 def write_recording(

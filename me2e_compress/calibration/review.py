@@ -8,19 +8,19 @@ from typing import Literal
 from me2e_compress.base.display import plural
 from me2e_compress.calibration.ranges import OUTLIER_CREST, Activity, Ranges
 
+# Crest factor from which half an int8 step (range / 254) exceeds the root mean square,
+# so that most elements round to zero
 ROUND_CREST = 254
-"""Crest factor from which half an int8 step (range / 254) exceeds the root mean square,
-so that most elements round to zero."""
 
+# Fewest scenes of a recording that nothing is said of. At the tag `road-1`, 4 of 16
+# scenes miss more than a fifth of the range of 9 % of the driver's tensors, 8 of 3 %,
+# one of 35 % (benchmarks/measure/observers.py).
 FEW_SCENES = 8
-"""Fewest scenes of a recording that nothing is said of. At the tag ``road-1``,
-4 of 16 scenes miss more than a fifth of the range of 9 % of the driver's tensors, 8 of
-3 %, one of 35 % (benchmarks/measure/observers.py)."""
 
 NOT_FINITE = "Runtimes answer it each in their own way: guard what makes it"
 
+# Number of tensors that a line lists
 _MOST_NAMES = 5
-"""Number of tensors that a line lists."""
 
 Kind = Literal[
     "rounds to zero", "few elements", "clipped", "dead tensor", "unfed input",

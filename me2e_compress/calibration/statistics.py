@@ -19,8 +19,8 @@ from me2e_compress.runtime.probing import READINGS, Probe, insert_probes
 from me2e_compress.runtime.providers import Provider
 from me2e_compress.runtime.session import Session
 
+# Checksums of an array of zeros, and of one with NaN or infinity
 ALL_ZERO, NOT_FINITE = 0, -1
-"""Checksums of an array of zeros, and of one with NaN or infinity."""
 
 Floats: TypeAlias = npt.NDArray[np.float32]
 

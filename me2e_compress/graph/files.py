@@ -23,13 +23,13 @@ from me2e_compress.graph.recurrence import recurrent_inputs
 from me2e_compress.graph.summary import weight_bytes
 from me2e_compress.graph.validity import PLAIN_INITIALIZERS_SINCE_IR
 
+# Weights beyond this go to a data file: protobuf cannot hold 2 GiB in one message.
 INLINE_LIMIT_BYTES = 1_900_000_000
-"""Weights beyond this go to a data file: protobuf cannot hold 2 GiB in one message."""
 
 _BLOCK_BYTES = 1 << 22
 
+# How a protobuf message begins that names a file of external data
 _LOCATION = b"\n\x08location"
-"""How a protobuf message begins that names a file of external data."""
 
 
 def load(path: str | Path) -> ir.Model:
@@ -242,9 +242,9 @@ def inlined(model: ir.Model) -> ir.Model:
     return copy
 
 
+# Weights up to this size are read at once: shapes and axes are among them, and ONNX's
+# checker would look for their file in the working directory.
 SMALL_BYTES = 1024
-"""Weights up to this size are read at once: shapes and axes are among them, and
-ONNX's checker would look for their file in the working directory."""
 
 
 def external_tensors(model: ir.Model) -> list[ir.ExternalTensor]:

@@ -9,21 +9,21 @@ import numpy.typing as npt
 import onnx
 import onnx_ir as ir
 
+# The two spellings of the domain of ONNX's own operators
 STANDARD = ("", "ai.onnx")
-"""The two spellings of the domain of ONNX's own operators."""
 
 
+# Operators that move nothing and equal a Reshape
 VIEWS = frozenset({"Flatten", "Identity", "Reshape", "Squeeze", "Unsqueeze"})
-"""Operators that move nothing and equal a Reshape."""
 
+# Operators that move elements and do nothing else to them
 LAYOUT_OPERATORS = VIEWS | {"Transpose"}
-"""Operators that move elements and do nothing else to them."""
 
+# Element-wise operators of two operands, which broadcast
 ELEMENTWISE = (
     *("Add", "And", "Div", "Equal", "Greater", "GreaterOrEqual", "Less"),
     *("LessOrEqual", "Max", "Min", "Mul", "Or", "Pow", "Sub", "Xor"),
 )
-"""Element-wise operators of two operands, which broadcast."""
 
 _RANDOM = (
     *("Bernoulli", "Multinomial", "RandomNormal", "RandomNormalLike"),
@@ -98,8 +98,8 @@ def reads_of(node: ir.Node) -> Iterator[ir.Value]:
         yield from (value for value in reads if value.graph is node.graph)
 
 
+# The operators of ONNX that have bodies: only these are searched, to save time.
 _WITH_BODIES = frozenset({"If", "Loop", "Scan", "SequenceMap"})
-"""The operators of ONNX that have bodies: only these are searched, to save time."""
 
 
 def bodies_of(node: ir.Node) -> Sequence[ir.Graph]:
@@ -190,15 +190,15 @@ def array_of(value: ir.Value | None) -> npt.NDArray[np.generic] | None:
 Array: TypeAlias = npt.NDArray[np.generic]
 Numbers: TypeAlias = npt.NDArray[np.float64]
 
+# The floating-point types that numpy itself computes with
 FLOATS = frozenset({ir.DataType.DOUBLE, ir.DataType.FLOAT, ir.DataType.FLOAT16})
-"""The floating-point types that numpy itself computes with."""
 
+# All element types that numpy itself computes with
 NATIVE = FLOATS | {
     *(ir.DataType.BOOL, ir.DataType.INT8, ir.DataType.INT16, ir.DataType.INT32),
     *(ir.DataType.INT64, ir.DataType.UINT8, ir.DataType.UINT16, ir.DataType.UINT32),
     ir.DataType.UINT64,
 }
-"""All element types that numpy itself computes with."""
 
 
 def maker(value: ir.Value | None, *op_types: str) -> ir.Node | None:

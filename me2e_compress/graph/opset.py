@@ -15,11 +15,11 @@ from me2e_compress.graph.runtime_operators import (
     newest_opset,
 )
 
+# Key of `model.meta` with what was changed on reading, in words
 _CHANGES = "me2e.read_as"
-"""Key of ``model.meta`` with what was changed on reading, in words."""
 
+# Key of `model.meta` with IR version and opset of a file that is read as another
 _ON_DISK = "me2e.on_disk"
-"""Key of ``model.meta`` with IR version and opset of a file that is read as another."""
 
 _NO_NEWER = "onnxruntime reads no newer"
 

@@ -22,8 +22,8 @@ from me2e_compress.graph.nodes import nodes_in, nodes_of
 
 MODULE, ORIGINS, PASSES = "me2e.module", "me2e.origins", "me2e.passes"
 _TRACE = "stack_trace"
+# Most bytes of a text that was compressed
 _LARGEST = 1 << 28
-"""Most bytes of a text that was compressed."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -167,8 +167,8 @@ def is_same(old: ir.Node | None, new: ir.Node) -> bool:
     return all(a is b or a.type in _BODIES or repr(a) == repr(b) for a, b in pairs)
 
 
+# Types of attributes whose nodes are compared one by one
 _BODIES = (ir.AttributeType.GRAPH, ir.AttributeType.GRAPHS)
-"""Types of attributes whose nodes are compared one by one."""
 
 
 def compressed(text: str) -> str:

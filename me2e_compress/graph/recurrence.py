@@ -8,14 +8,14 @@ import onnx_ir as ir
 from me2e_compress.base import documents
 from me2e_compress.base.errors import GraphError
 
+# Metadata key of the outputs whose rows are agents, in no order
 SETS = "me2e.sets"
-"""Metadata key of the outputs whose rows are agents, in no order."""
+# Metadata key: JSON `{input: output}`, null for an input that is not fed back; `{}`
+# where none is.
 RECURRENT = "me2e.recurrent"
-"""Metadata key: JSON ``{input: output}``, null for an input that is not fed back;
-``{}`` where none is."""
 
+# Naming rules: input `X` pairs with `X_out`, `prev_X` also with `next_X`.
 SUFFIX, BEFORE, AFTER = "_out", "prev_", "next_"
-"""Naming rules: input ``X`` pairs with ``X_out``, ``prev_X`` also with ``next_X``."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -8,16 +8,16 @@ import onnx
 import onnxruntime as ort
 from onnxruntime.capi import onnxruntime_pybind11_state as _native  # pyright: ignore[reportAttributeAccessIssue]
 
+# First and last version of a kernel's operator, and types by name of a constraint
 Kernel: TypeAlias = tuple[int, int, Mapping[str, Sequence[str]]]
-"""First and last version of a kernel's operator, and types by name of a constraint."""
 
+# What every onnxruntime that we run on reads (1.20 is the oldest)
 SURE_OPSET, SURE_IR = 21, 10
-"""What every onnxruntime that we run on reads (1.20 is the oldest)."""
 
+# The last version of a kernel that nothing has replaced
 _UNREPLACED = 2**31 - 1
-"""The last version of a kernel that nothing has replaced."""
+# Operators that passes add to any graph
 ADDED = ("QuantizeLinear", "DequantizeLinear")
-"""Operators that passes add to any graph."""
 
 
 @functools.cache

@@ -24,15 +24,15 @@ from me2e_compress.graph.nodes import (
     nodes_of,
 )
 
+# Elements that ONNX may propagate in all: about 3 s.
 MOST_CARRIED = 1 << 24
-"""Elements that ONNX may propagate in all: about 3 s."""
 
+# Operators through which ONNX propagates elements, without those that read shapes
 _CARRY = frozenset(
     {"Add", "Cast", "Concat", "Gather", "Mul", "Slice", "Squeeze", "Sub", "Unsqueeze"}
 )
-"""Operators through which ONNX propagates elements, without those that read shapes."""
+# Operators that make vectors whose length is a constant operand
 _FILL = frozenset({"ConstantOfShape", "Expand", "Range", "Tile"})
-"""Operators that make vectors whose length is a constant operand."""
 
 
 def can_propagate(graph: ir.Graph) -> bool:
@@ -91,8 +91,8 @@ def knowledge() -> PluginKnowledge:
     return plugins
 
 
+# Weights up to this size, as shapes and axes are, are passed to ONNX's inference
 INLINE_BYTES = 1024
-"""Weights up to this size, as shapes and axes are, are passed to ONNX's inference."""
 
 
 def static_shape(value: ir.Value | None) -> tuple[int, ...] | None:
@@ -272,8 +272,8 @@ def without_weights(model: ir.Model) -> onnx.ModelProto:
             graph.initializers.add(value)
 
 
+# The exceptions of `infer_node` where a node does not accept its inputs
 REFUSALS = (onnx.shape_inference.InferenceError, onnx.checker.ValidationError)
-"""The exceptions of :func:`infer_node` where a node does not accept its inputs."""
 
 NOTHING: Mapping[ir.Value, ir.Value] = {}
 
@@ -333,8 +333,8 @@ def infer_node(
 
 CONVOLUTIONS = ("Conv", "ConvTranspose")
 PRODUCTS = ("Gemm", "MatMul")
+# Operators of weighted layers: those that have an int8 kernel worth feeding.
 WEIGHTED = (*CONVOLUTIONS, *PRODUCTS)
-"""Operators of weighted layers: those that have an int8 kernel worth feeding."""
 
 Dims = tuple[int | None, ...]
 

@@ -19,8 +19,8 @@ from onnx.onnx_cpp2py_export.checker import CheckerContext
 from me2e_compress.base.errors import GraphError
 from me2e_compress.graph.nodes import STANDARD
 
+# Elements of one tensor: no memory holds more.
 LARGEST_ELEMENTS = 2**40
-"""Elements of one tensor: no memory holds more."""
 HIGHEST_RANK = 64
 
 _TYPES = frozenset(TensorProto.DataType.values()) - {TensorProto.UNDEFINED}
@@ -168,8 +168,8 @@ def _check_attributes(node: onnx.NodeProto, *, in_function: bool) -> None:
 
 
 _ATTRIBUTE_TYPES = frozenset(onnx.AttributeProto.AttributeType.values()) - {0}
+# The field of an attribute that has no value of its own where it is left out
 _FIELD = {onnx.AttributeProto.TENSOR: "t", onnx.AttributeProto.GRAPH: "g"}
-"""The field of an attribute that has no value of its own where it is left out."""
 
 
 def _label(node: onnx.NodeProto) -> str:
@@ -177,12 +177,12 @@ def _label(node: onnx.NodeProto) -> str:
 
 
 LARGEST_VERSION = 2**31 - 1
+# Graphs in nodes of graphs: protobuf itself ends at about thirty. Calls of functions in
+# functions likewise: what walks through them goes as deep.
 DEEPEST = 32
-"""Graphs in nodes of graphs: protobuf itself ends at about thirty. Calls of functions
-in functions likewise: what walks through them goes as deep."""
+# Nodes of a graph in which every call stands for what its function holds: ONNX's
+# inference goes through all of them.
 MOST_CALLED_NODES = 1_000_000
-"""Nodes of a graph in which every call stands for what its function holds: ONNX's
-inference goes through all of them."""
 
 Names = Collection[str]
 

@@ -13,13 +13,13 @@ from me2e_compress.graph.shapes import knowledge, static_shape
 Counter = Callable[[ir.Node], int | None]
 Count = TypeVar("Count")
 
+# Operators of ONNX that multiply matrices, and that no rule here counts
 _UNCOUNTED = frozenset(
     {
         "AffineGrid", "CausalConvWithState", "DFT", "Det",
         "LinearAttention", "STFT", "SequenceMap",
     }
 )  # fmt: skip
-"""Operators of ONNX that multiply matrices, and that no rule here counts."""
 
 _LOOPS = ("Loop", "Scan")
 

@@ -9,15 +9,15 @@ import onnx_ir as ir
 from me2e_compress.graph.nodes import is_plugin, is_standard, nodes_of
 from me2e_compress.graph.shapes import without_weights
 
+# Where plugins of the default domain live in our graphs: checker and functions need a
+# domain.
 PLUGIN_DOMAIN = "me2e.plugin"
-"""Where plugins of the default domain live in our graphs: checker and functions need a
-domain."""
 
+# Node metadata with the domain that a plugin had in the file it came from
 ORIGINAL_DOMAIN = "me2e.domain"
-"""Node metadata with the domain that a plugin had in the file it came from."""
 
+# The first ONNX IR version whose initializers need not be inputs (onnx/docs/IR.md)
 PLAIN_INITIALIZERS_SINCE_IR = 4
-"""The first ONNX IR version whose initializers need not be inputs (onnx/docs/IR.md)."""
 
 
 def refusal(

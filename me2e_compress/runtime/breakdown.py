@@ -22,8 +22,8 @@ from me2e_compress.runtime.session import Session, replay
 MOST_EVENTS = 200_000
 """Most nodes times inferences to record: onnxruntime stores half a kilobyte for each
 until the end, and drops those beyond a million."""
+# Time of an inference outside of its nodes, including the profiler's own work
 OUTSIDE = "(between nodes)"
-"""Time of an inference outside of its nodes, including the profiler's own work."""
 NO_MODULE = "(no module)"
 _KERNEL = "_kernel_time"
 

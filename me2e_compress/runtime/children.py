@@ -18,10 +18,10 @@ from multiprocessing import active_children, parent_process, resource_tracker
 from multiprocessing.context import SpawnContext, SpawnProcess
 from pathlib import Path
 
+# Option of prctl(2): the signal to receive when the parent dies.
 PR_SET_PDEATHSIG = 1
-"""Option of prctl(2): the signal to receive when the parent dies."""
+# Silences the warning about locks that the tracker cleans up after a kill
 _TRACKER_IS_SILENT = "ignore::UserWarning:multiprocessing.resource_tracker"
-"""Silences the warning about locks that the tracker cleans up after a kill."""
 _STARTING = threading.RLock()
 
 

@@ -28,8 +28,8 @@ from me2e_compress.operators import FusedCall
 DOMAIN = "com.microsoft"
 """The domain of onnxruntime's own operators."""
 
+# Integers, scale and zero point
 Quantized: TypeAlias = tuple[ir.Value, ir.Value, ir.Value]
-"""Integers, scale and zero point."""
 _KERNEL_SUFFIX = {ir.DataType.INT8: "Int8", ir.DataType.UINT8: "Uint8"}
 
 

@@ -15,8 +15,8 @@ from me2e_compress.graph import opset_of
 from me2e_compress.graph.nodes import is_read, is_standard, nodes_in
 from me2e_compress.graph.runtime_operators import kernels, serves
 
+# Types that onnxruntime casts to float32 and back where it has no kernel
 _CAST_BY_ITSELF = (ir.DataType.FLOAT16, ir.DataType.BFLOAT16)
-"""Types that onnxruntime casts to float32 and back where it has no kernel."""
 
 
 def nodes_without_kernel(model: ir.Model) -> Iterator[tuple[ir.Node, str]]:

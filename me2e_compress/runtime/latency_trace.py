@@ -16,11 +16,11 @@ from me2e_compress.base.display import Table, missing_note, plural, table
 from me2e_compress.base.errors import EvaluationError
 from me2e_compress.metrics.measure import percentile, too_few
 
+# Share of the cores that other processes may take before a latency is in doubt: they
+# move our threads between cores and evict caches long before all cores are taken.
 BUSY_SHARE = 0.1
-"""Share of the cores that other processes may take before a latency is in doubt: they
-move our threads between cores and evict caches long before all cores are taken."""
+# Shortest block to be judged, seconds: systems count CPU time in ticks of 10 ms.
 SHORTEST_S = 0.5
-"""Shortest block to be judged, seconds: systems count CPU time in ticks of 10 ms."""
 
 
 @with_config(ConfigDict(strict=True))
@@ -101,8 +101,8 @@ def cpu_seconds() -> float:
 
 PERCENTILES = (50, 90, 99)
 
+# Microseconds by name, one for each inference
 Microseconds: TypeAlias = Mapping[str, tuple[int, ...]]
-"""Microseconds by name, one for each inference."""
 
 
 @dataclass(frozen=True)
@@ -159,10 +159,10 @@ def _percentiles_note(count: int) -> str:
     return missing_note({name: each for name, each in why.items() if each})
 
 
+# Microseconds of one inference or more; a list in a file
 Samples: TypeAlias = Annotated[
     tuple[Annotated[int, Field(ge=0)], ...], Field(min_length=1, strict=False)
 ]
-"""Microseconds of one inference or more; a list in a file."""
 
 
 @with_config(ConfigDict(strict=True))

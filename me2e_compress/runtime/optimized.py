@@ -12,9 +12,9 @@ from me2e_compress.graph import producer_of
 from me2e_compress.runtime.providers import CPU, Provider
 from me2e_compress.runtime.session import Session
 
+# Separators between a node's name and the suffix that onnxruntime adds:
+# `/MatMulAddFusion`, `_nchwc`, `_token_1`.
 _SEPARATORS = "/_"
-"""Separators between a node's name and the suffix that onnxruntime adds:
-``/MatMulAddFusion``, ``_nchwc``, ``_token_1``."""
 
 
 def optimize(model: ir.Model, provider: Provider = CPU) -> ir.Model:

@@ -67,13 +67,13 @@ class Trajectory:
         return positions
 
 
+# Metadata key: JSON of `PlanAdapter`.
 PLAN = "me2e.plan"
-"""Metadata key: JSON of :class:`PlanAdapter`."""
 
 DEFAULT_OUTPUT = "plan"
 
+# Waypoints, and seconds between them, of a plan that does not state its step
 CONTRACT_WAYPOINTS, CONTRACT_STEP_S = 6, 0.5
-"""Waypoints, and seconds between them, of a plan that does not state its step."""
 
 Arrays: TypeAlias = Mapping[str, npt.NDArray[np.generic]]
 

@@ -17,8 +17,8 @@ from me2e_compress.graph import rewrite
 READINGS = "me2e_readings"
 """Name of the output that the probes write: float32 [tensors x width of the probe]."""
 
+# Nodes that measure a tensor, in order, and the 1-D values that they produce
 Reading: TypeAlias = tuple[list[ir.Node], list[ir.Value]]
-"""Nodes that measure a tensor, in order, and the 1-D values that they produce."""
 
 
 class Probe(Protocol):

@@ -111,12 +111,11 @@ def processor() -> str:
 # Interleaved timing: models measured in turn, so that noise affects all of them.
 
 
+# Inferences of one model in a row: caches stay warm, and noise that lasts a second
+# affects all models.
 BLOCK_RUNS = 10
-"""Inferences of one model in a row: caches stay warm, and noise that lasts a second
-affects all models."""
+# Uncounted inferences at the start of a block: the caches hold another model's data.
 BLOCK_WARM_UP = 2
-"""Uncounted inferences at the start of a block: the caches hold another model's
-data."""
 
 
 def record_traces(

@@ -16,17 +16,17 @@ from pydantic_core import CoreSchema
 from me2e_compress.base.errors import ProviderError
 from me2e_compress.base.registry import Registry
 
+# Providers in onnxruntime's form; each runs what those before it cannot
 Chain: TypeAlias = list[str | tuple[str, dict[str, str]]]
-"""Providers in onnxruntime's form; each runs what those before it cannot."""
 
+# Optimizations of onnxruntime up to 1.31 that change the result: this one folds a Pad
+# of zeros into the MaxPool after it, whose own padding is minus infinity.
 WRONG_FUSIONS = ("Pad_Fusion",)
-"""Optimizations of onnxruntime up to 1.31 that change the result: this one folds a Pad
-of zeros into the MaxPool after it, whose own padding is minus infinity."""
+# Optimizations that slow down the CPU: the fused kernel of Add and LayerNormalization
+# takes 4.0 to 6.9 times as long as the two (64 to 768 columns, 100 to 10,000 rows, one
+# thread and two), 2.7 times on 20 rows, and as long on one
+# (`benchmarks/measure/levers.py`).
 SLOW_FUSIONS = ("SkipLayerNormFusion",)
-"""Optimizations that slow down the CPU: the fused kernel of Add and LayerNormalization
-takes 4.0 to 6.9 times as long as the two (64 to 768 columns, 100 to 10,000 rows, one
-thread and two), 2.7 times on 20 rows, and as long on one
-(``benchmarks/measure/levers.py``)."""
 
 _CPU = "CPUExecutionProvider"
 _CUDA = "CUDAExecutionProvider"

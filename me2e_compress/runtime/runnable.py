@@ -158,8 +158,8 @@ def _shared_weights(model: ir.Model) -> Iterator[tuple[ir.Node, int]]:
                 yield node, index
 
 
+# Input indices of an int8 weight and its zero point
 _WEIGHT_INPUTS = {"DequantizeLinear": (0, 2), "MatMulIntegerToFloat": (1, 5)}
-"""Input indices of an int8 weight and its zero point."""
 
 
 def replace_fused(
@@ -231,8 +231,8 @@ def is_fused(node: ir.Node) -> bool:
     return kernel or operators.find(node) is not None
 
 
+# Most iterations of a loop times those around it: one takes at least 5 us.
 MOST_ROUNDS = 1 << 24
-"""Most iterations of a loop times those around it: one takes at least 5 us."""
 
 
 def why_endless(model: ir.Model) -> str | None:

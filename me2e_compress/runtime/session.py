@@ -31,9 +31,10 @@ from me2e_compress.runtime.runnable import (
 )
 
 # The compiled module has no stubs.
+# Raised where inputs do not fit
 InvalidArgument: type[Exception] = _native.InvalidArgument
-"""Raised where inputs do not fit."""
 
+# Everything raised where a graph cannot be read, built or run
 REFUSALS: tuple[type[Exception], ...] = (
     _native.Fail,
     _native.InvalidArgument,
@@ -47,11 +48,10 @@ REFUSALS: tuple[type[Exception], ...] = (
     MemoryError,  # what it computes of constants as it opens is too large
     RuntimeError,  # an output of a type that numpy lacks, such as bfloat16
 )
-"""Everything raised where a graph cannot be read, built or run."""
 
 _KEEP_INT8 = "session.qdqisint8allowed"
+# Smaller tensors stay in the graph: shape inference reads them.
 LENT_BYTES = 1024
-"""Smaller tensors stay in the graph: shape inference reads them."""
 
 Weights: TypeAlias = Mapping[str, ort.OrtValue]
 """Lent weights by name; they must live as long as the session."""
@@ -86,10 +86,10 @@ def open_file(
     return open_graph(graph.load(path), options, provider, without)
 
 
+# Bytes of a node in the toolkit's own domain; onnxruntime would run its body
 _OWN_NODE_BYTES = b":\x04me2e"
-"""Bytes of a node in the toolkit's own domain; onnxruntime would run its body."""
+# Bytes of a node that may never end
 _LOOP_BYTES = b'"\x04Loop'
-"""Bytes of a node that may never end."""
 
 
 def open_graph(
@@ -235,10 +235,10 @@ def _open_once(
 
 __all__ = ["Session", "SessionPort", "detached", "replay", "run_once"]
 
+# Element types by onnxruntime's word for them
 DTYPES: Mapping[str, np.dtype[np.generic]] = {
     f"tensor({kind.name.lower()})": kind.numpy() for kind in NATIVE
 }
-"""Element types by onnxruntime's word for them."""
 
 _SHRINK = "memory.enable_memory_arena_shrinkage"
 _WEIGHTS_FILE = "session.optimized_model_external_initializers_file_name"

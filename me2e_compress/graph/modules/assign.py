@@ -104,8 +104,8 @@ def map_of(model: ir.Model, name: str | None) -> ModuleMap:
         return ModuleMap.whole()
 
 
+# Most components of a prefix that is tried: wrappers nest this deep at most.
 _DEEPEST = 3
-"""Most components of a prefix that is tried: wrappers nest this deep at most."""
 
 
 def prefix_hint(modules: ModuleMap, paths: Iterable[str]) -> str:

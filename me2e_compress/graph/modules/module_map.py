@@ -150,8 +150,8 @@ def _last_path(paths: list[str]) -> str:
 
 Role = Literal["feature", "prediction"]
 
+# Name of the map of a graph that is not an ME2E stack; see `ModuleMap.whole`
 WHOLE = "whole"
-"""Name of the map of a graph that is not an ME2E stack; see `ModuleMap.whole`."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -29,8 +29,8 @@ from me2e_compress.graph.rewrite.edits import (
 )
 from me2e_compress.graph.rewrite.pattern import Match, Pattern, match
 
+# A fusion can complete the pattern of another: real graphs need two or three.
 ROUNDS = 16
-"""A fusion can complete the pattern of another: real graphs need two or three."""
 
 
 @dataclasses.dataclass(frozen=True)

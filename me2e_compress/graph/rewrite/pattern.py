@@ -30,10 +30,10 @@ from me2e_compress.graph.nodes import (
     maker,
 )
 
+# The standard operators whose operands may be swapped, up to rounding
 _IN_ANY_ORDER = frozenset(
     {"Add", "And", "Equal", "Max", "Mean", "Min", "Mul", "Or", "Sum", "Xor"}
 )
-"""The standard operators whose operands may be swapped, up to rounding."""
 
 
 class Pattern(abc.ABC):

@@ -26,17 +26,17 @@ from me2e_compress.graph.rewrite.edits import (
 from me2e_compress.graph.runtime_operators import since
 from me2e_compress.graph.shapes import infer_shapes
 
+# The first opset whose Scan has no axis of batches
 _SCAN_AS_IS = 9
-"""The first opset whose Scan has no axis of batches."""
+# The first opset whose Resize says how coordinates are made. Earlier ones, and
+# Upsample, are asymmetric (onnx/docs/Changelog.md, Resize-11), which the converter of
+# onnx 1.23 does not write; onnxruntime takes the left neighbour where it enlarges, the
+# right one where it shrinks (GetNearestPixelFromOriginal, `SIMPLE`).
 _RESIZE_AS_IS = 11
-"""The first opset whose Resize says how coordinates are made. Earlier ones, and
-Upsample, are asymmetric (onnx/docs/Changelog.md, Resize-11), which the converter of
-onnx 1.23 does not write; onnxruntime takes the left neighbour where it enlarges, the
-right one where it shrinks (GetNearestPixelFromOriginal, ``SIMPLE``)."""
 
 
+# The oldest opset that a graph is written in, as *import-normalize* does
 OLDEST_OPSET = 13
-"""The oldest opset that a graph is written in, as *import-normalize* does."""
 
 
 def raise_opset(model: ir.Model, opset: int, by: str) -> tuple[int, str]:

@@ -154,8 +154,8 @@ class EnergyRecording:
         return Window(*times, int(self.frames[end] - self.frames[begin]), joules)
 
 
+# Tries every counter of this machine in turn
 AUTO = "auto"
-"""Tries every counter of this machine in turn."""
 
 
 @dataclass(frozen=True)

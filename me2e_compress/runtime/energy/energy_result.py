@@ -66,10 +66,10 @@ class Absent:
 
 
 FEWEST_WINDOWS = 5
+# Fewest windows to fit the drift by a parabola: warming up slows down.
 PARABOLA_WINDOWS = 8
-"""Fewest windows to fit the drift by a parabola: warming up slows down."""
+# Relative error that the time between two updates of a counter may have
 STEP_TOLERANCE = 2e-4
-"""Relative error that the time between two updates of a counter may have."""
 
 
 @dataclass(frozen=True)

@@ -32,10 +32,10 @@ from me2e_compress.runtime.frames import Frame, Frames
 from me2e_compress.runtime.providers import CPU, Provider
 from me2e_compress.runtime.session import Session, replay
 
+# Seconds between samples of the power: five within a usual step of 0.1 s.
 SAMPLED_S = 0.02
-"""Seconds between samples of the power: five within a usual step of 0.1 s."""
+# Fewest samples in a window from which its integral is used
 FEWEST_SAMPLES = 20
-"""Fewest samples in a window from which its integral is used."""
 
 
 class PowerSamples:
@@ -93,10 +93,10 @@ def call_repeatedly(period_s: float, call: Callable[[], None]) -> Iterator[None]
         raise errors[0]
 
 
+# Runs one frame of a model and returns when it is done, on the device too
 Work = Callable[[], object]
-"""Runs one frame of a model and returns when it is done, on the device too."""
+# Calls a function every so many seconds while the context is open
 Repeater = Callable[[float, Callable[[], None]], AbstractContextManager[None]]
-"""Calls a function every so many seconds while the context is open."""
 
 
 class EnergyMeter:
@@ -223,8 +223,8 @@ class EnergyMeter:
         return window
 
 
+# Bytes of frames held in memory: reading from disk takes energy too.
 MOST_BYTES = 500_000_000
-"""Bytes of frames held in memory: reading from disk takes energy too."""
 
 
 def measure_energy(

@@ -12,6 +12,7 @@ from me2e_compress.runtime.energy.energy_result import Absent, Reader
 
 T = TypeVar("T")
 
+# NVML's reasons that reduce speed; idling and clocks set by a user do not count
 _REASONS = {
     "nvmlClocksEventReasonSwPowerCap": "power cap",
     "nvmlClocksEventReasonHwSlowdown": "hardware slowdown",
@@ -19,7 +20,6 @@ _REASONS = {
     "nvmlClocksEventReasonHwPowerBrakeSlowdown": "power brake",
     "nvmlClocksEventReasonSwThermalSlowdown": "thermal slowdown",
 }
-"""NVML's reasons that reduce speed; idling and clocks set by a user do not count."""
 
 
 @dataclass(frozen=True)
