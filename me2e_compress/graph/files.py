@@ -16,12 +16,12 @@ from google.protobuf.message import DecodeError
 from me2e_compress.base import atomic
 from me2e_compress.base.display import error_line, join_names
 from me2e_compress.base.errors import GraphError
-from me2e_compress.graph import provenance, structure
+from me2e_compress.graph import provenance
 from me2e_compress.graph.nodes import STANDARD, bodies, nodes_of
 from me2e_compress.graph.opset import fit_runtime, note_change
 from me2e_compress.graph.recurrence import recurrent_inputs
 from me2e_compress.graph.summary import weight_bytes
-from me2e_compress.graph.validity import PLAIN_INITIALIZERS_SINCE_IR
+from me2e_compress.graph.validity import PLAIN_INITIALIZERS_SINCE_IR, check_file
 
 # Weights beyond this go to a data file: protobuf cannot hold 2 GiB in one message.
 INLINE_LIMIT_BYTES = 1_900_000_000
@@ -61,7 +61,7 @@ def load(path: str | Path) -> ir.Model:
             f"{path}: not an ONNX file, or cut short ({error_line(error)})"
         ) from error
     try:
-        in_order = structure.check(proto)
+        in_order = check_file(proto)
         model = _build_model(proto, in_order)
         provenance.unpack(model)
     except GraphError as error:
@@ -147,7 +147,7 @@ def save(model: ir.Model, path: str | Path, *, external: bool | None = None) -> 
             raise GraphError(f"{data}: holds the weights of the model being saved")
     # The model that is replaced names one data file, if any; the last may be old
     there = path.is_file()
-    earlier = [n for n in names if there and _contains(path, n.name.encode())][:1]
+    earlier = [n for n in names if there and file_contains(path, n.name.encode())][:1]
     data = next(name for name in names if name not in earlier)
     if external is None:
         external = bool(stored) or weight_bytes(model) > INLINE_LIMIT_BYTES
@@ -195,43 +195,35 @@ def file_bytes(path: Path) -> int:
 def sha256_of(path: Path) -> str:
     """Hash a file, and with it the external data it names, as lower-case hex."""
     hasher = hashlib.sha256()
-    if _contains(path, _LOCATION, hasher):
-        for file in _external_files(path):
-            for block in _blocks(file):
-                hasher.update(block)
+    for file in (path, *_external_files(path)):
+        with file.open("rb") as stream:
+            hashlib.file_digest(stream, lambda: hasher)
     return hasher.hexdigest()
 
 
 def _external_files(path: Path) -> list[Path]:
     """List the data files that a model names, in the order of its weights."""
     # Parsing hundreds of MB takes as long as hashing them: look first.
-    if not _contains(path, _LOCATION):
+    if not file_contains(path, _LOCATION):
         return []
     model = ir.load(path, format="protobuf")
     files = [data_file(path, tensor) for tensor in external_tensors(model)]
     return list(dict.fromkeys(files))
 
 
-def _contains(path: Path, words: bytes, hasher: "hashlib._Hash | None" = None) -> bool:
-    """Return whether a file contains some bytes; hash it on the way.
+def file_contains(path: Path, word: bytes) -> bool:
+    """Return whether a file contains some bytes.
 
     It is read block by block: a mapped file would count as memory of this process.
     """
-    contains, tail = False, b""
-    for block in _blocks(path):
-        if hasher is not None:
-            hasher.update(block)
-        window = tail + block
-        contains, tail = contains or words in window, window[-len(words) :]
-        if contains and hasher is None:
-            break
-    return contains
-
-
-def _blocks(path: Path) -> Iterator[bytes]:
+    tail = b""
     with path.open("rb") as stream:
         while block := stream.read(_BLOCK_BYTES):
-            yield block
+            window = tail + block
+            if word in window:
+                return True
+            tail = window[-len(word) :]
+    return False
 
 
 def inlined(model: ir.Model) -> ir.Model:

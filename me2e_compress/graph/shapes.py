@@ -1,9 +1,4 @@
-"""Shapes of values, layers and products, and their inference.
-
-ONNX's inference may treat every vector as a shape and propagate its elements; for a
-vector of a billion elements that takes minutes and all memory. Thirty Concats, each of
-the one before twice, make such a vector of a scalar. So the elements are counted first.
-"""
+"""Shapes of values, layers and products, and their inference."""
 
 import dataclasses
 import math
@@ -23,48 +18,6 @@ from me2e_compress.graph.nodes import (
     nodes_in,
     nodes_of,
 )
-
-# Elements that ONNX may propagate in all: about 3 s.
-MOST_CARRIED = 1 << 24
-
-# Operators through which ONNX propagates elements, without those that read shapes
-_CARRY = frozenset(
-    {"Add", "Cast", "Concat", "Gather", "Mul", "Slice", "Squeeze", "Sub", "Unsqueeze"}
-)
-# Operators that make vectors whose length is a constant operand
-_FILL = frozenset({"ConstantOfShape", "Expand", "Range", "Tile"})
-
-
-def can_propagate(graph: ir.Graph) -> bool:
-    """Return whether ONNX can propagate the elements of a graph in bounded time."""
-    longest: dict[ir.Value, int] = {}
-    total = 0
-    for node in nodes_in(graph):
-        if node.op_type in _FILL:  # the elements that constants ask for, at most
-            arrays = map(array_of, node.inputs)
-            counts = [array for array in arrays if array is not None]
-            whole = [count for count in counts if count.dtype.kind == "i"]
-            size = math.prod(int(n.max(initial=1)) for n in whole if n.size < 64)
-        elif node.op_type in _CARRY and node.attributes.get_int("axis", 0) in (0, -1):
-            read = [
-                longest.get(value, _length(value)) for value in node.inputs if value
-            ]
-            size = sum(read) if node.op_type == "Concat" else max(read, default=0)
-            total += size
-        else:
-            continue
-        made = node.outputs[0]
-        if made.shape is None or len(made.shape) < 2:
-            longest[made] = max(size, _length(made))
-    return total <= MOST_CARRIED
-
-
-def _length(value: ir.Value) -> int:
-    """Return the length of a vector; 1 if it or its shape is unknown."""
-    if value.shape is None or not len(value.shape):
-        return 1
-    size = value.shape[0] if len(value.shape) == 1 else 0
-    return size if isinstance(size, int) else 1
 
 
 class PluginKnowledge(Protocol):
@@ -122,7 +75,7 @@ def rank_of(value: ir.Value | None) -> int | None:
 def infer_shapes(
     model: ir.Model, *, strict: bool = False, written: onnx.ModelProto | None = None
 ) -> None:
-    """Infer types and shapes with ONNX, in place, with data propagation if possible.
+    """Infer types and shapes with ONNX, in place, with data propagation.
 
     Plugins of known dialects are inferred too (:mod:`me2e_compress.operators`); outputs
     of unknown ones keep the shape that the file records, or none. A graph that ONNX
@@ -152,7 +105,7 @@ def _infer_once(model: ir.Model, strict: bool, written: onnx.ModelProto | None) 
         proto = onnx.shape_inference.infer_shapes(
             without_weights(model) if written is None else written,
             strict_mode=strict,
-            data_prop=can_propagate(model.graph),
+            data_prop=True,
         )
     except (
         onnx.checker.ValidationError,

@@ -3,7 +3,6 @@
 import abc
 import dataclasses
 import importlib.util
-import mmap
 from collections.abc import Sequence
 from pathlib import Path
 from typing import ClassVar, Literal, TypeAlias
@@ -15,6 +14,7 @@ from pydantic_core import CoreSchema
 
 from me2e_compress.base.errors import ProviderError
 from me2e_compress.base.registry import Registry
+from me2e_compress.graph.files import file_contains
 
 # Providers in onnxruntime's form; each runs what those before it cannot
 Chain: TypeAlias = list[str | tuple[str, dict[str, str]]]
@@ -249,17 +249,6 @@ class TensorRtRtxProvider(Provider):
 
     def chain(self) -> None:
         """Return None: the options of the session name its device."""
-
-
-def file_contains(path: Path, *words: bytes) -> bool:
-    """Return whether a file holds some of these bytes, without running it."""
-    if not path.is_file() or not path.stat().st_size:
-        return False
-    with (
-        path.open("rb") as file,
-        mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content,
-    ):
-        return any(content.find(word) >= 0 for word in words)
 
 
 CPU = CpuProvider()

@@ -17,12 +17,12 @@ from onnxruntime.capi import onnxruntime_pybind11_state as _native  # pyright: i
 
 from me2e_compress import graph
 from me2e_compress.base.errors import FramesError, GraphError
-from me2e_compress.graph.files import INLINE_LIMIT_BYTES
+from me2e_compress.graph.files import INLINE_LIMIT_BYTES, file_contains
 from me2e_compress.graph.nodes import NATIVE, is_read
 from me2e_compress.graph.recurrence import SessionPort, not_fed_back, recurrence
 from me2e_compress.runtime.frames import Array, Frame
 from me2e_compress.runtime.kernel_types import float32_hint, nodes_without_kernel
-from me2e_compress.runtime.providers import CPU, Provider, file_contains
+from me2e_compress.runtime.providers import CPU, Provider
 from me2e_compress.runtime.runnable import (
     QDQ_OFF,
     int8_entry,
@@ -78,7 +78,7 @@ def open_file(
     if not path.is_file():
         raise GraphError(f"{path}: no such file")
     # Most files open directly: to load one takes ten times as long as to search it.
-    if not file_contains(path, _OWN_NODE_BYTES, _LOOP_BYTES):
+    if not file_contains(path, _OWN_NODE_BYTES):
         try:
             return _open_with_retry(str(path), options, provider, without), {}
         except GraphError:
@@ -88,8 +88,6 @@ def open_file(
 
 # Bytes of a node in the toolkit's own domain; onnxruntime would run its body
 _OWN_NODE_BYTES = b":\x04me2e"
-# Bytes of a node that may never end
-_LOOP_BYTES = b'"\x04Loop'
 
 
 def open_graph(
