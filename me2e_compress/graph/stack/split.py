@@ -3,9 +3,9 @@
 from collections.abc import Mapping
 
 import onnx_ir as ir
+import onnx_ir.passes.common as common
 
 from me2e_compress.base.errors import GraphError
-from me2e_compress.graph.nodes import STANDARD, nodes_of, reads_of
 from me2e_compress.graph.stack.join import End, JoinedStack
 from me2e_compress.graph.stack.stack_file import Part
 
@@ -52,36 +52,27 @@ def split_stack(stack: JoinedStack, model: ir.Model) -> dict[str, ir.Model]:
 def _cut(model: ir.Model, file: Part, inputs: Values, outputs: Values) -> ir.Model:
     """Copy the nodes between a part's inputs and outputs, with its file's names."""
     borders = list(dict.fromkeys(inputs.values()))
-    # The nodes and weights that compute the outputs
-    needed, weights = set[ir.Node](), dict[ir.Value, None]()
-    stops, waiting = set(borders), list(outputs.values())
-    while waiting:
-        value = waiting.pop()
-        node = value.producer()
-        if value in stops:
-            continue
-        if value.is_initializer():
-            weights[value] = None
-        elif node is None:
-            raise GraphError(
-                f"{file.name} cannot be cut out again: a pass made it need"
-                f" {value.name}, which {file.path.name} does not take"
-            )
-        elif node not in needed:
-            needed.add(node)
-            waiting += reads_of(node)
-    # A copy of them
-    graph = ir.GraphView(
-        borders,
-        list(outputs.values()),
-        nodes=[node for node in model.graph if node in needed],
-        initializers=list(weights),
-        opset_imports=model.opset_imports,
-        name=file.name,
-    ).clone()
+    try:
+        graph = ir.convenience.extract(model.graph, borders, list(outputs.values()))
+    except ValueError as error:  # it names the inputs that are not among the borders
+        names = str(error).rpartition(": ")[2]
+        raise GraphError(
+            f"{file.name} cannot be cut out again: a pass made it need {names}, which"
+            f" {file.path.name} does not take"
+        ) from error
+    # The extracted weights are in no order
+    extracted = graph.initializers
+    ordered = [extracted[n] for n in model.graph.initializers if n in extracted]
+    extracted.clear()
+    for value in ordered:
+        extracted.add(value)
+    graph.name = file.name
     _rename(graph, file, inputs, outputs)
-    copy = ir.Model(graph, ir_version=model.ir_version)
-    _declare(copy, model)
+    # Functions that are called, and domains that are used, alone
+    functions = [function.clone() for function in model.functions.values()]
+    copy = ir.Model(graph, ir_version=model.ir_version, functions=functions)
+    common.RemoveUnusedFunctionsPass()(copy)  # type: ignore[no-untyped-call]
+    common.RemoveUnusedOpsetsPass(process_functions=False)(copy)
     return copy
 
 
@@ -114,22 +105,3 @@ def _rename(graph: ir.Graph, file: Part, inputs: Values, outputs: Values) -> Non
     graph.inputs[:] = named
     ends = {str(value.name): value for value in (*named, *graph.outputs)}
     graph.outputs[:] = [ends[name] for name in file.outputs if name in ends]
-
-
-def _declare(copy: ir.Model, model: ir.Model) -> None:
-    """Keep the functions that are called, and import the domains that are used."""
-    functions = dict(model.functions)
-    called = {node.op_identifier() for node in copy.graph.all_nodes()} & {*functions}
-    waiting = list(called)
-    while waiting:
-        inner = {node.op_identifier() for node in functions[waiting.pop()].all_nodes()}
-        new = (inner & {*functions}) - called
-        called |= new
-        waiting += new
-    for key in functions:
-        if key in called:
-            copy.functions[key] = functions[key].clone()
-    used = {node.domain for node in nodes_of(copy)}
-    for domain in list(copy.opset_imports):
-        if domain not in used and domain not in STANDARD:
-            del copy.opset_imports[domain]
