@@ -135,12 +135,14 @@ def _vanished_above(
 def to_graphsurgeon(model: ir.Model) -> gs.Graph:
     """Return a model as a ``gs.Graph`` of its own; the model stays as it is.
 
-    Weights are read into memory. graphsurgeon knows no overloads, so the second
-    function of a name is called ``name__overload`` there.
+    Weights are read into memory.
+
+    Raises:
+        GraphError: a function is an overload, which graphsurgeon does not know.
     """
-    copy = inlined(model)
-    _surgeon_rename(copy, {key: _spelled(key) for key in copy.functions if key[2]})
-    return gs.import_onnx(ir.to_proto(copy))
+    if overloads := [name for _, name, overload in model.functions if overload]:
+        raise GraphError(f"graphsurgeon knows no overloads, as of {overloads[0]}")
+    return gs.import_onnx(ir.to_proto(inlined(model)))
 
 
 def from_graphsurgeon(
@@ -162,28 +164,5 @@ def from_graphsurgeon(
         raise GraphError(f"{by}: graphsurgeon's graph is not a model: {reason}") from (
             error
         )
-    _surgeon_rename(model, {_spelled(key): key for key in like.functions if key[2]})
     restore(model, like, by=by)
     return model
-
-
-def _spelled(key: ir.OperatorIdentifier) -> ir.OperatorIdentifier:
-    domain, name, overload = key
-    return domain, f"{name}__{overload}", ""
-
-
-def _surgeon_rename(
-    model: ir.Model, names: dict[ir.OperatorIdentifier, ir.OperatorIdentifier]
-) -> None:
-    if not names:
-        return
-    functions = list(model.functions.values())
-    for nodes in (model.graph.all_nodes(), *(f.all_nodes() for f in functions)):
-        for node in nodes:
-            if (new := names.get(node.op_identifier())) is not None:
-                node.domain, node.op_type, node.overload = new
-    model.functions.clear()
-    for function in functions:
-        if (new := names.get(function.identifier())) is not None:
-            function.domain, function.name, function.overload = new
-        model.functions[function.identifier()] = function

@@ -17,7 +17,7 @@ g (bool c, float[2] x) => (float[2] y)
 {
   a = Add (x, w)
   b = f.Scale (a)
-  d = f.Scale : half (b)
+  d = f.Half (b)
   y = If (c) <
     then_branch = t () => (float[2] p) { p = Relu (d) },
     else_branch = e () => (float[2] q) { q = Neg (d) }
@@ -25,8 +25,8 @@ g (bool c, float[2] x) => (float[2] y)
 }
 <domain: "f", opset_import: ["": 17]>
 Scale (i) => (o) { o = Add (i, i) }
-<domain: "f", overload: "half", opset_import: ["": 17]>
-Scale (i) => (o) { k = Constant <value = float {0.5}> ()  o = Mul (i, k) }
+<domain: "f", opset_import: ["": 17]>
+Half (i) => (o) { k = Constant <value = float {0.5}> ()  o = Mul (i, k) }
 """
 
 
@@ -53,10 +53,9 @@ def test_there_and_back_changes_nothing(model: ir.Model) -> None:
     assert graph.digest(back) == graph.digest(model)
     assert graph.interface(back) == graph.interface(model)
     assert back.ir_version == model.ir_version
-    # functions keep their overloads and metadata
-    assert list(back.functions) == [("f", "Scale", ""), ("f", "Scale", "half")]
-    assert back.graph[2].op_identifier() == ("f", "Scale", "half")
-    half = back.functions["f", "Scale", "half"]
+    # functions keep their metadata
+    assert list(back.functions) == [("f", "Scale", ""), ("f", "Half", "")]
+    half = back.functions["f", "Half", ""]
     assert half.metadata_props == {"me2e.kind": "fallback"}
     assert all(n.metadata_props == {"note": "kept"} for n in half if n.name)
     onnx.checker.check_model(ir.to_proto(back))
@@ -93,3 +92,11 @@ def test_what_is_no_model_is_refused(model: ir.Model, fault: str) -> None:
     ) as c:
         from_graphsurgeon(handed, model, by="recipe")
     assert "\n" not in str(c.value)
+
+
+def test_an_overload_is_refused(model: ir.Model) -> None:
+    function = model.functions.pop(("f", "Half", ""))
+    function.overload = "half"
+    model.functions[function.identifier()] = function
+    with pytest.raises(GraphError, match="graphsurgeon knows no overloads, as of Half"):
+        to_graphsurgeon(model)

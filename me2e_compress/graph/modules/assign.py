@@ -11,7 +11,6 @@ from me2e_compress.base.display import join_names
 from me2e_compress.base.errors import ModuleMapError
 from me2e_compress.graph.modules.module_map import (
     ModuleMap,
-    PathGlob,
     parameter_path,
     presets,
     scope_of,
@@ -104,38 +103,6 @@ def map_of(model: ir.Model, name: str | None) -> ModuleMap:
         return ModuleMap.whole()
 
 
-# Most components of a prefix that is tried: wrappers nest this deep at most.
-_DEEPEST = 3
-
-
-def prefix_hint(modules: ModuleMap, paths: Iterable[str]) -> str:
-    """Suggest ``strip`` for a map if its patterns match behind a prefix; else "".
-
-    The suggested prefix is the one behind which most patterns match.
-    """
-    matches: dict[str, dict[tuple[str, str], None]] = {}
-    for path in paths:
-        parts = [part for part in path.split(".") if part]
-        for depth in range(1, min(_DEEPEST, len(parts) - 1) + 1):
-            if claims := modules.claims(".".join(parts[depth:])):
-                prefix = ".".join(parts[:depth])
-                matches.setdefault(prefix, {}).update(dict.fromkeys(claims))
-    # A pattern that matches anywhere also matches without a prefix
-    named = {
-        prefix: [text for _, text in claims if not PathGlob(text).anywhere]
-        for prefix, claims in matches.items()
-    }
-    best = max(named, key=lambda prefix: (len(named[prefix]), -len(prefix)), default="")
-    if not best or not named[best]:
-        return ""
-    strip = ", ".join(f'"{part}"' for part in best.split("."))
-    return (
-        f"; behind the prefix {best!r} {len(named[best])} of its patterns match, as"
-        f" {f'{best}.{named[best][0]}'!r}: write strip = [{strip}] into a copy of the"
-        " map"
-    )
-
-
 def assign(model: ir.Model, modules: ModuleMap) -> Assignment:
     """Find the module of every node, deterministically and in linear time.
 
@@ -186,7 +153,7 @@ def assign(model: ir.Model, modules: ModuleMap) -> Assignment:
     if nodes and not known:
         raise ModuleMapError(
             f"map {modules.name}: none of its patterns matches a parameter or a scope"
-            f" of this graph, which has {_sample(paths)}{prefix_hint(modules, paths)}"
+            f" of this graph, which has {_sample(paths)}"
         )
     for node, module in _spread(nodes, known, constant).items():
         placed.setdefault(node, Placement(module, "neighbour"))
@@ -203,7 +170,6 @@ def _check_required(modules: ModuleMap, paths: Collection[str]) -> None:
             raise ModuleMapError(
                 f"map {modules.name}: pattern {pattern!r} of module {module} matches"
                 f" no parameter and no scope; there are {_sample(paths)}"
-                f"{prefix_hint(modules, paths)}"
             )
 
 

@@ -1,4 +1,3 @@
-import dataclasses
 import re
 
 import onnx_ir as ir
@@ -147,12 +146,6 @@ MISSING = '[modules.det]\nrole = "prediction"\npatterns = ["det", "det.cls"]'
             "map three: none of its patterns matches a parameter or a scope of this"
             " graph, which has head.out, trunk.w",
         ),
-        (
-            ModuleMap.load("tcp"),
-            ONE,
-            '["/net/perception/Relu"] a = Relu(x) ["/net/join_traj/Neg"] y = Neg(a)',
-            'write strip = ["net"] into',
-        ),
     ],
 )
 def test_a_map_of_another_graph_says_what_there_is(
@@ -160,28 +153,6 @@ def test_a_map_of_another_graph_says_what_there_is(
 ) -> None:
     with pytest.raises(ModuleMapError, match=re.escape(words)):
         assign(read(signature, body), chosen)
-
-
-def test_a_prefix_that_hides_every_name_is_named() -> None:
-    mine = ModuleMap.parse(
-        '[modules.neck]\nrole = "feature"\npatterns = ["neck"]\n'
-        '[modules.det]\nrole = "prediction"\noptional = ["det.cls", "**.Abs"]',
-        "mine",
-    )
-    body = '["/net/agent/neck/Relu"] a = Relu(x) ["/net/agent/det/cls/Neg"] b = Neg(a)'
-    model = read(ONE, f"{body} y = Abs(b)")
-    with pytest.raises(ModuleMapError) as caught:
-        assign(model, mine)
-    assert str(caught.value).endswith(
-        "; behind the prefix 'net.agent' 2 of its patterns match, as 'net.agent.neck':"
-        ' write strip = ["net", "agent"] into a copy of the map'
-    )
-    # and so it is
-    assert placed(assign(model, dataclasses.replace(mine, strip=("net", "agent")))) == {
-        "a": ("neck", "scope"),
-        "b": ("det", "scope"),
-        "y": ("det", "neighbour"),
-    }
 
 
 def test_a_required_pattern_may_match_and_lose() -> None:
