@@ -3,22 +3,6 @@
 Every message says what was found, what there is, and names the culprit, on one line.
 """
 
-__all__ = [
-    "BrokenPackageError",
-    "EnergyError",
-    "EvaluationError",
-    "FramesError",
-    "GraphError",
-    "Me2eError",
-    "MissingExtraError",
-    "ModuleMapError",
-    "PassError",
-    "PreconditionError",
-    "RecipeError",
-    "StudyError",
-    "VerificationError",
-]
-
 
 class Me2eError(Exception):
     """Base class: the command line prints these on one line, without a traceback."""

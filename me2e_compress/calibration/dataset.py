@@ -19,11 +19,10 @@ import hashlib
 import io
 import itertools
 import json
-import math
 import zipfile
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import IO, Annotated, Literal, Self, TypeAlias, TypeVar
+from typing import Annotated, Literal, Self, TypeAlias, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -44,54 +43,34 @@ LARGEST_BYTES = 2 << 30
 
 @dataclasses.dataclass(frozen=True)
 class Header:
-    """Shape and type of an array, as its file states."""
+    """Shape and type of an array that need not be there."""
 
     shape: tuple[int, ...]
     dtype: np.dtype[np.generic]
 
 
-def read_headers(path: Path, what: str = "a readable .npz") -> Mapping[str, Header]:
-    """Read the headers of an ``.npz`` by array name, without the arrays.
+def load_arrays(path: Path, what: str = "a readable .npz") -> dict[str, Array]:
+    """Read every array of an ``.npz`` by name, unless they are larger than memory.
 
-    ``what`` is the expected content, for the FramesError of a file that is none.
+    Raises:
+        FramesError: the file is no archive of arrays of numbers or text, or these have
+            more than 2 GiB; ``what`` is the expected content, for the message.
     """
-    arrays, total = dict[str, Header](), 0
     try:
         check_regular(path)
         with path.open("rb") as source, zipfile.ZipFile(source) as archive:
-            for entry in archive.infolist():
-                with archive.open(entry) as stream:
-                    about = _header(stream)
-                    begin = stream.tell()
-                size = math.prod(about.shape) * about.dtype.itemsize
-                if entry.file_size != begin + size:
-                    raise ValueError(
-                        f"{entry.filename} has {entry.file_size} bytes, its header says"
-                        f" {begin + size}"
-                    )
-                name = entry.filename.removesuffix(".npy")
-                if name in arrays:
-                    raise ValueError("an array is there twice")
-                arrays[name], total = about, total + size
-    except NPZ_ERRORS as error:
-        raise FramesError(f"{path}: not {what} ({error_line(error)})") from error
-    # A header could claim any size: check before reading.
-    if total > LARGEST_BYTES:
-        raise FramesError(
-            f"{path}: not {what}: its arrays have {total:,} bytes, more than"
-            f" {LARGEST_BYTES:,}"
-        )
-    return arrays
-
-
-def load_arrays(path: Path, what: str = "a readable .npz") -> dict[str, Array]:
-    """Read every array of an ``.npz`` by name, after the checks of :func:`declared`."""
-    read_headers(path, what)
-    try:
+            total = sum(entry.file_size for entry in archive.infolist())
+        if total > LARGEST_BYTES:
+            raise ValueError(
+                f"its arrays have {total:,} bytes, more than {LARGEST_BYTES:,}"
+            )
         with path.open("rb") as source, np.load(source, allow_pickle=False) as content:
-            return {name: np.asarray(content[name]) for name in content}
+            arrays = dict(content.items())
+        if raw := [name for name, array in arrays.items() if isinstance(array, bytes)]:
+            raise ValueError(f"{raw[0]} is no array")
     except NPZ_ERRORS as error:
         raise FramesError(f"{path}: not {what} ({error_line(error)})") from error
+    return arrays
 
 
 def npz_bytes(
@@ -107,22 +86,6 @@ def npz_bytes(
                     entry, np.asanyarray(array), allow_pickle=False
                 )
     return content.getvalue()
-
-
-def _header(stream: IO[bytes]) -> Header:
-    version = np.lib.format.read_magic(stream)
-    if version == (1, 0):
-        shape, _, dtype = np.lib.format.read_array_header_1_0(stream)
-    elif version == (2, 0):
-        shape, _, dtype = np.lib.format.read_array_header_2_0(stream)
-    else:
-        raise ValueError(f"an array of version {version}")
-    # Objects would be unpickled, which runs code.
-    if dtype.hasobject:
-        raise ValueError("an array of Python objects")
-    if any(side < 0 for side in shape):
-        raise ValueError(f"an array of shape {shape}")
-    return Header(tuple(shape), dtype)
 
 
 _PositiveFloat: TypeAlias = Annotated[FiniteFloat, Field(gt=0)]
@@ -153,7 +116,7 @@ class PixelInput(BaseModel):
     rows: PositiveInt
     columns: PositiveInt
 
-    def fed_header(self, stored: Header) -> Header:
+    def fed_header(self, stored: Array) -> Header:
         """Return shape and type of a stored input when it is fed.
 
         Raises:
@@ -175,7 +138,7 @@ class PixelInput(BaseModel):
 
     def normalise(self, stored: Array) -> npt.NDArray[np.float32]:
         """Return the input, float32 [..., 3, rows, columns]; raises as `fed_header`."""
-        shape = self.fed_header(Header(stored.shape, stored.dtype)).shape
+        shape = self.fed_header(stored).shape
         height, width = stored.shape[-2:]
         ready = np.zeros(shape, np.float32)
         picture = ready[..., :height, :width]
@@ -287,14 +250,17 @@ class CalibrationSet:
         return Frame(place, self._starts_scene(index), arrays)
 
     def _convert_pixels(
-        self, path: Path, arrays: Mapping[str, T], convert: Callable[[PixelInput, T], T]
-    ) -> dict[str, T]:
-        """Return a frame's arrays, or headers, with its pixel inputs converted."""
-        ready = dict(arrays)
+        self,
+        path: Path,
+        arrays: Mapping[str, Array],
+        convert: Callable[[PixelInput, Array], T],
+    ) -> dict[str, Array | T]:
+        """Return a frame's arrays with its pixel inputs converted."""
+        ready: dict[str, Array | T] = dict(arrays)
         for name, pixels in self.pixels.items():
             try:
-                if name in ready:
-                    ready[name] = convert(pixels, ready[name])
+                if name in arrays:
+                    ready[name] = convert(pixels, arrays[name])
             except ValueError as error:
                 raise FramesError(f"{path}: {name} {error}") from error
         return ready
@@ -344,15 +310,16 @@ class CalibrationSet:
                     f" the model; it takes {', '.join(inputs)}"
                 )
         for path in self.files:
-            # Compare headers before any array is read.
-            headers = read_headers(path)
-            arrays = self._convert_pixels(path, headers, PixelInput.fed_header)
-            for name in arrays:
+            # Names, types and shapes first, as they are fed
+            arrays = load_arrays(path)
+            fed = self._convert_pixels(path, arrays, PixelInput.fed_header)
+            for name in fed:
                 if (array := array_of(weights.get(name))) is not None:
                     frozen.setdefault(name, digest_of(array))
-            asked = {name: arrays[name] for name in arrays if name not in frozen}
-            _check_frame(asked, model, str(path))
-            for name, array in load_arrays(path).items():
+            inputs_fed = {name: fed[name] for name in fed if name not in frozen}
+            _check_frame(inputs_fed, model, str(path))
+            # Then numbers
+            for name, array in arrays.items():
                 if array.dtype.kind == "f" and not np.isfinite(array).all():
                     kind = "NaN" if np.isnan(array).any() else "infinite"
                     at = np.argwhere(~np.isfinite(array))[0].tolist()
@@ -378,7 +345,9 @@ def digest_of(array: Array) -> str:
     return hashlib.blake2b(head + array.tobytes(), digest_size=16).hexdigest()
 
 
-def _check_frame(frame: Mapping[str, Header], model: ir.Model, source: str) -> None:
+def _check_frame(
+    frame: Mapping[str, Header | Array], model: ir.Model, source: str
+) -> None:
     """Raise a FramesError where names, dtypes or shapes are not the model's."""
     ports = {str(value.name): value for value in model.graph.inputs}
     # Recurrent inputs may come from the model itself.

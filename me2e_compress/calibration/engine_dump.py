@@ -9,7 +9,7 @@ from pathlib import Path
 
 from me2e_compress.base.display import plural
 from me2e_compress.base.errors import FramesError
-from me2e_compress.calibration.dataset import CalibrationSet, load_arrays, read_headers
+from me2e_compress.calibration.dataset import CalibrationSet, load_arrays
 from me2e_compress.runtime.frames import Array
 
 # Most frames in memory: some are read again and again.
@@ -57,10 +57,7 @@ class EngineDump:
         return str(self.path / self.stems[index])
 
     def _read(self, index: int) -> Mapping[str, Array]:
-        return load_arrays(self._file(index))
-
-    def _file(self, index: int) -> Path:
-        return self.path / f"{self.stems[index]}.npz"
+        return load_arrays(self.path / f"{self.stems[index]}.npz")
 
     def check(self, frames: CalibrationSet) -> None:
         """Check that every frame was answered, and with the same tensors.
@@ -84,7 +81,7 @@ class EngineDump:
                 f" {frames.folder}, whose first is {frames.files[0].stem}"
             )
         for index in range(len(self)):
-            tensors = read_headers(self._file(index))
+            tensors = self[index]
             if missing := [each for each in self.names if each not in tensors]:
                 label = self.label(index)
                 raise FramesError(
