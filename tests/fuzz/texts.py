@@ -40,8 +40,6 @@ def neither() -> Iterator[tuple[str, bytes]]:
         "deep-object": b'{"a":' * DEEP,
         "deep-toml": b"a = " + b"[" * DEEP,
         "deep-inline": b"a = " + b"{a = " * DEEP,
-        "deep-key": b"a." * DEEP + b"a = 1",
-        "deep-header": b"[" + b"a." * DEEP + b"a]",
         "huge": HUGE.encode(),
         "huge-toml": b"a = " + HUGE.encode(),
         "list": b"[]",

@@ -10,7 +10,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 import numpy.typing as npt
@@ -231,9 +231,6 @@ def integrate_power(times_s: Floats, watts: Floats) -> Floats:
     return np.concatenate([[0.0], np.cumsum(steps)])
 
 
-_COLUMNS = "time_s, frames, and joules or watts"
-
-
 @dataclass(frozen=True)
 class Recorded(EnergyCounter):
     """A file of the energy or the power that was recorded on the target device.
@@ -252,7 +249,7 @@ class Recorded(EnergyCounter):
     def open(self) -> EnergyRecording:
         """Read the file and check it."""
         try:
-            return _recording(_read(self.file), self.file.name)
+            return _recording(_read_columns(self.file), self.file.name)
         except OSError as error:
             raise EnergyError(f"{self.file}: {error.strerror}") from error
         except (documents.MalformedError, ValueError, csv.Error) as error:
@@ -261,52 +258,49 @@ class Recorded(EnergyCounter):
             ) from error
 
 
-def _read(path: Path) -> Mapping[str, Sequence[str]]:
+def _read_columns(path: Path) -> Mapping[str, Floats]:
     """Return a CSV file's columns by name; a ValueError of rows of other lengths."""
     content = documents.read_bytes(path)
-    rows = csv.reader(io.StringIO(content.decode("utf-8-sig")))
-    header = [name.strip() for name in next(rows, [])]
-    lines = [line for line in rows if line]
-    for number, line in enumerate(lines, 2):
+    lines = csv.reader(io.StringIO(content.decode("utf-8-sig")))
+    header = [name.strip() for name in next(lines, [])]
+    rows = [line for line in lines if line]
+    for number, line in enumerate(rows, 2):
         if len(line) != len(header):
             raise ValueError(
                 f"line {number} has {len(line)} values, the header {len(header)}"
             )
-    values = zip(*lines, strict=True) if lines else [()] * len(header)
-    return dict(zip(header, values, strict=True))
+    table = np.array(rows, np.float64).reshape(len(rows), len(header))
+    return dict(zip(header, table.T, strict=True))
 
 
-def _recording(columns: Mapping[str, Sequence[str]], name: str) -> EnergyRecording:
+def _recording(columns: Mapping[str, Floats], name: str) -> EnergyRecording:
     """Build a recording; a ValueError names the first row that does not fit."""
-    times, frames = _column(columns, "time_s"), _column(columns, "frames")
-    if np.any(np.diff(times) <= 0):
-        raise ValueError(f"time_s does not ascend at row {_row(np.diff(times) <= 0)}")
-    if np.any(np.diff(frames) < 0):
-        raise ValueError(f"frames go back at row {_row(np.diff(frames) < 0)}")
-    # Check the columns against each other.
-    counts = "joules" in columns
-    values = _column(columns, "joules" if counts else "watts")
-    if len({len(times), len(frames), len(values)}) > 1 or len(times) < 2:
-        raise ValueError("the columns are not of one length of 2 rows or more")
-    if counts and np.any(np.diff(values) < 0):
-        raise ValueError(f"joules go back at row {_row(np.diff(values) < 0)}")
-    if not counts and np.any(values < 0):
-        raise ValueError(f"watts are negative at row {_row(values < 0)}")
-    # Power is integrated to joules.
-    joules = values if counts else integrate_power(times, values)
-    counter = "recorded" if counts else "recorded-power-integrated"
+    power_or_energy = "joules" if "joules" in columns else "watts"
+    for column in ("time_s", "frames", power_or_energy):
+        if column not in columns:
+            there = ", ".join(columns) or "none"
+            raise ValueError(
+                f"no column {column}; there are {there}, wanted: time_s, frames, and"
+                " joules or watts"
+            )
+        _check_rows(f"{column} is not finite", ~np.isfinite(columns[column]))
+    times, frames = columns["time_s"], columns["frames"]
+    values = columns[power_or_energy]
+    if len(times) < 2:
+        raise ValueError("a recording has 2 rows or more")
+    # Time and counts never go back
+    _check_rows("time_s does not ascend", np.diff(times) <= 0)
+    _check_rows("frames go back", np.diff(frames) < 0)
+    if power_or_energy == "joules":
+        _check_rows("joules go back", np.diff(values) < 0)
+        joules, counter = values, "recorded"
+    else:
+        _check_rows("watts are negative", values < 0)
+        joules, counter = integrate_power(times, values), "recorded-power-integrated"
     return EnergyRecording(times, joules, frames, name, "as recorded", counter)
 
 
-def _column(columns: Mapping[str, Sequence[str]], name: str) -> Floats:
-    if name not in columns:
-        there = ", ".join(columns) or "none"
-        raise ValueError(f"no column {name}; there are {there}, wanted: {_COLUMNS}")
-    values = np.array([float(each) for each in columns[name]])
-    if not np.all(np.isfinite(values)):
-        raise ValueError(f"{name} is not finite at row {_row(~np.isfinite(values))}")
-    return values
-
-
-def _row(wrong: Any) -> int:
-    return int(np.argmax(wrong)) + 1
+def _check_rows(fault: str, wrong: npt.NDArray[np.bool_]) -> None:
+    """Raise a ValueError that names the first wrong row, counted from 1."""
+    if wrong.any():
+        raise ValueError(f"{fault} at row {int(np.argmax(wrong)) + 1}")

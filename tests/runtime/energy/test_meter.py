@@ -261,7 +261,7 @@ def changed(column: str, row: int, value: float, *, joules: bool = False) -> str
     [
         ("", "no column time_s; there are none"),
         ("time_s,frames\n0,0\n1,1", "no column watts"),
-        ("time_s,frames,watts", "the columns are not of one length"),
+        ("time_s,frames,watts", "a recording has 2 rows or more"),
         ("time_s,frames,watts\n0,0", "line 2 has 2 values, the header 3"),
         ("time_s,frames,watts\n0,0,x\n1,1,1", "could not convert string to float"),
         (changed("time_s", 9, 0.0), "time_s does not ascend at row 9"),
