@@ -4,8 +4,7 @@ import contextlib
 import hashlib
 import os
 import tempfile
-from collections.abc import Callable, Iterator
-from functools import partial
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import onnx
@@ -60,15 +59,34 @@ def load(path: str | Path) -> ir.Model:
         raise GraphError(
             f"{path}: not an ONNX file, or cut short ({error_line(error)})"
         ) from error
+    # Build the graph, its nodes in order
+    proto.graph.name = proto.graph.name or "graph"  # ONNX's checker wants one
     try:
         in_order = check_file(proto)
-        model = _build_model(proto, in_order)
+        model = ir.serde.deserialize_model(proto)
+        if not in_order:
+            model.graph.sort()
+            for function in model.functions.values():
+                function.graph.sort()
         provenance.unpack(model)
     except GraphError as error:
         raise GraphError(f"{path}: {error}") from error
+    except (ir.serde.SerdeError, ValueError) as error:
+        cause: BaseException = error
+        while cause.__cause__ is not None:
+            cause = cause.__cause__
+        line = f"not a valid ONNX graph ({error_line(cause)})"
+        raise GraphError(f"{path}: {line}") from error
+    # The standard domain, which may be called ai.onnx, becomes the empty name
+    for body, _ in bodies(model):
+        for domain in STANDARD[1:]:
+            if domain in body.opset_imports:
+                body.opset_imports.setdefault("", body.opset_imports.pop(domain))
+        for node in body.all_nodes():
+            node.domain = "" if node.domain in STANDARD else node.domain
+    # Weights, then versions
     ir.external_data.set_base_dir(model.graph, path.parent)
-    _name_standard(model)
-    read_small_weights(model, path)
+    _read_external(model, path)
     fit_runtime(model, path)
     _freeze_defaults(model)
     model.ir_version = max(model.ir_version, PLAIN_INITIALIZERS_SINCE_IR)
@@ -94,33 +112,6 @@ def _freeze_defaults(model: ir.Model) -> None:
         change = f"{join_names(names)} held a value: no input any more, but a constant"
         way = "what is to stay one, take out of the initializers"
         note_change(model, f"{change}; {way}")
-
-
-def _build_model(proto: onnx.ModelProto, in_order: bool) -> ir.Model:
-    """Build the graph of a message, its nodes in order."""
-    proto.graph.name = proto.graph.name or "graph"  # ONNX's checker wants one
-    try:
-        model = ir.serde.deserialize_model(proto)
-        if not in_order:
-            model.graph.sort()
-            for function in model.functions.values():
-                function.graph.sort()
-    except (ir.serde.SerdeError, ValueError) as error:
-        cause: BaseException = error
-        while cause.__cause__ is not None:
-            cause = cause.__cause__
-        raise GraphError(f"not a valid ONNX graph ({error_line(cause)})") from error
-    return model
-
-
-def _name_standard(model: ir.Model) -> None:
-    """Write the standard domain, which may be called ``ai.onnx``, as the empty name."""
-    for body, _ in bodies(model):
-        for domain in STANDARD[1:]:
-            if domain in body.opset_imports:
-                body.opset_imports.setdefault("", body.opset_imports.pop(domain))
-        for node in body.all_nodes():
-            node.domain = "" if node.domain in STANDARD else node.domain
 
 
 def save(model: ir.Model, path: str | Path, *, external: bool | None = None) -> None:
@@ -229,22 +220,37 @@ def file_contains(path: Path, word: bytes) -> bool:
 def inlined(model: ir.Model) -> ir.Model:
     """Return a copy whose weights are all in memory."""
     copy = model.clone()
-    for tensor, replace in list(_places(copy)):
-        replace(ir.tensor(tensor.numpy().copy(), name=tensor.name))
+    ir.external_data.load_to_model(copy)
     return copy
 
 
 # Weights up to this size are read at once: shapes and axes are among them, and ONNX's
-# checker would look for their file in the working directory.
+# checker would look for their file in the working directory
 SMALL_BYTES = 1024
 
 
 def external_tensors(model: ir.Model) -> list[ir.ExternalTensor]:
-    """List the weights whose data lie in a file of their own."""
-    return [tensor for tensor, _ in _places(model)]
+    """List the weights and attributes whose data lie in a file of their own."""
+    tensors = [
+        value.const_value
+        for graph in model.graphs()
+        for value in graph.initializers.values()
+    ]
+    for node in nodes_of(model):
+        for attribute in node.attributes.values():
+            tensors += _tensors_of(attribute)
+    return [tensor for tensor in tensors if isinstance(tensor, ir.ExternalTensor)]
 
 
-def read_small_weights(model: ir.Model, path: Path) -> None:
+def _tensors_of(attribute: ir.Attr) -> Sequence[ir.TensorProtocol]:
+    if attribute.type == ir.AttributeType.TENSOR and not attribute.is_ref():
+        return (attribute.as_tensor(),)
+    if attribute.type == ir.AttributeType.TENSORS and not attribute.is_ref():
+        return attribute.as_tensors()
+    return ()
+
+
+def _read_external(model: ir.Model, path: Path) -> None:
     """Check the files of external weights, and read those that must not stay on disk.
 
     Large initializers of the main graph stay, mapped from an absolute path. Small ones,
@@ -254,18 +260,35 @@ def read_small_weights(model: ir.Model, path: Path) -> None:
         GraphError: a tensor's file is missing, too short, or outside the model's
             folder.
     """
-    mapped = {id(value.const_value) for value in model.graph.initializers.values()}
-    for tensor, replace in list(_places(model)):
-        anchored = _anchored(tensor, path)
-        if tensor.nbytes > SMALL_BYTES and id(tensor) in mapped:
-            replace(anchored)
-            continue
+
+    def read(tensor: ir.TensorProtocol) -> ir.TensorProtocol:
+        if not isinstance(tensor, ir.ExternalTensor):
+            return tensor
         try:
-            array = anchored.numpy().copy()
-            replace(ir.tensor(array, dtype=tensor.dtype, name=tensor.name))
+            array = _anchored(tensor, path).numpy().copy()
+            return ir.tensor(array, dtype=tensor.dtype, name=tensor.name)
         except (ValueError, TypeError) as error:
             message = f"{path}: {tensor.name} cannot be read ({error})"
             raise GraphError(message) from error
+
+    for graph in model.graphs():
+        for value in graph.initializers.values():
+            tensor = value.const_value
+            if isinstance(tensor, ir.ExternalTensor):
+                is_mapped = graph is model.graph and tensor.nbytes > SMALL_BYTES
+                value.const_value = (
+                    _anchored(tensor, path) if is_mapped else read(tensor)
+                )
+    for node in nodes_of(model):
+        for name, attribute in list(node.attributes.items()):
+            stored = _tensors_of(attribute)
+            if not any(isinstance(tensor, ir.ExternalTensor) for tensor in stored):
+                continue
+            tensors = [read(tensor) for tensor in stored]
+            if attribute.type == ir.AttributeType.TENSOR:
+                node.attributes[name] = ir.AttrTensor(name, tensors[0])
+            else:
+                node.attributes[name] = ir.AttrTensors(name, tensors)
 
 
 def data_file(model: Path, tensor: ir.ExternalTensor) -> Path:
@@ -291,34 +314,6 @@ def data_file(model: Path, tensor: ir.ExternalTensor) -> Path:
             " outside the model's folder: not read"
         )
     return resolved
-
-
-def _places(
-    model: ir.Model,
-) -> Iterator[tuple[ir.ExternalTensor, Callable[[ir.TensorProtocol], None]]]:
-    """List external tensors, each with the function that puts another in its place."""
-    for graph in model.graphs():
-        for value in graph.initializers.values():
-            if isinstance(value.const_value, ir.ExternalTensor):
-                yield value.const_value, partial(setattr, value, "const_value")
-    for node in nodes_of(model):
-        for attribute in node.attributes.values():
-            if isinstance(attribute.value, ir.ExternalTensor):
-                yield attribute.value, partial(_put, node, attribute.name, None)
-            elif attribute.type == ir.AttributeType.TENSORS and not attribute.is_ref():
-                for at, tensor in enumerate(attribute.as_tensors()):
-                    if isinstance(tensor, ir.ExternalTensor):
-                        yield tensor, partial(_put, node, attribute.name, at)
-
-
-def _put(node: ir.Node, name: str, at: int | None, tensor: ir.TensorProtocol) -> None:
-    """Put a tensor into an attribute, or into one place of its list."""
-    if at is None:
-        node.attributes[name] = ir.AttrTensor(name, tensor)
-        return
-    tensors = list(node.attributes[name].as_tensors())
-    tensors[at] = tensor
-    node.attributes[name] = ir.AttrTensors(name, tensors)
 
 
 def _anchored(tensor: ir.ExternalTensor, path: Path) -> ir.ExternalTensor:
