@@ -5,60 +5,27 @@ that would need to change an input or output is refused. New nodes inherit the m
 and the origins of those they replace, and name the pass that made them.
 """
 
-from me2e_compress.graph.rewrite.edits import (
-    add_constant,
-    bypass,
-    can_replace,
-    fresh_name,
-    lift_constants,
-    put,
-    remove_dead,
-    remove_node,
-    remove_unread,
-    replace_value,
-    sweep,
-    value_names,
-)
-from me2e_compress.graph.rewrite.fusion import (
-    Facts,
-    Fused,
-    Fusion,
-    Kit,
-    fuse,
-)
-from me2e_compress.graph.rewrite.pattern import (
-    Match,
-    Pattern,
-    constant,
-    either,
-    match,
-    op,
-    var,
-)
-
-__all__ = [
-    "Facts",
-    "Fused",
-    "Fusion",
-    "Kit",
-    "Match",
-    "Pattern",
-    "add_constant",
-    "bypass",
-    "can_replace",
-    "constant",
-    "either",
-    "fresh_name",
-    "fuse",
-    "lift_constants",
-    "match",
-    "op",
-    "put",
-    "remove_dead",
-    "remove_node",
-    "remove_unread",
-    "replace_value",
-    "sweep",
-    "value_names",
-    "var",
-]
+from me2e_compress.graph.rewrite.edits import add_constant as add_constant
+from me2e_compress.graph.rewrite.edits import bypass as bypass
+from me2e_compress.graph.rewrite.edits import can_replace as can_replace
+from me2e_compress.graph.rewrite.edits import fresh_name as fresh_name
+from me2e_compress.graph.rewrite.edits import lift_constants as lift_constants
+from me2e_compress.graph.rewrite.edits import put as put
+from me2e_compress.graph.rewrite.edits import remove_dead as remove_dead
+from me2e_compress.graph.rewrite.edits import remove_node as remove_node
+from me2e_compress.graph.rewrite.edits import remove_unread as remove_unread
+from me2e_compress.graph.rewrite.edits import replace_value as replace_value
+from me2e_compress.graph.rewrite.edits import sweep as sweep
+from me2e_compress.graph.rewrite.edits import value_names as value_names
+from me2e_compress.graph.rewrite.fusion import Facts as Facts
+from me2e_compress.graph.rewrite.fusion import Fused as Fused
+from me2e_compress.graph.rewrite.fusion import Fusion as Fusion
+from me2e_compress.graph.rewrite.fusion import Kit as Kit
+from me2e_compress.graph.rewrite.fusion import fuse as fuse
+from me2e_compress.graph.rewrite.pattern import Match as Match
+from me2e_compress.graph.rewrite.pattern import Pattern as Pattern
+from me2e_compress.graph.rewrite.pattern import constant as constant
+from me2e_compress.graph.rewrite.pattern import either as either
+from me2e_compress.graph.rewrite.pattern import match as match
+from me2e_compress.graph.rewrite.pattern import op as op
+from me2e_compress.graph.rewrite.pattern import var as var
