@@ -62,14 +62,8 @@ def reading(
 ) -> Iterator[None]:
     """Turn what is wrong with a file that is read here into one line that names it.
 
-    Args:
-        path: the file, or what a text came from.
-        error: what is raised.
-        otherwise: what the line says of a file that is there and does not fit.
-
-    Raises:
-        Exception: ``error``: the file cannot be read, is malformed, or does not fit;
-            the first place that does not is named.
+    ``otherwise`` is what the line says of a file that is there and does not fit; the
+    first place that does not is named. ``error`` is what is raised.
     """
     try:
         yield
@@ -91,12 +85,7 @@ def check_regular(path: Path) -> None:
 
 
 def read_bytes(path: Path, most: int = LARGEST_BYTES) -> bytes:
-    """Read a text file of at most so many bytes.
-
-    Raises:
-        OSError: it is not there, or may not be read.
-        MalformedError: it is not a regular file, or too large.
-    """
+    """Read a regular file of at most so many bytes; OSError or MalformedError."""
     check_regular(path)
     _check_size(path.stat().st_size, most)
     return path.read_bytes()
@@ -105,10 +94,11 @@ def read_bytes(path: Path, most: int = LARGEST_BYTES) -> bytes:
 def from_json(text: bytes | str, *, finite: bool = True) -> Any:
     """Read a JSON document; anything else is a MalformedError.
 
-    So are NaN and infinities, which Python's own writer writes, unless ``finite`` is
-    False; the caller must then look at the numbers.
+    So are NaN and infinities, unless ``finite`` is False.
     """
     try:
+        # Python's own writer writes NaN: a caller that takes it must look at the
+        # numbers
         document = (_DECODER if finite else _ANY_NUMBER).decode(_decode(text))
     except RecursionError as error:
         raise MalformedError("nested too deeply") from error

@@ -30,11 +30,7 @@ _OURS = "me2e-compress"
 
 
 class NamedItem(Protocol):
-    """What is registered: a frozen dataclass.
-
-    Class attributes:
-        name: what recipes and the command line call it.
-    """
+    """What is registered: a frozen dataclass with a name for texts."""
 
     name: ClassVar[str]
 
@@ -71,10 +67,8 @@ class Registry(Generic[T]):
     def get(self, name: str) -> type[T]:
         """Import the class of a name.
 
-        Raises:
-            error: no such name, two packages claim it, it does not load, or it is not
-                a frozen dataclass of that name.
-            MissingExtraError: what it needs is not installed.
+        What does not load, is not of the right form or is claimed by two packages is an
+        ``error``; a missing package of an extra is a MissingExtraError.
         """
         claim, *rivals = self._entries(name) or (None,)
         if claim is None:
@@ -96,11 +90,7 @@ class Registry(Generic[T]):
         return tuple(usable)
 
     def build(self, name: str, options: Mapping[str, object]) -> T:
-        """Make an item from its options, each checked against the field's type.
-
-        Raises:
-            error: no such item or option, one is missing, or of another type.
-        """
+        """Make an item from options, each checked by its field's type."""
         return self.make(self.get(name), options)
 
     def make(self, cls: type[T], options: Mapping[str, object]) -> T:
@@ -136,12 +126,8 @@ class Registry(Generic[T]):
     ) -> T:
         """Make an item from ``name``, ``name{option=value, ...}`` or ``name:value``.
 
-        What follows a colon is the value of the first option. ``cls`` need not be
-        registered; None finds the class by the name. The text must not give the
-        options in ``more``.
-
-        Raises:
-            error: the text is not of that form, or see :meth:`build`.
+        ``cls`` need not be registered; None finds the class by the name. The text must
+        not give the options in ``more``. Anything else is an ``error``.
         """
         try:
             item = read_one(text)
@@ -162,12 +148,11 @@ class Registry(Generic[T]):
     def text(self, item: T, *, defaults: bool = False) -> str:
         """Write an item so that :meth:`parse` makes an equal one.
 
-        The single number of an item that has no other option is written after a colon.
-        Options at their default are left out unless ``defaults``, and fields that hold
-        functions always: they have no text.
+        Options at their default are left out unless ``defaults``.
         """
         fields = [field for field in fields_of(type(item)) if field.name != "name"]
         values = {field.name: getattr(item, field.name) for field in fields}
+        # Fields that hold functions have no text
         chosen = {
             field.name: values[field.name]
             for field in fields
@@ -302,14 +287,7 @@ _OPTION = re.compile(r"^    (\w+): ((?:.|\n(?=      ))+)", re.MULTILINE)
 
 @dataclasses.dataclass(frozen=True)
 class Option:
-    """One option of an entry.
-
-    Attributes:
-        name: of the field.
-        type: as in Python.
-        default: as text; None where it must be given.
-        doc: of the docstring; empty where it says nothing.
-    """
+    """One option of an entry; ``default`` is None where it must be given."""
 
     name: str
     type: str
@@ -319,14 +297,13 @@ class Option:
 
 @dataclasses.dataclass(frozen=True)
 class Entry:
-    """One name of a registry.
+    """One name of a registry, as ``list`` shows it.
 
     Attributes:
         name: as in recipes and commands.
-        source: the package; with its version; of a name that several
-            packages claim, all of them.
+        source: the package, with its version; all that claim the name.
         doc: first line of its docstring.
-        options: in order; that of its fields.
+        options: in the order of its fields.
         error: why it cannot be used; empty if it can.
     """
 

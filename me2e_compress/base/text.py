@@ -98,11 +98,9 @@ def write_item(name: str, options: Mapping[str, object], *, short: bool = False)
 
 
 def write_value(value: object) -> str:
-    """Write the value of an option: a number, a list, or else a string.
-
-    A dataclass is a mapping of its fields, those at their default left out, unless it
-    has a text of its own.
-    """
+    """Write the value of an option: a number, a list, a mapping, or else a string."""
+    # A dataclass is a mapping of its fields, those at their default left out, unless it
+    # has a text of its own
     own = type(value).__str__ is not object.__str__
     if dataclasses.is_dataclass(value) and not isinstance(value, type) and not own:
         return write_value(fields_changed(value))

@@ -51,8 +51,6 @@ from me2e_compress.runtime.session import DTYPES, Session, feed_forward
 class Extremes:
     """Smallest element, largest element, mean square.
 
-    The mean square shows where few elements determine the range. It also finds every
-    NaN, which onnxruntime's ReduceMin and ReduceMax overlook unless it comes first.
     A tensor without elements gives infinity, minus infinity and 0.
     """
 
@@ -62,6 +60,9 @@ class Extremes:
         """Build three reductions of the whole tensor."""
         one = shared_constant(where, np.array([1], np.int64), "one")
         least = shared_constant(where, np.array(1, np.float32), "least")
+        # The mean square shows where few elements determine the range. It also finds
+        # every NaN, which onnxruntime's ReduceMin and ReduceMax overlook unless it
+        # comes first
         low, high, total = (
             ir.node(op, [value], {"keepdims": 0})
             for op in ("ReduceMin", "ReduceMax", "ReduceSumSquare")
@@ -390,17 +391,14 @@ def probed_session(
     optimize: bool,
     provider: Provider = CPU,
 ) -> Session:
-    """Open a model with probes, in the memory and nearly the time of the model.
-
-    onnxruntime optimizes the graph with its probes; then the nodes are put into an
-    order in which every watched tensor is freed as early as without them. A provider
-    that compiles parts of the graph uses an order of its own.
-    """
+    """Open a model with probes, in the memory and nearly the time of the model."""
     probed = insert_probes(model, tensors, probe)
     run = partial(Session, threads=threads, frugal=True, provider=provider)
+    # A provider that compiles parts of the graph uses an order of its own
     if not optimize or provider.native != CPU.native:
         return run(probed, optimize=optimize)
-    # Write the optimized graph, reorder it, and run it as it is.
+    # Write the optimized graph with its probes, put its nodes into an order in which
+    # every watched tensor is freed as early as without them, and run it as it is
     with tempfile.TemporaryDirectory(prefix="me2e-probed-") as folder:
         path = Path(folder) / "optimized.onnx"
         Session(probed, threads=1, rewritten=path, provider=provider)
@@ -413,13 +411,11 @@ def probed_session(
 
 
 def schedule_probes(model: ir.Model) -> None:
-    """Move the nodes of every probe to the earliest position, in place.
-
-    onnxruntime runs nodes in the order of the file (``Session(frugal=True)``). Its
-    optimizations append new nodes at the end: the conversion from a blocked layout that
-    a probe reads would come last, and keep the tensors of a whole backbone in memory.
-    """
-    # What the model's own outputs need keeps its order; the rest waits for its inputs.
+    """Move the nodes of every probe to the earliest position, in place."""
+    # onnxruntime runs nodes in the order of the file (`Session(frugal=True)`), and its
+    # optimizations append new nodes at the end: the conversion from a blocked layout
+    # that a probe reads would come last, and keep the tensors of a backbone in memory.
+    # What the model's own outputs need keeps its order; the rest waits for its inputs
     nodes = list(model.graph)
     own = makers_of([v for v in model.graph.outputs if v.name != READINGS])
     waiting = {

@@ -117,11 +117,7 @@ class PixelInput(BaseModel):
     columns: PositiveInt
 
     def fed_header(self, stored: Array) -> Header:
-        """Return shape and type of a stored input when it is fed.
-
-        Raises:
-            ValueError: it is not bytes, has not three planes, or is too large.
-        """
+        """Return shape and type when it is fed; ValueError if it is no such bytes."""
         if stored.dtype != np.uint8:
             raise ValueError(f"is {stored.dtype}, pixels are uint8")
         if len(stored.shape) < CHANNELS or stored.shape[-3] != CHANNELS:
@@ -149,12 +145,7 @@ class PixelInput(BaseModel):
 
 
 class PixelInputs(BaseModel):
-    """The entry ``pixels`` of ``scenes.json``.
-
-    Attributes:
-        version: version of this format; later ones are refused.
-        inputs: the inputs stored as bytes, by name.
-    """
+    """The entry ``pixels`` of ``scenes.json``: a version, and inputs by name."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -267,16 +258,13 @@ class CalibrationSet:
 
     @property
     def fingerprint(self) -> str:
-        """A digest of the whole: it changes with its content, order or scenes.
-
-        It uses the checksums in every .npz (CRC-32 and size of each array), so that the
-        arrays need not be read.
-        """
+        """A digest of the whole: it changes with its content, order or scenes."""
         digest = hashlib.blake2b(digest_size=16)
         digest.update(repr(self._starts).encode())
         if self.pixels:
             digest.update(repr(sorted(self.pixels.items())).encode())
-        # The directory of each archive has its checksums.
+        # The directory of each archive has checksums (CRC-32 and size of each array),
+        # so that the arrays need not be read
         for path in self.files:
             try:
                 with zipfile.ZipFile(path) as archive:
@@ -293,14 +281,11 @@ class CalibrationSet:
     def check(self, model: ir.Model) -> None:
         """Read every frame of the whole once and check it against a model's inputs.
 
-        Recurrent inputs may be absent. Names that the model lacks are an error, except
-        those of constants, by ``freeze-inputs`` or in the file: their values must be
-        the same.
-
-        Raises:
-            FramesError: an array is missing, unknown, of another shape or dtype, or not
-                finite.
+        An array that is missing, unknown, of another shape or dtype, or not finite is a
+        FramesError.
         """
+        # Constants, by `freeze-inputs` or in the file, may be there with the same
+        # values
         frozen, weights = frozen_inputs(model), model.graph.initializers
         inputs = [str(each.name) for each in model.graph.inputs]
         for name in self.pixels:
@@ -388,12 +373,9 @@ def _matches(shape: tuple[int, ...], expected: ir.Shape) -> bool:
 def draw_frames(model: ir.Model, *, seed: int, count: int) -> Iterator[Frame]:
     """Draw random inputs for a model: one scene of ``count`` frames.
 
-    Floats are standard normal, integers and booleans 0 or 1. They show that two graphs
-    compute the same, but differ from real inputs, so nothing is calibrated on them.
-    Recurrent inputs are left to the replay.
-
-    Raises:
-        PreconditionError: an input has an open shape or a type that cannot be drawn.
+    They show that two graphs compute the same, but differ from real inputs, so nothing
+    is calibrated on them. Recurrent inputs are left to the replay. An input of an open
+    shape, or that is not of numbers, is a PreconditionError.
     """
     open_state = recurrent_inputs(model)
     ports = [value for value in model.graph.inputs if value.name not in open_state]
@@ -416,6 +398,7 @@ def draw_frames(model: ir.Model, *, seed: int, count: int) -> Iterator[Frame]:
     def draw_array(value: ir.Value) -> Array:
         shape = static_shape(value) or ()
         dtype = np.dtype(np.float32) if value.dtype is None else value.dtype.numpy()
+        # Floats are standard normal, integers and booleans 0 or 1
         if dtype.kind == "f":
             return np.asarray(generator.standard_normal(shape)).astype(dtype)
         return np.asarray(generator.integers(0, 2, shape)).astype(dtype)

@@ -60,11 +60,9 @@ class EngineDump:
         return load_arrays(self.path / f"{self.stems[index]}.npz")
 
     def check(self, frames: CalibrationSet) -> None:
-        """Check that every frame was answered, and with the same tensors.
+        """Check that every frame was answered, and with the same tensors of numbers.
 
-        Raises:
-            FramesError: frames are missing or unknown, a tensor is missing in one or
-                not of numbers, or a file is cut.
+        Anything else is a FramesError, which names the first such frame.
         """
         stems = {each.stem: None for each in frames.files}
         if len(self) != len(frames):

@@ -23,10 +23,7 @@ _LEAST_SHARE = 0.5
 def read_cache(path: Path) -> Ranges:
     """Read a TensorRT cache, or the ``calibration.cache`` of an onnxruntime table.
 
-    Neither names its graph: the digest is empty.
-
-    Raises:
-        FramesError: no such file, a malformed line, or no line.
+    Neither names its graph: the digest is empty. A malformed line is a FramesError.
     """
     if not path.is_file():
         raise FramesError(f"{path}: no such calibration cache")
@@ -55,12 +52,10 @@ def pick_ranges(
 ) -> Ranges:
     """Return the ranges of ``tensors`` that a cache has, by their names in ``model``.
 
-    A node that replaces several of the file may have the name of the first, and the
-    output of the last: its range is not used.
-
-    Raises:
-        FramesError: the cache is of another graph: it has less than half of them.
+    A cache that has less than half of them, of another graph, is a FramesError.
     """
+    # A node that replaces several of the file may have the name of the first, and the
+    # output of the last: its range is not used
     merged = {
         str(value.name)
         for node in model.graph

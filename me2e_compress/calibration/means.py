@@ -26,8 +26,6 @@ def token_means(
 
     The model runs as it is, its recurrent state fed forward and reset at the start of a
     scene. ``values`` are names in the main graph; means keep their shape and type.
-    Floats give their mean, booleans the majority (True in a tie), and integers the most
-    frequent value (the smallest in a tie).
 
     Raises:
         GraphError: no such value, or onnxruntime cannot run the graph.
@@ -86,12 +84,14 @@ class _Average:
     def result(self) -> Array:
         if self.like is None:
             raise FramesError(f"no frames: {self.name} has no mean")
+        # Integers give the most frequent value (the smallest in a tie)
         if self.total is None:
             from scipy import stats  # takes a second to import
 
             # the smallest of the most frequent values
             stack = cast("npt.NDArray[np.int64]", np.stack(self.values))  # any integers
             return np.asarray(stats.mode(stack).mode, self.like.dtype)
+        # Floats give their mean, booleans the majority (True in a tie)
         mean = np.asarray(self.total / self.count)
         if self.like.dtype == np.bool_:
             return np.asarray(mean >= 0.5)

@@ -171,11 +171,7 @@ class Ranges:
 
         ``model`` is the digest of the graph to be quantized, ``source`` the fingerprint
         of the frames, None if there are none; the message calls the ranges ``named``.
-        Imported ranges fit any method and frames.
-
-        Raises:
-            FramesError: something is stale; the message says what to do.
-            RecipeError: no such method.
+        Ranges that do not fit are a FramesError that says what to do.
         """
         again = "calibrate the graph that is being quantized again"
         if self.model != model:

@@ -49,18 +49,18 @@ def write_recording(
 ) -> Path:
     """Write a folder that `CalibrationSet` reads, atomically.
 
-    It has one ``000000.npz`` a frame, keyed by input name, and ``scenes.json`` with the
-    starts of scenes and with ``about``. An earlier recording in the folder is replaced.
-    The same frames give the same bytes. Complete scenes of a killed run are kept in a
-    separate folder beside it, and a run with the same ``about`` and ``key`` resumes
-    from them. ``pixels`` has the inputs that the source yields as bytes, by name.
+    An earlier recording in the folder is replaced. The same frames give the same bytes.
+    ``about`` goes into ``scenes.json``; a run with the same ``about`` and ``key``
+    resumes a killed one. ``pixels`` has the inputs that the source yields as bytes, by
+    name.
 
     Raises:
         FramesError: there are no frames, or a folder holds something else.
     """
     _check_replaceable(folder)
     folder.parent.mkdir(parents=True, exist_ok=True)
-    # Write into a hidden folder first; it may hold an earlier run.
+    # Write into a hidden folder beside it first, which may hold complete scenes of a
+    # killed run
     partial = partial_folder(folder)
     _check_replaceable(partial, PROGRESS)
     described = dict[str, object](about)
@@ -190,11 +190,7 @@ class DriveLog(ABC):
 
     @abstractmethod
     def frames(self, request: LogRequest, begin: Begin) -> Iterator[Frame]:
-        """Yield frames of the model's inputs, from the beginning of a scene on.
-
-        Raises:
-            FramesError: something is missing or malformed, or does not fit the model.
-        """
+        """Yield frames of the inputs, from the beginning of a scene on; FramesError."""
 
     def pixels(self, request: LogRequest) -> Mapping[str, PixelInput]:
         """Return the inputs that are yielded as bytes, by name."""

@@ -10,13 +10,11 @@ from me2e_compress.calibration.dataset import CalibrationSet
 
 
 def draw(whole: CalibrationSet, count: int, seed: int) -> CalibrationSet:
-    """Draw ``count`` frames by ``seed``, scene by scene without replacement.
-
-    Scenes stay complete, since recurrent state grows along them; only the last one
-    drawn is cut at its end. A shorter recording is taken whole: no frame counts twice.
-    """
+    """Draw ``count`` frames by ``seed``, scene by scene without replacement."""
     if count < 1:
         raise FramesError(f"{count} frames were asked for; at least 1 is needed")
+    # Scenes stay complete, since recurrent state grows along them; only the last one
+    # drawn is cut at its end. A shorter recording is taken whole: no frame counts twice
     ends = [*whole.scenes, len(whole)]
     scenes = [range(start, end) for start, end in itertools.pairwise(ends)]
     order = np.random.default_rng(seed).permutation(len(scenes)).tolist()
@@ -46,11 +44,11 @@ def hold_out(
 ) -> tuple[CalibrationSet, CalibrationSet]:
     """Split a recording: frames to calibrate on, and frames to measure on.
 
-    A third of the frames is for measuring, at least one and at most ``most``, see
-    :func:`spread`. A recording of one frame is both.
+    A recording of one frame is both.
     """
     if len(whole) == 1:
         return whole, whole
+    # A third of the frames is for measuring
     measured = spread(whole, max(1, min(most, -(-len(whole) // 3))), run)
     others = sorted(set(whole.places) - set(measured.places))
     return whole.part(others), measured

@@ -60,16 +60,13 @@ class Statistics:
 
     @functools.cached_property
     def readings(self) -> Floats:
-        """The measurements, filled in where a tensor had no element.
-
-        The value is that of the last frame with an element, else of the first such
-        frame; 0 if there is none.
-        """
+        """The measurements, filled in where a tensor had no element."""
         empty = is_empty(self.measured)
         if not empty.any():
             return self.measured
         rows = np.arange(len(self.frames))[:, None]
-        # Take the last frame with an element, for each tensor.
+        # The value is that of the last frame with an element, else of the first such
+        # frame; 0 if there is none
         last = np.maximum.accumulate(np.where(empty, -1, rows), axis=0)
         taken = np.where(last < 0, np.argmin(empty, axis=0), last)
         filled = self.measured[taken, np.arange(len(self.tensors))]
@@ -136,11 +133,7 @@ def rebinned(
 
 
 def checksum(array: Array) -> int:
-    """Return a number that distinguishes arrays: the CRC-32 of the bytes, plus 1.
-
-    It is :data:`ALL_ZERO` where every element is zero, and :data:`NOT_FINITE` where one
-    is NaN or infinite.
-    """
+    """Return a number that distinguishes arrays: the CRC-32 of the bytes, plus 1."""
     if not array.any():
         return ALL_ZERO
     if array.dtype.kind == "f" and not np.isfinite(array).all():
@@ -180,8 +173,7 @@ def first_bad_node(
 ) -> str:
     """Name the node that first makes NaN or infinity of one frame, in a sentence.
 
-    NaN that reaches none of the tensors ``read`` is no cause, such as a mask of
-    -infinity before a Softmax. Empty if there is none; ``probe`` is `Extremes`.
+    Empty if there is none; ``probe`` is `Extremes`.
     """
     made = [value for node in model.graph for value in node.outputs]
     floats = [str(value.name) for value in made if value.dtype in FLOATS]

@@ -13,11 +13,7 @@ _TENSORS: "weakref.WeakKeyDictionary[ir.TensorProtocol, bytes]" = (
 
 
 def digest(model: ir.Model) -> str:
-    """Hash nodes, edges, attributes, weights, metadata and interface, in order.
-
-    Weights are hashed once per tensor object: clones share them, so hashing a graph
-    again after a pass costs only the walk over its nodes.
-    """
+    """Hash nodes, edges, attributes, weights, metadata and interface, in order."""
     hasher = hashlib.blake2b(digest_size=16)
     hasher.update(repr(sorted(model.opset_imports.items())).encode())
     hasher.update(repr(sorted(model.metadata_props.items())).encode())
@@ -75,6 +71,8 @@ def _hash_attribute(hasher: "hashlib.blake2b", attribute: ir.Attr) -> None:
 
 def digest_of_tensor(tensor: ir.TensorProtocol) -> bytes:
     """Hash type, shape and numbers of a tensor, once for every object."""
+    # Clones share tensors: to hash a graph again after a pass costs only the walk over
+    # its nodes
     known = _TENSORS.get(tensor)
     if known is None:
         # SHA-256 has processor instructions: half the time of BLAKE2 on weights.

@@ -34,11 +34,9 @@ _LOCATION = b"\n\x08location"
 def load(path: str | Path) -> ir.Model:
     """Read an ONNX file; large external weights stay on disk and are mapped when read.
 
-    Initializers that the exporter also listed as inputs
-    (``keep_initializers_as_inputs``) stop being inputs, which is valid from IR version
-    4 on: older models are raised to that. A graph in an opset in which onnxruntime
-    cannot run it is converted (:func:`~me2e_compress.graph.opset.read_as` says to
-    which).
+    Inputs that have a value become constants, and a graph in an opset in which
+    onnxruntime cannot run it is converted; :func:`~me2e_compress.graph.opset.read_as`
+    says what changed.
 
     Raises:
         GraphError: no such file, not an ONNX model, cut short, or its data file is
@@ -94,18 +92,17 @@ def load(path: str | Path) -> ir.Model:
 
 
 def _freeze_defaults(model: ir.Model) -> None:
-    """Make constants of inputs that have initializers, and note that in the model.
-
-    Before IR version 4 every initializer had to be an input. A recurrent input stays an
-    input, and begins as zeros.
-    """
+    """Make constants of inputs that have initializers, and note that in the model."""
     weights = model.graph.initializers
+    # A recurrent input stays an input, and begins as zeros
     if any(value.is_initializer() for value in model.graph.inputs):
         for name in filter(weights.__contains__, recurrent_inputs(model)):
             state = weights.pop(name)
             if state.const_value is not None and state.const_value.numpy().any():
                 note_change(model, f"state {name} held a value, and begins as zeros")
             state.const_value = None
+    # Before IR version 4 every initializer had to be an input, and exporters may still
+    # list them (`keep_initializers_as_inputs`)
     names = [str(value.name) for value in model.graph.inputs if value.is_initializer()]
     common.RemoveInitializersFromInputsPass()(model)
     if names and model.ir_version >= PLAIN_INITIALIZERS_SINCE_IR:
@@ -251,15 +248,7 @@ def _tensors_of(attribute: ir.Attr) -> Sequence[ir.TensorProtocol]:
 
 
 def _read_external(model: ir.Model, path: Path) -> None:
-    """Check the files of external weights, and read those that must not stay on disk.
-
-    Large initializers of the main graph stay, mapped from an absolute path. Small ones,
-    those of subgraphs and tensors of attributes are read.
-
-    Raises:
-        GraphError: a tensor's file is missing, too short, or outside the model's
-            folder.
-    """
+    """Check the files of external weights; read those that must not stay on disk."""
 
     def read(tensor: ir.TensorProtocol) -> ir.TensorProtocol:
         if not isinstance(tensor, ir.ExternalTensor):
@@ -271,6 +260,7 @@ def _read_external(model: ir.Model, path: Path) -> None:
             message = f"{path}: {tensor.name} cannot be read ({error})"
             raise GraphError(message) from error
 
+    # Large initializers of the main graph stay, mapped from an absolute path
     for graph in model.graphs():
         for value in graph.initializers.values():
             tensor = value.const_value
@@ -279,6 +269,7 @@ def _read_external(model: ir.Model, path: Path) -> None:
                 value.const_value = (
                     _anchored(tensor, path) if is_mapped else read(tensor)
                 )
+    # Tensors of attributes are read
     for node in nodes_of(model):
         for name, attribute in list(node.attributes.items()):
             stored = _tensors_of(attribute)
@@ -294,12 +285,11 @@ def _read_external(model: ir.Model, path: Path) -> None:
 def data_file(model: Path, tensor: ir.ExternalTensor) -> Path:
     """Find the file with the data of a tensor, links resolved.
 
-    The rule is onnxruntime's: a relative path, and a link must stay in the model's
-    folder, or lead to where the model itself is a link to (a hub's cache).
-
     Raises:
-        GraphError: the path is absolute or leads elsewhere.
+        GraphError: the path is absolute, or leads out of the model's folder.
     """
+    # The rule is onnxruntime's: a relative path, and a link must stay in the model's
+    # folder, or lead to where the model itself is a link to (a hub's cache)
     location = str(tensor.location)
     if os.path.isabs(location) or not location or "\0" in location:
         raise GraphError(

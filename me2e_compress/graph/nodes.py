@@ -37,12 +37,10 @@ def is_standard(node: ir.Node) -> bool:
 
 
 def is_plugin(node: ir.Node) -> bool:
-    """Return whether ONNX has no such operator: a plugin, or a function of the model.
-
-    A plugin may stand in the default domain: so do those of
-    ``OperatorExportTypes.ONNX_FALLTHROUGH`` (``MultiScaleDeformableAttnTRT``) and of a
-    symbolic without a domain (``MSDAPlugin``).
-    """
+    """Return whether a node is no operator of ONNX, but a plugin or function call."""
+    # A plugin may stand in the default domain: so do those of
+    # `OperatorExportTypes.ONNX_FALLTHROUGH` (`MultiScaleDeformableAttnTRT`) and of a
+    # symbolic without a domain (`MSDAPlugin`)
     return not is_standard(node) or not _has_operator(node.op_type)
 
 
@@ -224,14 +222,12 @@ def sole_maker(value: ir.Value | None, *op_types: str) -> ir.Node | None:
 
 
 def sole_reader(value: ir.Value) -> ir.Node | None:
-    """Return the one node that reads a value, once; None if it is an output too.
-
-    None also if the reader is in another graph than the value's maker: the body of an
-    If or Loop may run never, or often.
-    """
+    """Return the one node that reads a value, once; None if it is an output too."""
     uses = value.uses()
     if len(uses) != 1 or value.is_graph_output():
         return None
+    # A reader in another graph than the maker, the body of an If or Loop, may run never
+    # or often
     node, made = next(iter(uses)).node, value.producer()
     return node if made is None or made.graph is node.graph else None
 

@@ -27,12 +27,7 @@ _NO_NEWER = "onnxruntime reads no newer"
 def fit_runtime(model: ir.Model, path: Path) -> None:
     """Convert a graph to an opset and IR version in which onnxruntime can run it.
 
-    A graph newer than onnxruntime is converted to the newest opset that it reads. If it
-    has an operator of the graph only in other opsets (RoiAlign before 22,
-    RMSNormalization from 23 on), the graph is converted to the nearest older opset in
-    which it has all operators, or else to a newer one. Operators that did not change
-    stay; others are converted by ONNX's version converter, one by one, so that names
-    and metadata stay. :func:`read_as` says what changed.
+    :func:`read_as` says what changed.
 
     Raises:
         GraphError: the graph is newer than onnxruntime, and its opset is unknown or an
@@ -79,10 +74,14 @@ def _fit_opset(model: ir.Model, path: Path) -> str:
         )
     if lacking := lacking or [name for name in ADDED if not has_operator(name, opset)]:
         why = f"onnxruntime has no {' and no '.join(lacking)} in {opset}"
+    # The nearest older opset that has all operators (onnxruntime has RoiAlign before
+    # 22, RMSNormalization from 23 on), else a newer one
     older = range(min(opset, newest), OLDEST_OPSET - 1, -1)
     nearest = (*older, *range(opset + 1, newest + 1))
     able = [each for each in nearest if not _lacking(model, opset, each)]
     refusals = []
+    # Operators that did not change stay; others are converted one by one, so that names
+    # and metadata stay
     for wanted in able or ([newest] if opset > newest else []):
         _, refusal = write_in(model, opset, wanted, "load", one_by_one=True)
         if not refusal:

@@ -42,11 +42,7 @@ class Provenance:
 
 
 def read(node: ir.Node) -> Provenance | None:
-    """Read a node's provenance; None if it has none.
-
-    Raises:
-        GraphError: the metadata are not of the form that :func:`stamp` writes.
-    """
+    """Read a node's provenance, if it has any; a GraphError of malformed metadata."""
     data = node.metadata_props
     if MODULE not in data or ORIGINS not in data:
         return None
@@ -118,11 +114,9 @@ def sign(before: ir.Model, after: ir.Model, by: str) -> None:
 
 
 def unstamped(before: ir.Model, after: ir.Model, by: str) -> list[str]:
-    """List the nodes that a pass made or changed without adding its name.
-
-    A node is changed if its operator or an attribute differs, but not if it only reads
-    another value. The list is empty if the graph before has no provenance.
-    """
+    """List the nodes that a pass made or changed without adding its name."""
+    # A node is changed if its operator or an attribute differs, but not if it only
+    # reads another value
     if missing(before):
         return []
     return [node.name or node.op_type for node in _unsigned(before, after, by)]
@@ -177,11 +171,7 @@ def compressed(text: str) -> str:
 
 
 def decompressed(text: str) -> str:
-    """Read a text of :func:`compressed`; JSON is returned as it is.
-
-    Raises:
-        MalformedError: it is neither, or holds more than 256 MiB.
-    """
+    """Read a text of :func:`compressed`, or JSON; a MalformedError of anything else."""
     if text[:1] in ("", "[", "{"):
         return text
     reader = zlib.decompressobj()
@@ -196,17 +186,16 @@ def decompressed(text: str) -> str:
 
 @contextlib.contextmanager
 def packed(model: ir.Model) -> Iterator[None]:
-    """Move origins from the nodes into one text while a model is written.
-
-    Left out are origins that are a node's own name, and passes. A module that all nodes
-    share is written once, by the name "". Nodes that share a name keep what they have.
-    """
+    """Move origins from the nodes into one text while a model is written."""
+    # Nodes that share a name keep what they have
     nodes = [node for node in nodes_in(model.graph) if ORIGINS in node.metadata_props]
     times = Counter(node.name for node in nodes)
     before = [(node, dict(node.metadata_props)) for node in nodes]
+    # A module that all nodes share is written once, by the name ""
     modules = {props.get(MODULE, "") for _, props in before}
     table = {"": min(modules)} if len(modules) == 1 else {}
     moved = (PASSES, MODULE) if table else (PASSES,)
+    # Left out are origins that are a node's own name, and passes
     for node in nodes:
         if node.name and times[node.name] == 1:
             origins = node.metadata_props.pop(ORIGINS)
@@ -227,11 +216,7 @@ def packed(model: ir.Model) -> Iterator[None]:
 
 
 def unpack(model: ir.Model) -> None:
-    """Give the nodes of a model that was read their modules and origins again.
-
-    Raises:
-        GraphError: the metadata are not of the form that :func:`packed` writes.
-    """
+    """Give nodes their modules and origins again; a GraphError of malformed ones."""
     text = model.metadata_props.pop(ORIGINS, "{}")
     try:
         table = dict(json.loads(decompressed(text)))

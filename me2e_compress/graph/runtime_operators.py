@@ -42,11 +42,7 @@ def serves(kernel: Kernel, since: int) -> bool:
 
 @functools.cache
 def has_operator(op_type: str, opset: int) -> bool:
-    """Return whether onnxruntime runs an operator of ONNX's own in an opset.
-
-    It has a kernel, or ONNX makes it of others. Such a body must mean the same in the
-    opset of the graph: that of Swish holds a Constant, which is another from 25 on.
-    """
+    """Return whether onnxruntime runs an operator of ONNX's own in an opset."""
     if not onnx.defs.has(op_type, opset, ""):
         return False
     schema: Any = onnx.defs.get_schema(op_type, opset, "")  # stubs lack functions
@@ -56,6 +52,8 @@ def has_operator(op_type: str, opset: int) -> bool:
         serves(kernel, schema.since_version) for kernel in kernels().get(op_type, ())
     ):
         return True
+    # Or ONNX makes it of others. Such a body must mean the same in the opset of the
+    # graph: that of Swish holds a Constant, which is another from 25 on
     if not schema.has_function:
         return bool(schema.has_context_dependent_function)
     version = max(each for each in schema.function_opset_versions if each <= opset)

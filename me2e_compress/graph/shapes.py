@@ -33,11 +33,9 @@ class PluginKnowledge(Protocol):
 
 
 def knowledge() -> PluginKnowledge:
-    """Return the knowledge of :mod:`me2e_compress.operators`.
-
-    This package may not import that one, so it is resolved by name, and only for a
-    graph with plugins.
-    """
+    """Return the knowledge of :mod:`me2e_compress.operators`."""
+    # This package may not import that one, so it is resolved by name, and only for a
+    # graph with plugins
     plugins: PluginKnowledge = pkgutil.resolve_name(
         "me2e_compress.operators.replace:DialectKnowledge"
     )()
@@ -77,18 +75,16 @@ def infer_shapes(
 ) -> None:
     """Infer types and shapes with ONNX, in place, with data propagation.
 
-    Plugins of known dialects are inferred too (:mod:`me2e_compress.operators`); outputs
-    of unknown ones keep the shape that the file records, or none. A graph that ONNX
-    cannot infer at all stays as it is. Inputs, and the order of initializers, never
-    change. Open dimensions of outputs become numbers where these are inferred: behind
-    an exporter's symbol (``Gathery_dim_0``), shape arithmetic could not be folded.
-    ``strict`` refuses shapes that contradict each other; ``written`` is this graph by
-    :func:`without_weights`, None writes it.
+    A graph that ONNX cannot infer at all stays as it is. ``strict`` refuses shapes that
+    contradict each other; ``written`` is this graph by :func:`without_weights`, None
+    writes it.
 
     Raises:
         onnx.shape_inference.InferenceError: strict, and shapes contradict each other.
     """
     while _infer_once(model, strict, written):
+        # Plugins of known dialects are inferred too; outputs of unknown ones keep the
+        # shape that the file records, or none
         bare = [
             node
             for node in nodes_in(model.graph)
@@ -122,11 +118,9 @@ def _infer_once(model: ir.Model, strict: bool, written: onnx.ModelProto | None) 
 def _adopt(
     graph: ir.Graph, inferred: onnx.GraphProto, interface: set[ir.Value]
 ) -> None:
-    """Copy inferred types and shapes to the values of a graph and its subgraphs.
-
-    Only these are read: deserializing the whole graph would take as long as the
-    inference.
-    """
+    """Copy inferred types and shapes to the values of a graph and its subgraphs."""
+    # Only these are read: deserializing the whole graph would take as long as the
+    # inference
     known = {info.name: info for info in (*inferred.value_info, *inferred.output)}
     for node, written in zip(graph, inferred.node, strict=True):
         for value in node.outputs:
@@ -134,6 +128,8 @@ def _adopt(
             if info is None:
                 continue
             shape = ir.serde.deserialize_type_proto_for_shape(info.type)
+            # Open dimensions of outputs become numbers: behind an exporter's symbol
+            # (`Gathery_dim_0`), shape arithmetic could not be folded
             if value in interface:
                 value.shape = refined(value.shape, shape)
                 continue
@@ -177,10 +173,7 @@ def without_inferable_shapes(model: ir.Model) -> ir.Model:
 
 
 def unshaped_plugins(model: ir.Model) -> list[ir.Node]:
-    """List the plugins with an output of unknown shape, which nothing can infer.
-
-    It must be written into ``value_info`` of the file.
-    """
+    """List the plugins with an output of unknown shape, which nothing can infer."""
     return [
         node
         for node in nodes_of(model)
@@ -250,14 +243,11 @@ def infer_node(
 
     The result is empty if an input has no type, or ONNX has no such operator. ``known``
     returns the array of an input, or None; ``instead`` maps inputs to values that are
-    read in their place.
-
-    Raises:
-        InferenceError: the node does not accept its inputs.
-        ValidationError: likewise.
+    read in their place. A node that does not accept its inputs raises `REFUSALS`.
     """
     if not is_standard(node) or not onnx.defs.has(node.op_type, opset):
         return {}
+    # The types of its inputs, and the numbers of small constants
     types: dict[str, onnx.TypeProto] = {}
     data: dict[str, onnx.TensorProto] = {}
     for value in filter(None, node.inputs):
@@ -332,12 +322,10 @@ class Extent:
 
 
 def extent(node: ir.Node, *, weight: bool) -> Extent:
-    """Measure a MatMul or Gemm.
+    """Measure a MatMul or Gemm; ``weight`` tells whether the right operand is constant.
 
     A weight of shape [K, N] (or [1, ..., K, N]) is shared by every row, whatever the
-    rank of the left operand: [1, 1, 256] x [256, 12] has one row, and so does
-    [1, 256] x [256, 12]. Where the right operand differs from batch to batch, the rows
-    of one batch count. ``weight`` tells whether that operand is constant.
+    rank of the left operand: [1, 1, 256] x [256, 12] has one row.
     """
     left, right = open_shape(node.inputs[0]), open_shape(node.inputs[1])
     if node.op_type == "Gemm":
@@ -351,6 +339,7 @@ def extent(node: ir.Node, *, weight: bool) -> Extent:
     if right is not None:
         wide = len(right) > 1
         columns, depth = (right[-1], right[-2]) if wide else (1, product(right))
+    # Where the right operand differs from batch to batch, the rows of one batch count
     if not left:
         return Extent(None, columns, depth)
     shared = weight and right is not None and product(right[:-2]) == 1

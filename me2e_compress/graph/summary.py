@@ -27,16 +27,8 @@ _LOOPS = ("Loop", "Scan")
 def macs(node: ir.Node) -> int | None:
     """Return a node's MACs: 0 for operators that multiply no matrices.
 
-    Conv, DeformConv and ConvTranspose: output (input) elements x kernel volume x
-    channels per group. Gemm and MatMul: rows x columns x inner dimension x batch.
-    Einsum of two operands: the product of all its dimensions. LSTM, GRU and RNN: steps
-    x batch x elements of both weights, which hold all gates and directions. Attention:
-    queries x keys x (channels of query + channels of value). Integer forms likewise.
-    Plugins of known dialects: the count of their operator.
-
-    Returns:
-        The count; None where it is unknown: of an unknown plugin, a local function, an
-        operator without a rule, a loop around one that multiplies, or an open shape.
+    None where they are unknown: of an unknown plugin, a local function, an operator
+    without a rule, a loop around one that multiplies, or an open shape.
     """
     if is_plugin(node):
         return knowledge().macs(node)
@@ -50,12 +42,10 @@ def macs(node: ir.Node) -> int | None:
 
 
 def macs_counter(model: ir.Model) -> Counter:
-    """Return :func:`macs` for the nodes of a model: calls of its functions count too.
+    """Return :func:`macs` for nodes of a model, its functions counted at every call."""
 
-    A call counts as all nodes of its body; shapes inside are seldom known, so that a
-    function that multiplies matrices is mostly None.
-    """
-
+    # A call counts as all nodes of its body; shapes inside are seldom known, so that a
+    # function that multiplies matrices is mostly None
     def total(counts: Iterable[int | None]) -> int | None:
         known, unknown = total_macs(counts)
         return known if not unknown else None
@@ -170,6 +160,11 @@ def _attention(node: ir.Node) -> int | None:
     return query[0] * query[-2] * keys * (width + out)
 
 
+# Conv, DeformConv and ConvTranspose: output (input) elements x kernel volume x channels
+# per group. Gemm and MatMul: rows x columns x inner dimension x batch. Einsum of two
+# operands: the product of all its dimensions. LSTM, GRU and RNN: steps x batch x
+# elements of both weights, which hold all gates and directions. Attention: queries x
+# keys x (channels of query + channels of value). Integer forms likewise.
 _RULES: dict[str, Counter] = {
     **dict.fromkeys(("Conv", "ConvInteger", "DeformConv"), _conv(1)),
     **dict.fromkeys(("GRU", "LSTM", "RNN"), _recurrent),

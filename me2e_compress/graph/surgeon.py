@@ -23,11 +23,7 @@ def restore(
     """Restore metadata and provenance in a graph that a tool has rewritten.
 
     onnxsim and onnx-graphsurgeon drop the metadata of models, functions, nodes and
-    values. A node is recognized by the name of its first output, then by its own name.
-    If its operator is the same, all its metadata are restored; if it is another, it
-    inherits from the old node and from removed nodes above that. A new node inherits
-    from its nearest neighbour: the producer that comes last in the graph, else the
-    consumer that comes first. The time is linear in nodes.
+    values. The time is linear in nodes.
 
     Args:
         model: the tool's result, in graph order; changed in place.
@@ -78,6 +74,7 @@ def _match(nodes: Sequence[ir.Node], past: Sequence[ir.Node]) -> dict[ir.Node, i
     by_name = {node.name: node for node in past if node.name}
     matches: dict[ir.Node, ir.Node] = {}
     for node in nodes:
+        # A node is recognized by the name of its first output, then by its own name
         known = by_output.get(node.outputs[0].name) if node.outputs else None
         if known is None and node.name:
             named = by_name.get(node.name)
@@ -96,14 +93,15 @@ def _alike(one: ir.Node, other: ir.Node) -> bool:
 def _inherit_from_neighbours(
     nodes: Sequence[ir.Node], matches: dict[ir.Node, ir.Node], by: str
 ) -> None:
-    # A node of another operator also inherits from removed nodes above it
+    # A node of another operator inherits from the old node and removed ones above that
     alive = {value.name for node in nodes for value in node.outputs}
     claimed: set[ir.Node] = set()
     for node in nodes:
         if provenance.read(node) is None and (known := matches.get(node)) is not None:
             vanished = _vanished_above(known, alive, claimed)
             provenance.inherit(node, (known, *vanished), by=by)
-    # New nodes inherit from producers, then from consumers
+    # A new node inherits from its nearest neighbour: the producer that comes last in
+    # the graph, else the consumer that comes first
     place = {node: index for index, node in enumerate(nodes)}
     for node in nodes:
         makers = [m for m in node.predecessors() if m in place and provenance.read(m)]
@@ -133,12 +131,9 @@ def _vanished_above(
 
 
 def to_graphsurgeon(model: ir.Model) -> gs.Graph:
-    """Return a model as a ``gs.Graph`` of its own; the model stays as it is.
+    """Return a model as a ``gs.Graph`` of its own, its weights in memory.
 
-    Weights are read into memory.
-
-    Raises:
-        GraphError: a function is an overload, which graphsurgeon does not know.
+    A function that is an overload, which graphsurgeon does not know, is a GraphError.
     """
     if overloads := [name for _, name, overload in model.functions if overload]:
         raise GraphError(f"graphsurgeon knows no overloads, as of {overloads[0]}")

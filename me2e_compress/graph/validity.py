@@ -53,13 +53,9 @@ Names = Collection[str]
 def check_file(model: onnx.ModelProto) -> bool:
     """Check a model as it was read, without its weights on disk.
 
-    Returns:
-        Whether every node comes after the makers of its inputs; if not, the nodes must
-        be sorted, which finds cycles.
-
-    Raises:
-        GraphError: names what is missing, doubled, unknown or of another kind, without
-            the file.
+    Returns whether every node comes after the makers of its inputs; if not, the nodes
+    must be sorted, which finds cycles. A GraphError names what is missing, doubled,
+    unknown or of another kind, without the file.
     """
     # Versions
     if not model.opset_import:
@@ -308,11 +304,9 @@ def _check_attributes(node: onnx.NodeProto, *, in_function: bool) -> None:
 
 
 def _check_signature(node: onnx.NodeProto, version: int) -> None:
-    """Check a standard node against its operator's schema, by ONNX's checker.
-
-    Unknown operators, as plugins are, and deprecated ones are not checked: runtimes may
-    have them.
-    """
+    """Check a standard node against its operator's schema, by ONNX's checker."""
+    # Unknown operators, as plugins are, and deprecated ones are not checked: runtimes
+    # may have them
     if node.domain not in STANDARD or not onnx.defs.has(node.op_type, version, ""):
         return
     if onnx.defs.get_schema(node.op_type, version, "").deprecated:

@@ -32,9 +32,8 @@ _KERNEL = "_kernel_time"
 class Breakdown:
     """The time of every inference, divided in two ways that each add up to the total.
 
-    ``modules_us`` has nodes without a module under :data:`NOWHERE` and time outside of
-    nodes under :data:`BETWEEN`; ``operators_us`` has operators as they run:
-    ``FusedConv``.
+    Nodes without a module are under :data:`NO_MODULE`, time outside of nodes is under
+    :data:`OUTSIDE`; operators are those that run: ``FusedConv``.
     """
 
     modules_us: Microseconds
@@ -67,12 +66,9 @@ def break_down(
 ) -> Breakdown:
     """Run a model under onnxruntime's profiler, its recurrent state fed forward.
 
-    Time of a node that onnxruntime's optimizer made goes to the node that it replaces.
     ``frames`` repeat as often as needed; ``runs`` inferences count after ``warm_up``
-    ones, fewer where that exceeds :data:`MOST_EVENTS`.
-
-    Raises:
-        ProviderError: the provider runs nodes elsewhere than on the CPU.
+    ones, fewer where that exceeds :data:`MOST_EVENTS`. A provider that runs nodes
+    elsewhere than on the CPU is a ProviderError.
     """
     if provider.native != CPU.native:
         raise ProviderError(
@@ -106,17 +102,17 @@ def break_down(
 def node_runs(lines: Iterable[str]) -> Iterator[tuple[int, list[NodeRun]]]:
     """Yield the microseconds and the nodes, in order, of each profiled inference.
 
-    ``lines`` is what onnxruntime's profiler wrote, one event a line. Nodes in the body
-    of an If, Loop or Scan are left out: the node that has the body includes their time.
+    ``lines`` is what onnxruntime's profiler wrote, one event a line.
     """
     nodes: list[NodeRun] = []
     for line in lines:
         text = line.strip().rstrip(",")
         event: dict[str, Any] = json.loads(text) if text.startswith("{") else {}
         if event.get("cat") == "Node" and str(event["name"]).endswith(_KERNEL):
-            # Events come at the end of a node, so its body's are earlier.
+            # Events come at the end of a node: those of the body of an If, Loop or Scan
+            # are earlier, and left out, since the node includes their time
             begin = int(event["ts"])
-            while nodes and nodes[-1].begin_us >= begin:  # inside of this one
+            while nodes and nodes[-1].begin_us >= begin:
                 nodes.pop()
             name = str(event["name"]).removesuffix(_KERNEL)
             operator = str(event["args"]["op_name"])

@@ -27,12 +27,9 @@ _STARTING = threading.RLock()
 
 @contextlib.contextmanager
 def sheltered() -> Iterator[None]:
-    """Start processes in this block without Ctrl-C and without the current folder.
-
-    Python looks for the modules of a new process in the current folder first, even for
-    ``pickle`` or ``numpy``. A terminal sends Ctrl-C to all processes at once: only the
-    parent should receive it, and it ends the others.
-    """
+    """Start processes in this block without Ctrl-C and without the current folder."""
+    # Python looks for the modules of a new process in the current folder first, even
+    # for `pickle` or `numpy`
     with _STARTING, _with_environment("PYTHONSAFEPATH", "1"):
         if os.name == "posix":
             with _with_environment("PYTHONWARNINGS", _TRACKER_IS_SILENT):
@@ -40,7 +37,8 @@ def sheltered() -> Iterator[None]:
         if not hasattr(signal, "pthread_sigmask"):
             yield
             return
-        # Block Ctrl-C in this thread: processes that it starts inherit the mask.
+        # A terminal sends Ctrl-C to all processes at once: only the parent should get
+        # it, and it ends the others. Processes inherit the mask of this thread
         before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
         try:
             yield
@@ -125,8 +123,7 @@ def run_script(
 ) -> "subprocess.CompletedProcess[str]":
     """Run a Python file, which imports nothing of this package, and return its output.
 
-    Raises:
-        subprocess.TimeoutExpired: it took longer than ``timeout_s`` and was killed.
+    A script that takes longer than ``timeout_s`` is killed: subprocess.TimeoutExpired.
     """
     command = [sys.executable, "-P", __file__, str(script), *arguments]
     read_end, write_end = os.pipe()  # nothing is written: it closes with this process

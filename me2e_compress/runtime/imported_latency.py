@@ -36,11 +36,7 @@ class ImportedLatency:
 
 
 def read_latencies(path: Path) -> ImportedLatency:
-    """Read one file.
-
-    Raises:
-        EvaluationError: it is missing, or of no such form.
-    """
+    """Read one file; an EvaluationError if it is missing, or of no such form."""
     with documents.reading(path, EvaluationError, FORMATS):
         document = documents.from_json(documents.read_bytes(path))
         if isinstance(document, dict):

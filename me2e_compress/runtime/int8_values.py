@@ -121,8 +121,6 @@ def use_int8_kernel(node: ir.Node, opset: int, names: set[str] | None) -> None:
         channel, then any Reshape, then the value of a call.
     Result: the same Reshape of the integers, read by the int8 kernel; nodes that nobody
         else reads are removed.
-
-    ``node`` calls a kernel of deformable attention that has an int8 kernel beside it.
     """
     value = node.inputs[0]
     assert value is not None

@@ -20,15 +20,12 @@ _CAST_BY_ITSELF = (ir.DataType.FLOAT16, ir.DataType.BFLOAT16)
 
 
 def nodes_without_kernel(model: ir.Model) -> Iterator[tuple[ir.Node, str]]:
-    """Yield the nodes that onnxruntime has no kernel for, with what is missing.
-
-    Types must be known, by the file or by inference: a node of unknown types is not
-    judged, nor one of an operator that is made of others.
-    """
+    """Yield the nodes that onnxruntime has no kernel for, with what is missing."""
     opset = opset_of(model)
     for node in nodes_in(model.graph):
         if not is_standard(node) or not any(map(is_read, node.outputs)):
             continue
+        # Nodes of unknown types are not judged, nor those of operators made of others
         if missing := _missing_types(node, opset):
             yield node, f"onnxruntime has no kernel for {node.op_type} of {missing}"
 

@@ -33,7 +33,7 @@ class Load:
 
     @property
     def busy(self) -> bool:
-        """Whether they took more than `BUSY` of the cores."""
+        """Whether they took more than `BUSY_SHARE` of the cores."""
         return self.others > BUSY_SHARE * self.cores
 
     def to_json(self) -> dict[str, float]:
@@ -53,9 +53,9 @@ class Load:
 class OthersLoad:
     """Measure the cores that other processes keep busy while a block runs.
 
-    ``machine`` and ``ours`` return CPU seconds of all processes since boot, and of this
-    process with its ended children. ``load`` is None before the end, or if the block
-    was too short.
+    ``machine`` and ``ours`` return CPU seconds of all processes, and of this process
+    with its ended children. ``load`` is None before the end, or if the block was too
+    short.
     """
 
     def __init__(

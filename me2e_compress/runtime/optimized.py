@@ -48,29 +48,27 @@ def with_unique_names(model: ir.Model) -> ir.Model:
 def origins(source: ir.Model, compiled: ir.Model) -> dict[str, ir.Node]:
     """Return the source node for each node that runs, by the running node's name.
 
-    A fused node maps to the node whose name it keeps, or else to the last one that it
-    absorbed. A node that only changes a layout maps to its reader's node, else to its
-    input's. Nodes without a known origin are missing. ``compiled`` is what
-    :func:`optimized` made of ``source``, whose nodes have unique names.
+    Nodes without a known origin are missing. ``compiled`` is what :func:`optimize` made
+    of ``source``, whose nodes have unique names.
     """
     names = {str(node.name): node for node in source.graph}
     makers = {str(value.name): node for node in source.graph for value in node.outputs}
     known: dict[ir.Node, ir.Node | None] = {}
     for node in compiled.graph:
-        # Match by the name and its prefixes at separators, the longest first; or by an
-        # output.
+        # A fused node belongs to the node whose name it keeps (or its prefix at a
+        # separator, the longest first), or else to the last one that it absorbed
         name = str(node.name)
         ends = (at for at in range(len(name) - 1, 0, -1) if name[at] in _SEPARATORS)
         stems = (name, *(name[:end] for end in ends))
         named = (names.get(stem) for stem in stems)
         made = (makers.get(str(value.name)) for value in node.outputs)
         known[node] = _first_known(chain(named, made))
-    # Take the origin of readers, then of inputs, for the rest.
+    # A node that only changes a layout belongs to its reader's node
     for node in reversed(compiled.graph):
         known[node] = known[node] or _first_known(
             known.get(reader) for value in node.outputs for reader in value.consumers()
         )
-    # Readers may be unknown too: fall back to the inputs.
+    # Readers may be unknown too: fall back to the inputs
     for node in compiled.graph:
         known[node] = known[node] or _first_known(
             known.get(maker)

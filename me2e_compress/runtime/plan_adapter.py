@@ -52,11 +52,9 @@ class Trajectory:
         return cls(points[times_s > 0], times_s[times_s > 0])
 
     def at(self, times_s: npt.NDArray[np.floating]) -> Floats:
-        """Return the positions [m, 2] at other times [m] from 0 on.
-
-        They are interpolated linearly, from the ego at 0 s; after the last waypoint
-        they continue at the last velocity.
-        """
+        """Return the positions [m, 2] at other times [m] from 0 on."""
+        # Interpolate linearly, from the ego at 0 s; after the last waypoint continue at
+        # the last velocity
         times = np.concatenate([[0.0], self.times_s])
         points = np.vstack([np.zeros((1, 2)), self.points])
         velocity = (points[-1] - points[-2]) / (times[-1] - times[-2])
@@ -129,11 +127,7 @@ class PlanAdapter(pydantic.BaseModel):
 
     @classmethod
     def of(cls, metadata: Mapping[str, str], outputs: Sequence[str]) -> Self | None:
-        """Read the adapter from a model's metadata, or use an output named ``plan``.
-
-        Returns None if the model names no plan; metadata that are malformed or name
-        what is not an output are a GraphError.
-        """
+        """Read the adapter from metadata, or take the output ``plan``; None without."""
         text = metadata.get(PLAN)
         if text is None:
             return cls(output=DEFAULT_OUTPUT) if DEFAULT_OUTPUT in outputs else None
@@ -156,8 +150,7 @@ class PlanAdapter(pydantic.BaseModel):
     def plan(self, outputs: Arrays, inputs: Arrays) -> npt.NDArray[np.float64]:
         """Return the waypoints, metres in the model's frame, float64 [waypoints, 2].
 
-        Raises:
-            GraphError: the output has the wrong shape, or no mode is selected.
+        An output of the wrong shape, or a missing choice of mode, is a GraphError.
         """
         value = np.asarray(outputs[self.output], np.float64)
         # Lay out a flat output.

@@ -31,10 +31,9 @@ def profile(
 ) -> LatencyTrace:
     """Measure the latency of a model on every frame, one at a time.
 
-    Recurrent state is fed forward and reset where scenes begin; reading a frame is not
-    counted. The recording is repeated as often as needed; by default there is one
-    sample a frame. The closed loop uses one thread. ``metadata`` overrides
-    the model's own; ``on_sample`` is called with samples done and all samples.
+    Recurrent state is fed forward and reset where scenes begin. By default there is one
+    sample a frame. ``metadata`` overrides the model's own; ``on_sample`` is called with
+    samples done and all samples.
     """
     wanted = len(frames) if samples is None else samples
     check_counts(wanted, warm_up, frames)
@@ -131,10 +130,9 @@ def record_traces(
 ) -> dict[str, LatencyTrace]:
     """Record the latency of models, each warm, in alternating blocks.
 
-    Recurrent state is fed forward and reset where scenes begin; the recording is
-    repeated as often as needed. ``models`` has ONNX files, ``metadata`` that of them;
-    ``samples`` and ``warm_up`` count for each model; ``on_sample`` is called with
-    samples done, all samples and the model's name.
+    Recurrent state is fed forward and reset where scenes begin. ``models`` has ONNX
+    files, ``metadata`` that of them; ``samples`` and ``warm_up`` count for each model;
+    ``on_sample`` is called with samples done, all samples and the model's name.
     """
     check_counts(samples, warm_up, frames)
     sessions = {

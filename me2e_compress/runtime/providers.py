@@ -58,11 +58,7 @@ class Provider(abc.ABC):
     plugins: tuple[Path, ...] = dataclasses.field(default=(), kw_only=True)
 
     def check(self) -> None:
-        """Check that the provider is installed and that its libraries exist.
-
-        Raises:
-            ProviderError: one is missing; the message names it and what to install.
-        """
+        """Check that it is installed and its libraries exist; else a ProviderError."""
         for library in self.plugins:
             if not library.is_file():
                 raise ProviderError(f"plugins library {library}: no such file")
@@ -84,8 +80,8 @@ class Provider(abc.ABC):
     def attach(self, options: ort.SessionOptions) -> None:
         """Register the users' operators in the options of a session.
 
-        Raises:
-            ProviderError: the provider is not installed, or a library has no operators.
+        A provider that is not installed, or a library without operators, is a
+        ProviderError.
         """
         self.check()
         for library in self.plugins:
@@ -100,11 +96,8 @@ class Provider(abc.ABC):
         """Return the providers of a session; None where its options name them."""
 
     def confirm(self, running: Sequence[str]) -> None:
-        """Check that a session runs on it: onnxruntime silently falls back to the CPU.
-
-        Raises:
-            ProviderError: the provider is not among those ``running``.
-        """
+        """Check that it is among the ``running`` providers; else a ProviderError."""
+        # onnxruntime silently falls back to the CPU
         if self.native not in running:
             raise ProviderError(
                 f"provider {self.name} cannot start here: its driver or libraries are"
@@ -270,10 +263,8 @@ PROVIDERS: Registry[Provider] = Registry(
 def provider_named(text: str, plugins: Sequence[Path] = ()) -> Provider:
     """Build the provider of a text, and check that it is installed.
 
-    ``text`` is e.g. ``cpu``, ``cuda``, ``tensorrt{precision=fp16, cache=engines}``.
-
-    Raises:
-        ProviderError: no such provider, option or library, or it is not installed.
+    ``text`` is e.g. ``cpu``, ``cuda``, ``tensorrt{precision=fp16, cache=engines}``. An
+    unknown provider, option or library is a ProviderError.
     """
     provider = PROVIDERS.parse(text)
     provider = dataclasses.replace(provider, plugins=(*provider.plugins, *plugins))

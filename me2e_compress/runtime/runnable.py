@@ -90,13 +90,14 @@ def make_runnable(
 ) -> ir.Model:
     """Return a graph whose fused nodes onnxruntime can run with these options.
 
-    The kernels that it needs are registered in ``options``. Kernels are for the CPU;
-    operators that a library of the user implements are left to that library. A graph
-    without fused nodes is returned itself, others are copied.
+    A graph without fused nodes is returned itself, others are copied.
     """
+    # Kernels are for the CPU; operators that a library of the user implements are left
+    # to that library
     compiled = provider.native == CPU.native and kernels.why_not() is None
     in_library = provider.claims
     prepared, needed = replace_fused(model, compiled=compiled, in_library=in_library)
+    # The kernels of the graph are registered in the options
     if needed:
         from me2e_compress.operators.kernels import custom_ops  # needs the extra `fast`
 
@@ -122,9 +123,10 @@ def make_runnable(
 def _unshare_weights(model: ir.Model) -> ir.Model:
     """Return a graph in which no two nodes read one int8 weight or zero point.
 
-    With :data:`NO_OVERFLOW` onnxruntime (1.31) writes each as uint8 under one new name,
-    and refuses the second. A graph that shares none is returned itself.
+    A graph that shares none is returned itself.
     """
+    # With `NO_OVERFLOW` onnxruntime (1.31) writes each as uint8 under one new name, and
+    # refuses the second
     if not any(_shared_weights(model)):
         return model
     copy = model.clone()
@@ -229,16 +231,16 @@ def is_fused(node: ir.Node) -> bool:
 def why_unsupported(model: ir.Model, provider: Provider = CPU) -> str | None:
     """Return why a graph cannot be run; None if every operator is known.
 
-    Fused operators are supported: a kernel or a body runs them. The operators of a
-    provider's libraries are unknown before a session is built. A known operator may
-    still lack a kernel for its element type; only building a
+    A known operator may still lack a kernel for its element type; only building a
     :class:`~me2e_compress.runtime.session.Session` shows it.
     """
+    # Fused operators are supported: a kernel or a body runs them
     unknown = {
         f"{node.domain or 'ai.onnx'}::{node.op_type}": node
         for node in unknown_nodes(model)
         if not is_fused(node)
     }
+    # The operators of a provider's libraries are unknown before a session is built
     if not unknown or provider.plugins:
         return None
     node = next(iter(unknown.values()))

@@ -70,11 +70,7 @@ def open_file(
     provider: Provider = CPU,
     without: Sequence[str] | None = None,
 ) -> tuple[ort.InferenceSession, Weights]:
-    """Open an ONNX file directly or, if onnxruntime refuses it, after loading it here.
-
-    This opens graphs that are newer than onnxruntime, that store shapes in a file of
-    weights, or that hold fused operators. See :func:`open_graph`.
-    """
+    """Open an ONNX file directly or, if onnxruntime refuses it, by loading it here."""
     if not path.is_file():
         raise GraphError(f"{path}: no such file")
     # Most files open directly: to load one takes ten times as long as to search it.
@@ -83,6 +79,8 @@ def open_file(
             return _open_with_retry(str(path), options, provider, without), {}
         except GraphError:
             pass
+    # Graphs that are newer than onnxruntime, that store shapes in a file of weights, or
+    # that hold fused operators
     return open_graph(graph.load(path), options, provider, without)
 
 
@@ -183,25 +181,23 @@ def _open_with_retry(
     provider: Provider,
     without: Sequence[str] | None,
 ) -> ort.InferenceSession:
-    """Open a graph; on failure, retry without what the optimizer makes of it.
-
-    First without converting int8 to uint8: from opset 21 on, that step of onnxruntime
-    (1.31) leaves QuantizeLinear nodes whose ``output_dtype`` is not that of their zero
-    point, and then refuses them. Then as the nodes stand: 1.32 makes a MatMulNBits of
-    float16 products of int8 weights with float32 scales, and refuses that.
-    """
+    """Open a graph; on failure, retry without what the optimizer makes of it."""
     left_out = provider.left_out if without is None else without
     try:
         return _open_once(source, options, provider, left_out)
     except REFUSALS as error:
         refusal = error.with_traceback(None)  # no circle that holds our callers
-    # Disable that step; setting the option twice would make onnxruntime warn.
+    # First without converting int8 to uint8: from opset 21 on, that step of onnxruntime
+    # (1.31) leaves QuantizeLinear nodes whose `output_dtype` is not that of their zero
+    # point, and then refuses them. Setting the option twice would make it warn
     try:
         options.get_session_config_entry(_KEEP_INT8)
     except RuntimeError:  # it is not set yet
         options.add_session_config_entry(_KEEP_INT8, "1")
     level = options.graph_optimization_level
-    # Who asks for the rewritten graph gets that
+    # Then as the nodes stand: 1.32 makes a MatMulNBits of float16 products of int8
+    # weights with float32 scales, and refuses that. Who asks for the rewritten graph
+    # gets that
     for tried in (level, level if options.optimized_model_filepath else _UNOPTIMIZED):
         options.graph_optimization_level = tried
         try:
@@ -332,10 +328,8 @@ class Session:
     def first_state(self, arrays: Mapping[str, Array]) -> dict[str, Array]:
         """Return the first values of recurrent inputs: from ``arrays``, else zeros.
 
-        An open dimension has the size that an array has for its name.
-
-        Raises:
-            GraphError: an input of unknown shape has no first value.
+        An open dimension has the size that an array has for its name; an input of
+        unknown shape is a GraphError.
         """
         sizes = {
             dim: size
@@ -357,11 +351,8 @@ class Session:
     ) -> dict[str, Array]:
         """Run one inference; return all outputs, or those that are named.
 
-        ``feeds`` has one array for every input; other names are ignored.
-
-        Raises:
-            FramesError: an input is missing or has the wrong type or shape.
-            GraphError: a node failed on these inputs.
+        ``feeds`` has one array for every input; other names are ignored. An input that
+        is missing or does not fit is a FramesError, a node that fails a GraphError.
         """
         if missing := [name for name in self.inputs if name not in feeds]:
             reason = not_fed_back(missing[0], self.inputs, self.outputs)
@@ -409,10 +400,8 @@ def feed_forward(
 ) -> Iterator[tuple[dict[str, Array], dict[str, Array], dict[str, Array]]]:
     """Run a model over a recording, its recurrent state fed forward.
 
-    At the start of a scene a recurrent input comes from the frame or, if the frame has
-    none, is zeros. Afterwards it is the model's output of the previous frame, even if
-    the frame has an array for it. ``state`` holds the recurrent inputs before a first
-    frame that continues a scene, to resume an interrupted replay.
+    ``state`` holds the recurrent inputs before a first frame that continues a scene, to
+    resume an interrupted replay.
 
     Yields:
         All inputs of a frame, the outputs and those that are state, the next state.
@@ -425,6 +414,9 @@ def feed_forward(
     fetched = list(dict.fromkeys([*outputs, *session.recurrent.values()]))
     memory = dict(state or {})
     for frame in frames:
+        # At the start of a scene a recurrent input comes from the frame or is zeros;
+        # afterwards it is the output of the previous frame, even if the frame has an
+        # array
         if frame.starts_scene:
             memory = session.first_state(frame.arrays)
         inputs = {**frame.arrays, **memory}
@@ -446,12 +438,7 @@ def detached(outputs: Mapping[str, Array]) -> dict[str, Array]:
 
 
 def run_once(model: ir.Model, feeds: Mapping[str, Array]) -> dict[str, Array]:
-    """Run a graph once in a new session, to evaluate a few constants.
-
-    Raises:
-        GraphError: onnxruntime cannot run this graph.
-        FramesError: an input is missing or does not fit.
-    """
+    """Run a graph once in a new session, to evaluate a few constants."""
     return Session(model, threads=1, optimize=False).run(feeds)
 
 
@@ -469,8 +456,7 @@ def zero_state(
 ) -> Array:
     """Return zeros for a recurrent input, its open dimensions of the named sizes.
 
-    Raises:
-        GraphError: a size is not known; the message has the command that fixes it.
+    If a size is not known, a GraphError has the command that fixes it.
     """
     known = sizes or {}
     shape = [each if isinstance(each, int) else known.get(each) for each in port.shape]

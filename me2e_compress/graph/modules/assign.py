@@ -57,13 +57,11 @@ STACK = "me2e.stack"
 def detect(model: ir.Model) -> ModuleMap:
     """Return the preset that fits a graph.
 
-    The model's metadata decide (``me2e.stack``: a preset's name, or one followed by
-    ``-`` and a variant, as in ``vad-tiny``). Without them, it is the preset with the
-    largest share of modules in the graph, at least half; of equal ones, the preset that
-    matches most names.
+    The metadata ``me2e.stack`` name it (``vad-tiny`` is ``vad``); otherwise it is the
+    one with the largest share of modules in the graph.
 
     Raises:
-        ModuleMapError: no preset fits.
+        ModuleMapError: no preset has half of its modules in the graph.
     """
     # The metadata decide
     stack = model.metadata_props.get(STACK, "")
@@ -79,6 +77,7 @@ def detect(model: ir.Model) -> ModuleMap:
         claims = [modules.match(path) for path in dict.fromkeys(paths)]
         claimed = [module for module in claims if module is not None]
         share = len({*claimed}) / len(modules.modules)
+        # Of equal shares, the preset that matches most names
         ranked.append((-share, -len(claimed), name))
     share, _, best = min(ranked)
     if -share < 0.5:
@@ -106,22 +105,12 @@ def map_of(model: ir.Model, name: str | None) -> ModuleMap:
 def assign(model: ir.Model, modules: ModuleMap) -> Assignment:
     """Find the module of every node, deterministically and in linear time.
 
-    The first rule that applies decides:
-
-    0. *stamp*: the node's own metadata, in a graph that was imported before;
-    1. *parameter*: names of the initializers that reach it, directly or through
-       constant arithmetic (Transpose, Cast, Reshape of a weight); for a MatMul whose
-       weight lost its name, that of the bias added to it. An initializer that scopes of
-       several modules read was merged by the exporter and decides nothing;
-    2. *scope*: the torch module whose forward made it, see :func:`scope_of`;
-    3. *neighbour*: the one module that reads all its results; else that of the nearest
-       node with a module, the producer first, then the consumer. Constants belong to
-       the module of their consumers.
+    The first rule that applies decides: *stamp*, *parameter*, *scope*, *neighbour*.
 
     Raises:
         ModuleMapError: a required pattern matches nothing, or no pattern matches.
     """
-    # Stamps of an earlier import
+    # Stamp: the metadata of the node, in a graph that was imported before
     nodes = list(model.graph.all_nodes())
     names = modules.names()
     placed = {
@@ -133,7 +122,9 @@ def assign(model: ir.Model, modules: ModuleMap) -> Assignment:
     paths = dict.fromkeys(scopes.values()) | dict.fromkeys(_parameters(model))
     if not placed:
         _check_required(modules, paths)
-    # Names of parameters, then scopes
+    # Parameter: names of the initializers that reach the node, directly or through
+    # constant arithmetic (Transpose, Cast, Reshape of a weight). Scope: the torch
+    # module whose forward made it
     by_scope = {
         node: module
         for node, scope in scopes.items()
@@ -148,7 +139,8 @@ def assign(model: ir.Model, modules: ModuleMap) -> Assignment:
     if everywhere is not None:  # the pattern ``**`` takes nodes without a name, too
         for node in nodes:
             placed.setdefault(node, Placement(everywhere, "scope"))
-    # The others belong to the modules of their neighbours
+    # Neighbour: the one module that reads all results; else that of the nearest node
+    # with a module, the producer first, then the consumer
     known = {node: place.module for node, place in placed.items()}
     if nodes and not known:
         raise ModuleMapError(
@@ -191,30 +183,26 @@ def _spread(
 ) -> dict[ir.Node, str]:
     """Assign the nodes without a name to modules, in four sweeps over the graph.
 
-    1. A node whose results are all read by one module, directly or through other
-       unnamed nodes, belongs to that module: it prepares its input.
-    2. Any other node belongs to the module of its last producer.
-    3. A node without such a producer, as a constant, belongs to the module of its first
-       consumer.
-    4. A node without such neighbours belongs to the module of the node before it (in a
-       subgraph: of the node with the subgraph), the first nodes to that of the next.
-
     ``known`` must not be empty; ``constant`` nodes do not count as producers. Returns
     the module of every node, known ones included.
     """
-    # Sweep 1, then 2: from producers to consumers
+    # 1. A node whose results are all read by one module, directly or through other
+    # unnamed nodes, belongs to that module: it prepares its input
     place = {node: index for index, node in enumerate(nodes)}
     modules = dict(known) | _single_destinations(nodes, known)
+    # 2. Any other node belongs to the module of its last producer
     for node in nodes:
         makers = [m for m in node.predecessors() if m in modules and m not in constant]
         if node not in modules and node not in constant and makers:
             modules[node] = modules[max(makers, key=place.__getitem__)]
-    # Sweep 3: from consumers to producers
+    # 3. A node without such a producer, as a constant, belongs to the module of its
+    # first consumer
     for node in reversed(nodes):
         readers = [reader for reader in node.successors() if reader in modules]
         if node not in modules and readers:
             modules[node] = modules[min(readers, key=place.__getitem__)]
-    # Sweep 4: along the graph's order
+    # 4. A node without such neighbours belongs to the module of the node before it (in
+    # a subgraph: of the node with the subgraph), the first nodes to that of the next
     last = next(modules[node] for node in nodes if node in modules)
     for node in nodes:
         last = modules.setdefault(node, last)
@@ -287,11 +275,9 @@ def by_parameter(
 def _module_of_copy(
     node: ir.Node, modules: ModuleMap, constant: Collection[ir.Node]
 ) -> list[str]:
-    """Return the module of a parameter that is stored as a copy of an equal one.
-
-    TorchScript's exporter writes the first of equal parameters, and the others as an
-    Identity of that under their names.
-    """
+    """Return the module of a parameter that is stored as a copy of an equal one."""
+    # TorchScript's exporter writes the first of equal parameters, and the others as an
+    # Identity of that under their names
     if node.op_type != "Identity" or node not in constant:
         return []
     module = modules.match(parameter_path(node.outputs[0].name))

@@ -69,32 +69,21 @@ def is_malformed(text: str) -> bool:
 
 
 def parameter_path(name: str | None) -> str:
-    """Return an initializer's dotted path; empty for names that tools made up.
-
-    The TorchScript exporter's ``onnx::MatMul_123`` and values of nodes
-    (``/img_neck/Constant_output_0``) are not parameter names.
-    """
+    """Return an initializer's dotted path; empty for names that tools made up."""
+    # The TorchScript exporter's `onnx::MatMul_123` and values of nodes
+    # (`/img_neck/Constant_output_0`) are not parameter names
     return "" if not name or ":" in name or "/" in name else name
 
 
 def scope_of(node: ir.Node) -> str:
     """Return the dotted path of the torch module whose forward made a node.
 
-    Read, in this order, from
-
-    1. the dynamo exporter's metadata (``pkg.torch.onnx.name_scopes``: a list of paths,
-       each within the one before; or ``namespace``: ``path: class/path: class/...``),
-    2. the node's name as the TorchScript exporter writes it:
-       ``/img_backbone/layer1/layer1.0/conv1/Conv`` is
-       ``img_backbone.layer1.layer1.0.conv1``,
-    3. the name of its first output, which tools that rename nodes often keep
-       (``/img_neck/Resize_output_0``).
-
     Empty if there is none: nodes of the outermost forward, or renamed by a tool.
     """
     props = node.metadata_props
     if props:
-        # The dynamo exporter's metadata, without the node itself
+        # The dynamo exporter's metadata, without the node itself: a list of paths, each
+        # within the one before, or `path: class/path: class/...`
         if (scopes := props.get(_SCOPES)) is not None:
             try:
                 parsed: object = ast.literal_eval(scopes)
@@ -105,7 +94,9 @@ def scope_of(node: ir.Node) -> str:
         if (namespace := props.get(_NAMESPACE)) is not None:
             paths = [part.partition(": ")[0] for part in namespace.split("/")]
             return _last_path(paths[:-1])
-    # The TorchScript exporter's names
+    # The node's name as the TorchScript exporter writes it, where the scope of
+    # `/img_neck/lateral/lateral.0/conv/Conv` is `img_neck.lateral.lateral.0.conv`; or
+    # the name of its first output, which tools that rename nodes often keep
     return _scope_in(node.name) or (
         _scope_in(node.outputs[0].name) if node.outputs else ""
     )

@@ -134,11 +134,7 @@ def put(
 
 
 def remove_node(node: ir.Node) -> None:
-    """Remove a node that nothing reads, with its bodies.
-
-    Raises:
-        GraphError: the node is not in a graph, or it is read.
-    """
+    """Remove a node with its bodies; a GraphError if it is read or in no graph."""
     graph = node.graph
     if not isinstance(graph, ir.Graph):
         raise GraphError(f"node {node.name} is not in a graph")
@@ -193,21 +189,16 @@ def _idle(graph: ir.Graph) -> list[ir.Value]:
 
 
 def sweep(model: ir.Model) -> None:
-    """Remove unread nodes, weights and functions.
-
-    Other nodes do not change, not even by dropping default attributes or empty inputs:
-    a changed node would have to name the pass.
-    """
+    """Remove unread nodes, weights and functions."""
+    # Other nodes do not change, not even by dropping default attributes or empty
+    # inputs: a changed node would have to name the pass
     remove_dead(model.graph)
     common.RemoveUnusedFunctionsPass()(model)  # type: ignore[no-untyped-call]
 
 
 def lift_constants(model: ir.Model) -> int:
-    """Turn Constant nodes of the graph and its subgraphs into initializers; count them.
-
-    Those that are graph outputs stay, and those in functions, which have no
-    initializers.
-    """
+    """Turn Constant nodes of a graph and its bodies into initializers; count them."""
+    # Graph outputs stay, and constants of functions, which have no initializers
     before = _constants(model)
     if not before:
         return 0

@@ -35,11 +35,7 @@ ROUNDS = 16
 
 @dataclasses.dataclass(frozen=True)
 class Facts:
-    """Facts about the graph besides the match.
-
-    Attributes:
-        opset: the version of ONNX's own operators.
-    """
+    """Facts about the graph besides the match: the version of ONNX's own operators."""
 
     opset: int
 
@@ -180,15 +176,14 @@ class Fused:
 def fuse(model: ir.Model, fusions: Sequence[Fusion], *, by: str) -> Fused:
     """Apply fusions to every node, in order and in place, until none applies.
 
-    Unread nodes are removed first and after every round: they would read inner values
-    of patterns. Shapes must be inferred. Bodies are rewritten too. ``by`` is the pass's
-    name.
+    Shapes must be inferred. Bodies are rewritten too. ``by`` is the pass's name.
     """
     table: dict[str, list[Fusion]] = {}
     for fusion in fusions:
         for root in sorted(fusion.pattern.roots()):
             table.setdefault(root, []).append(fusion)
     run = _Run(Facts(opset_of(model)), by, value_names(model.graph), table)
+    # Unread nodes would read inner values of patterns
     fused = Fused(unread=remove_dead(model.graph))
     for _ in range(ROUNDS):
         done: Counter[str] = Counter()

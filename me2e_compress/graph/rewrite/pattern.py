@@ -44,11 +44,7 @@ class Pattern(abc.ABC):
         """Yield the ways in which a value may match, with what must match then."""
 
     def roots(self) -> frozenset[str]:
-        """Return the types of the operators that can end the pattern.
-
-        Raises:
-            GraphError: it does not end in an operator, so nothing could be replaced.
-        """
+        """Return the types of operators that can end the pattern; else a GraphError."""
         raise GraphError(f"a fusion ends in an operator, not in {self}")
 
 
@@ -198,22 +194,14 @@ class Match:
         return part in self.values
 
     def node(self, part: Pattern) -> ir.Node:
-        """Return the node that makes the value of a part.
-
-        Raises:
-            GraphError: no node makes it: it is an input or a weight.
-        """
+        """Return the node that makes the value of a part; a GraphError if none does."""
         producer = self.values[part].producer()
         if producer is None:
             raise GraphError(f"no node makes {self.values[part].name}")
         return producer
 
     def array(self, part: Pattern) -> Array:
-        """Return the array of a constant part, as it is stored.
-
-        Raises:
-            GraphError: it is not a constant.
-        """
+        """Return the array of a constant part, as it is stored; else a GraphError."""
         constant = array_of(self.values[part])
         if constant is None:
             raise GraphError(f"{self.values[part].name} is not a constant")

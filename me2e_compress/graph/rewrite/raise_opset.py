@@ -52,12 +52,10 @@ def write_in(
 ) -> tuple[int, str]:
     """Convert a graph to another opset; return the changes, and why there are none.
 
-    Operators that did not change in between stay; others are converted by ONNX's
-    version converter, one by one, so that names, metadata and plugins stay. Nodes of
-    functions must need no change. Nothing changes unless every node can be converted.
     ``before`` is the newest imported opset. ``one_by_one`` refuses nodes that become
     another operator or several, for results that are not proven afterwards.
     """
+    # Operators that did not change in between stay
     changed = [
         (node, own, after, body is not model.graph)
         for body, own in bodies(model)
@@ -66,7 +64,8 @@ def write_in(
     ]
     if changed:
         infer_shapes(model)
-    # Convert all of them before the first is replaced, equal ones once
+    # Convert the others one by one, so that names, metadata and plugins stay: all of
+    # them before the first is replaced, equal ones once
     made, known = dict[ir.Node, ir.Graph](), dict[bytes, onnx.ModelProto]()
     for node, own, after, in_function in changed:
         called, old = f"{node.op_type} {node.name!r}", alone(node, own)
@@ -85,6 +84,7 @@ def write_in(
             made[node] = ir.serde.deserialize_model(known[key]).graph
         elif not _is_same(known[key].graph, old.graph):
             return 0, f"{called} of a function is another there"
+    # Nothing changes unless every node can be converted
     own, names = opset_of(model), value_names(model.graph)
     for node, instead in made.items():
         _replace(node, instead, own, names, by)

@@ -94,8 +94,7 @@ class JoinedStack:
         """Read a TOML file and the files it names, and join them.
 
         Raises:
-            GraphError: a file is missing, no graph or outside the folder, or does not
-                fit the others; the message names the TOML file, the part, the tensor.
+            GraphError: names the TOML file, the part and the tensor that does not fit.
         """
         content = StackFile.load(path)
         try:
@@ -277,12 +276,7 @@ def _form(port: SessionPort) -> str:
 
 
 def _merged(stack: JoinedStack) -> ir.Model:
-    """Return one graph of all parts.
-
-    Its inputs are those of the stack, its outputs those of all parts. Other names that
-    occur in two parts are prefixed by the part: ``head.w``, and ``/head/Mul`` for
-    ``/Mul``. Weights are shared with the files' graphs, not copied.
-    """
+    """Return one graph of all parts; weights are shared with the files' graphs."""
     parts, names, inputs = stack.parts, stack.names, stack.inputs
     models = {part: file.model.clone() for part, file in parts.items()}
     _write_one_opset(parts, models)
@@ -349,6 +343,7 @@ def _outputs(graph: ir.Graph, file: Part) -> list[ir.Value]:
 def _rename_apart(models: Mapping[str, ir.Model], public: Collection[str]) -> None:
     """Prefix names of inner values and nodes that occur in several parts."""
 
+    # A name of two parts is prefixed by the part: `head.w`, and `/head/Mul` for `/Mul`
     def apart(
         named: Mapping[str, list[ir.Value] | list[ir.Node]], reserved: Collection[str]
     ) -> None:

@@ -21,12 +21,7 @@ _STRICT = pydantic.ConfigDict(frozen=True, extra="forbid")
 
 
 class PartEntry(pydantic.BaseModel):
-    """One ``[[part]]``.
-
-    Attributes:
-        name: letters, digits, ``_`` and ``-``.
-        file: the ONNX file, relative to the TOML.
-    """
+    """One ``[[part]]``: its name, and the ONNX file, relative to the TOML."""
 
     model_config = _STRICT
 

@@ -172,11 +172,7 @@ class EnergyCounter(abc.ABC):
 
     @abc.abstractmethod
     def open(self) -> Reader | EnergyRecording | Absent:
-        """Open the counter and check that it can be read.
-
-        Raises:
-            EnergyError: a file that it reads is not usable.
-        """
+        """Open the counter and check that it answers; an EnergyError of a bad file."""
 
 
 _HERE = "me2e_compress.runtime.energy"
@@ -192,11 +188,8 @@ ENERGY_COUNTERS: Registry[EnergyCounter] = Registry(
 def open_counter(text: str = AUTO) -> Reader | EnergyRecording | Absent:
     """Open a counter by its text, e.g. ``nvml:1`` or ``recorded:FILE``.
 
-    ``auto`` opens the first of :data:`ENERGY_COUNTERS` that answers on this machine; an
-    :class:`Absent` has the answer of each counter tried.
-
-    Raises:
-        EnergyError: no such counter, an unknown option, or a file that is not usable.
+    ``auto`` opens the first that answers on this machine, or returns an :class:`Absent`
+    with all answers. An unknown counter or option, or a bad file, is an EnergyError.
     """
     if text.strip() != AUTO:
         counters = [ENERGY_COUNTERS.parse(text)]
@@ -213,12 +206,9 @@ def open_counter(text: str = AUTO) -> Reader | EnergyRecording | Absent:
 
 
 def check_counter(text: str) -> None:
-    """Check that a counter's text is valid by opening and closing it.
+    """Check a counter's text by opening and closing it; raises as `open_counter` does.
 
     A counter that is absent on this machine passes.
-
-    Raises:
-        EnergyError: no such counter, an unknown option, or a file that is not usable.
     """
     counter = open_counter(text)
     if isinstance(counter, Reader):
@@ -233,13 +223,11 @@ def integrate_power(times_s: Floats, watts: Floats) -> Floats:
 
 @dataclass(frozen=True)
 class Recorded(EnergyCounter):
-    """A file of the energy or the power that was recorded on the target device.
-
-    CSV with a header: ``time_s``, ``frames`` (inferences done so far), and ``joules``
-    (so far) or ``watts`` (at that time).
+    """A CSV file of the energy or the power that was recorded on the target device.
 
     Attributes:
-        file: the recording.
+        file: has the columns ``time_s``, ``frames`` (inferences done so far), and
+            ``joules`` (so far) or ``watts`` (at that time).
     """
 
     name: ClassVar[str] = "recorded"

@@ -34,19 +34,11 @@ class Reader(abc.ABC):
     counts: bool = True
 
     def joules(self) -> float:
-        """Return the energy since an arbitrary start; called only if ``counts``.
-
-        Raises:
-            EnergyError: the counter cannot be read any more, or went back.
-        """
+        """Return the joules since an arbitrary start; EnergyError if it went back."""
         raise NotImplementedError
 
     def watts(self) -> float:
-        """Return the present power; called unless it ``counts``.
-
-        Raises:
-            EnergyError: it cannot be read any more.
-        """
+        """Return the present power; an EnergyError if it cannot be read any more."""
         raise NotImplementedError
 
     def throttled(self) -> tuple[str, ...]:
@@ -98,14 +90,8 @@ class Window:
 def estimate(windows: Sequence[Window], step_s: float) -> tuple[float, float, float]:
     """Return joules per frame over windows of one model, and the 95 % interval.
 
-    A straight line over time (a parabola from :data:`ENOUGH_FOR_A_BEND` windows) is
-    fitted to the windows, because warm-up and drift are no noise; Student's t applies
-    to the residuals. Windows begin at a random phase of the counter, so that its step,
-    its part-time sensing and its noise show in their spread. If the windows lie closer
-    together than the step (``step_s``) alone allows, its error replaces the spread: a
-    window of whole steps and ``r`` more seconds holds one step more or less by chance,
-    a standard deviation of power x sqrt(r (step - r)), for the worst r that the step,
-    which is `UNSURE`, leaves open. At least :data:`FEWEST_WINDOWS` are needed.
+    ``step_s`` are the seconds between two updates of the counter. At least
+    :data:`FEWEST_WINDOWS` are needed.
     """
     from scipy.special import stdtrit  # takes a moment to import
 
@@ -113,13 +99,18 @@ def estimate(windows: Sequence[Window], step_s: float) -> tuple[float, float, fl
     taken = np.array([each.taken_s for each in windows])
     watts = np.array([each.watts for each in windows])
     per_frame = watts * taken / frames
-    # Take the drift over time out of the spread.
+    # Warm-up and drift are no noise: a straight line over time, or a parabola, is
+    # fitted, and Student's t applies to the residuals
     middle = np.array([(each.begin_s + each.end_s) / 2 for each in windows])
     degree = 2 if len(windows) >= PARABOLA_WINDOWS else 1
     freedom = len(windows) - 1 - degree
     drift = np.polynomial.Polynomial.fit(middle, per_frame, degree)
     residuals = per_frame - drift(middle)
-    # The spread is at least what the counter's step allows.
+    # Windows begin at a random phase of the counter, so that its step, its part-time
+    # sensing and its noise show in their spread. If they lie closer together than the
+    # step alone allows, its error replaces the spread: a window of whole steps and r
+    # more seconds holds one step more or less by chance, a standard deviation of
+    # power x sqrt(r (step - r)), for the worst r that the step leaves open
     from_whole = np.abs(taken - step_s * np.round(taken / step_s))
     past_step = np.minimum(from_whole + STEP_TOLERANCE * taken, step_s / 2)
     ends = watts / frames * np.sqrt(past_step * (step_s - past_step))
@@ -145,17 +136,15 @@ class EnergyResult:
         joules: of all windows; idle power included.
         frames: inferences in all windows.
         j_per_frame: idle power included; gross.
-        net_j_per_frame: without idle power; noise may make it
-            negative.
-        low: 95 % interval of ``j_per_frame``. It covers repetition on
-            this device and counter, not the error of the counter itself.
+        net_j_per_frame: without idle power; noise may make it negative.
+        low: 95 % interval of ``j_per_frame``. It covers repetition on this device and
+            counter, not the error of the counter itself.
         high: likewise.
         windows: number of windows.
         window_s: mean seconds of a window.
         counter: ``nvml-total`` or another.
         counter_step_s: seconds between its updates.
-        idle_w: watts of the idle device; with the model loaded, mean of before and
-            after.
+        idle_w: watts of the idle device, the model loaded, before and after.
         throttled: why the device slowed itself down in a window.
         device: name of the device.
         scope: what the counter covers: a board, packages, rails.

@@ -102,9 +102,6 @@ Repeater = Callable[[float, Callable[[], None]], AbstractContextManager[None]]
 class EnergyMeter:
     """Measure several models side by side with one counter.
 
-    The idle device is measured first, with the models loaded. The models then warm up
-    together and take windows in turn (A B B A), each at a random phase of the counter
-    and after lead-in frames of its own model. Idle is measured again at the end.
     Nothing else may run on the device of ``reader``; ``on_window`` is called with
     windows done, windows in all, and the model's name.
     """
@@ -137,10 +134,10 @@ class EnergyMeter:
             if reader.counts
             else self._every(SAMPLED_S, self._power.add)
         ):
-            # Idle and warm up before the windows.
+            # The idle device with the models loaded, then a warm-up of all together
             idle = [self._window(0, rest)]
             frame_s = self._warm_up(work)
-            # Alternate the models, so that drift falls on all alike.
+            # Windows in turn (A B B A), so that drift falls on all models alike
             for done, name in enumerate(turns):
                 self._on_window(done, len(turns), name)
                 frames = schedule.frames(frame_s[name])
@@ -172,8 +169,7 @@ class EnergyMeter:
     def _window(self, frames: int, wait: Callable[[], object]) -> Window:
         """Measure what happens meanwhile; its joules are 0 where power is integrated.
 
-        Raises:
-            EnergyError: the counter stands still, or goes back.
+        A counter that stands still, or goes back, is an EnergyError.
         """
         reader = self._reader
         before = reader.joules() if reader.counts else 0.0
@@ -240,15 +236,13 @@ def measure_energy(
 ) -> dict[str, EnergyResult]:
     """Measure the energy of models, one frame at a time, in alternating windows.
 
-    Recurrent state is fed forward and reset where scenes begin. The first frames, as
-    many as fit into 500 MB, are repeated as often as needed. Nothing else may run on
-    the device. ``models`` has ONNX files by name; ``counter``
-    is described at ``open_counter``; ``metadata`` overrides the models'
-    own; ``on_window`` is called with windows done, windows in all, and the model's
-    name.
+    Recurrent state is fed forward and reset where scenes begin. Nothing else may run on
+    the device. ``models`` has ONNX files by name; ``counter`` is a text for
+    :func:`open_counter`; ``metadata`` overrides the models' own; ``on_window`` is
+    called with windows done, windows in all, and the model's name.
 
     Returns joules per frame by model; without a counter, the reason why not, at once. A
-    counter that fails, or a recording given for several models, is an EnergyError.
+    counter that fails, or a recording of several models, is an EnergyError.
     """
     digests = {name: sha256_of(path) for name, path in models.items()}
     # Measure, take the recording, or say why there is no counter.

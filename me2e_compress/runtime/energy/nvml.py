@@ -26,9 +26,6 @@ _REASONS = {
 class Nvml(EnergyCounter):
     """NVIDIA GPU: total energy (Volta and later), else its power integrated.
 
-    That NVML loads proves nothing: on a Jetson with JetPack 7 it loads, but supports
-    neither call. So the calls themselves are tried.
-
     Attributes:
         index: number of the GPU, 0 or more.
     """
@@ -56,6 +53,8 @@ class Nvml(EnergyCounter):
             handle = pynvml.nvmlDeviceGetHandleByIndex(self.index)
         except pynvml.NVMLError as error:
             return Absent(f"GPU {self.index}: {error}")
+        # That NVML loads proves nothing: on a Jetson with JetPack 7 it loads, but
+        # supports neither call
         energy = _query(pynvml.nvmlDeviceGetTotalEnergyConsumption, handle)
         power = _query(_instant_power, handle)
         if isinstance(energy, str) and isinstance(power, str):
