@@ -33,10 +33,8 @@ _END_BYTES = 4096
 
 
 def is_marked(path: Path) -> bool:
-    """Return whether a file says that we wrote it; of a folder, whether all files do.
-
-    Links are not followed: a link, a pipe or a device is never ours.
-    """
+    """Return whether a file, or all of a folder, say that we wrote them."""
+    # Links are not followed: a link, a pipe or a device is never ours
     if path.is_symlink():
         return False
     if path.is_dir():
@@ -75,10 +73,8 @@ def remove(path: Path) -> None:
 
 @contextlib.contextmanager
 def all_or_none() -> Iterator[None]:
-    """Restore the files that are replaced or removed in this block if it raises.
-
-    What was there before is kept until its end, as a second link to the same file.
-    """
+    """Restore the files that are replaced or removed in this block if it raises."""
+    # What was there before is kept until the end, as a second link to the same file
     saved: list[tuple[Path, Path]] = []
     _SETS.append(saved)
     try:
@@ -130,10 +126,7 @@ def writing_errors(path: Path, error: Callable[[str], Exception]) -> Iterator[No
 
 
 def write_bytes(path: Path, content: bytes) -> None:
-    """Write a file atomically: a draft in the same folder is renamed to it.
-
-    An OSError (folder missing, not writable, or full) leaves no draft.
-    """
+    """Write a file atomically: a draft in the same folder is renamed to it."""
     with naming_file(path):
         handle, draft = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
         try:
@@ -143,6 +136,7 @@ def write_bytes(path: Path, content: bytes) -> None:
                 os.fsync(file.fileno())
             Path(draft).chmod(0o644)
             put_in_place(Path(draft), path)
+        # A folder that is missing, not writable or full leaves no draft
         except BaseException:
             Path(draft).unlink(missing_ok=True)
             raise

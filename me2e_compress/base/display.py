@@ -93,23 +93,19 @@ def table(
 
 
 def format_number(value: float | None, form: str = ",.0f") -> str:
-    """Write a number, never as a negative zero; a dash for what was not measured.
-
-    ``form`` is a format without fill, alignment or width, such as ``+.1f``.
-    """
+    """Write a number, never as a negative zero; a dash for what was not measured."""
     if value is None:
         return "-"
+    # `form` is a format without fill, alignment or width, such as `+.1f`
     sign = "+" if form.startswith("+") else ""
     return format(value, f"{sign}z{form.removeprefix('+')}")
 
 
 def format_significant(value: float | None, digits: int = 4) -> str:
-    """Write a number in so many digits, without an exponent: 4,778,000 and 0.00012.
-
-    All digits before the point are written, and none of the zeros at the end after it.
-    """
+    """Write a number in so many digits, without an exponent: 4,778,000 and 0.00012."""
     if value is None or not math.isfinite(value):
         return format_number(value)
+    # All digits before the point are written, and none of the zeros at the end after it
     before = math.floor(math.log10(abs(value))) + 1 if value else 1
     text = format_number(value, f",.{max(0, digits - before)}f")
     return text.rstrip("0").rstrip(".") if "." in text else text
@@ -146,10 +142,8 @@ def error_line(error: BaseException) -> str:
 
 
 def missing_note(reasons: Mapping[str, str]) -> str:
-    """Return a table's note on what was not measured, empty without ``reasons``.
-
-    They are by the name of the row; rows of one reason are named together.
-    """
+    """Return a table's note on what was not measured, empty without ``reasons``."""
+    # Rows of one reason are named together
     names_by_reason = {reason: list[str]() for reason in reasons.values()}
     for name, reason in reasons.items():
         names_by_reason[reason].append(name.strip())
@@ -163,10 +157,7 @@ def format_mb(count: float) -> str:
 
 
 def format_gmacs(macs: int | None, unknown: int | None = 0, form: str = ".2f") -> str:
-    """Write MACs in billions, with ≥ where ``unknown`` nodes are not counted.
-
-    A dash where none are known; ``form`` is a format.
-    """
+    """Write MACs in billions, with ≥ where ``unknown`` nodes are not counted."""
     if macs is None:
         return "-"
     return ("≥ " if unknown else "") + format(macs / 1e9, form)

@@ -38,10 +38,7 @@ def require_extra(extras: str, user: str) -> None:
 
 
 def with_install_hint(error: Exception) -> Exception:
-    """Return an error that says what to install, for a failed import of an extra.
-
-    Any other error is returned as it is.
-    """
+    """Return an error that says what to install, or the error of another cause."""
     if not isinstance(error, ImportError | OSError):
         return error
     # the error may name the module, or something that it needs in its turn: then it is

@@ -51,19 +51,14 @@ class ParsedItem:
 
 
 def name_in(text: str) -> str:
-    """Return the name that a text begins with, empty if there is none.
-
-    A colon, a brace or the end of the text must follow it.
-    """
+    """Return the name that a text begins with, empty if there is none."""
+    # A colon, a brace or the end of the text must follow it
     name = _BEGINNING.match(text.strip())
     return "" if name is None else name.group()
 
 
 def read_one(text: str) -> ParsedItem:
-    """Read one item; what follows its colon is taken as it stands.
-
-    Anything else is a TextError.
-    """
+    """Read one item; what follows its colon is taken as it stands; else a TextError."""
     name, colon, value = text.strip().partition(":")
     if colon and value and name == name_in(text):
         return ParsedItem(name, value=value)
@@ -84,10 +79,7 @@ def read_all(text: str) -> tuple[ParsedItem, ...]:
 
 
 def write_item(name: str, options: Mapping[str, object], *, short: bool = False) -> str:
-    """Write an item so that it is read back.
-
-    ``short`` writes a single number after a colon instead of in braces.
-    """
+    """Write an item so that it is read back; ``short`` writes ``name:number``."""
     if not options:
         return name
     values = list(options.values())

@@ -60,10 +60,7 @@ class EngineDump:
         return load_arrays(self.path / f"{self.stems[index]}.npz")
 
     def check(self, frames: CalibrationSet) -> None:
-        """Check that every frame was answered, and with the same tensors of numbers.
-
-        Anything else is a FramesError, which names the first such frame.
-        """
+        """Check that every frame was answered, and with the same tensors of numbers."""
         stems = {each.stem: None for each in frames.files}
         if len(self) != len(frames):
             missing = [each for each in stems if each not in self.stems]

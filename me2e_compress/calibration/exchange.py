@@ -50,10 +50,7 @@ def read_cache(path: Path) -> Ranges:
 def pick_ranges(
     cache: Ranges, path: Path, model: ir.Model, tensors: Sequence[str]
 ) -> Ranges:
-    """Return the ranges of ``tensors`` that a cache has, by their names in ``model``.
-
-    A cache that has less than half of them, of another graph, is a FramesError.
-    """
+    """Return the ranges of ``tensors`` that a cache has, by names in ``model``."""
     # A node that replaces several of the file may have the name of the first, and the
     # output of the last: its range is not used
     merged = {
@@ -64,6 +61,7 @@ def pick_ranges(
     }
     known = cache.tensors.keys() - merged
     bounds = {name: cache.tensors[name] for name in tensors if name in known}
+    # A cache that has less than half of them is of another graph
     if len(bounds) < _LEAST_SHARE * len(tensors):
         missing = [name for name in tensors if name not in bounds]
         raise FramesError(

@@ -67,12 +67,10 @@ class Observer(abc.ABC):
 
 
 def within(seen: Statistics, reach: Bounds) -> tuple[Bounds, Bounds]:
-    """Clip the extremes of every tensor at plus and minus its reach.
-
-    If all observed values are beyond the reach, the range shrinks to the nearest one.
-    """
+    """Clip the extremes of every tensor at plus and minus its reach."""
     lows, highs = seen.lows.min(axis=0), seen.highs.max(axis=0)
     low, high = np.maximum(lows, -reach), np.minimum(highs, reach)
+    # If all observed values are beyond the reach, the range shrinks to the nearest one
     return np.minimum(low, highs), np.maximum(high, lows)
 
 
@@ -151,10 +149,8 @@ class MeanSquaredError(HistogramObserver):
     name: ClassVar[str] = "mse"
 
     def edge(self, counts: Counts) -> int:
-        """Return the edge at which rounding and clipping cost least.
-
-        In a tie it is the last bin in use.
-        """
+        """Return the edge at which rounding and clipping cost least."""
+        # In a tie it is the last bin in use
         top = int(np.flatnonzero(counts)[-1]) + 1
         tried = [top, *range(LEVELS, top, _STRIDE)]
         centres, noises = np.arange(BINS) + 0.5, list[float]()

@@ -23,12 +23,10 @@ def draw(whole: CalibrationSet, count: int, seed: int) -> CalibrationSet:
 
 
 def spread(whole: CalibrationSet, count: int, run: int = 1) -> CalibrationSet:
-    """Pick frames at equal distances, so that every part of a recording is seen.
-
-    In runs of so many frames of one scene where a state grows along them.
-    """
+    """Pick frames at equal distances, in runs, so that all of a recording is seen."""
     frames, picked = len(whole), set[int]()
     ends, count = [*whole.scenes, frames], min(count, frames)
+    # A run is of one scene: a state grows along it
     for part in range(parts := max(1, count // run)):
         # a run in the middle of its part, and within a scene that is long enough
         length = count // parts + (part < count % parts)
@@ -42,11 +40,9 @@ def spread(whole: CalibrationSet, count: int, run: int = 1) -> CalibrationSet:
 def hold_out(
     whole: CalibrationSet, most: int, run: int = 1
 ) -> tuple[CalibrationSet, CalibrationSet]:
-    """Split a recording: frames to calibrate on, and frames to measure on.
-
-    A recording of one frame is both.
-    """
+    """Split a recording: frames to calibrate on, and frames to measure on."""
     if len(whole) == 1:
+        # One frame is both
         return whole, whole
     # A third of the frames is for measuring
     measured = spread(whole, max(1, min(most, -(-len(whole) // 3))), run)

@@ -171,10 +171,7 @@ def first_bad_node(
     probe: Probe,
     provider: Provider,
 ) -> str:
-    """Name the node that first makes NaN or infinity of one frame, in a sentence.
-
-    Empty if there is none; ``probe`` is `Extremes`.
-    """
+    """Name the node that first makes NaN or infinity of one frame, in a sentence."""
     made = [value for node in model.graph for value in node.outputs]
     floats = [str(value.name) for value in made if value.dtype in FLOATS]
 
@@ -206,10 +203,8 @@ def first_bad_node(
 
 
 def is_not_finite(readings: Floats) -> npt.NDArray[np.bool_]:
-    """Return which tensors hold NaN or infinity: bool [n], of readings [n, 3].
-
-    Mean squares may overflow to infinity.
-    """
+    """Return which tensors hold NaN or infinity: bool [n], of readings [n, 3]."""
+    # Mean squares may overflow to infinity
     bad = np.isnan(readings).any(1) | np.isinf(readings[:, :2]).any(1)
     return np.asarray(bad & ~is_empty(readings))
 

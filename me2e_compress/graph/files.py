@@ -200,10 +200,8 @@ def _external_files(path: Path) -> list[Path]:
 
 
 def file_contains(path: Path, word: bytes) -> bool:
-    """Return whether a file contains some bytes.
-
-    It is read block by block: a mapped file would count as memory of this process.
-    """
+    """Return whether a file contains some bytes."""
+    # Block by block: a mapped file would count as memory of this process
     tail = b""
     with path.open("rb") as stream:
         while block := stream.read(_BLOCK_BYTES):
@@ -283,11 +281,7 @@ def _read_external(model: ir.Model, path: Path) -> None:
 
 
 def data_file(model: Path, tensor: ir.ExternalTensor) -> Path:
-    """Find the file with the data of a tensor, links resolved.
-
-    Raises:
-        GraphError: the path is absolute, or leads out of the model's folder.
-    """
+    """Find the file with a tensor's data; a GraphError if it is outside the folder."""
     # The rule is onnxruntime's: a relative path, and a link must stay in the model's
     # folder, or lead to where the model itself is a link to (a hub's cache)
     location = str(tensor.location)

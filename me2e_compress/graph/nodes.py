@@ -139,10 +139,7 @@ def input_at(node: ir.Node, index: int) -> ir.Value | None:
 
 
 def draws(node: ir.Node) -> bool:
-    """Return whether a node draws random numbers, as a Dropout in training does.
-
-    Nodes with a seed draw the same numbers in every session.
-    """
+    """Return whether a node draws random numbers, as a Dropout in training does."""
     training = input_at(node, 2) if node.op_type == "Dropout" else None
     known = array_of(training)
     trains = training is not None and (known is None or bool(known.any()))
@@ -284,13 +281,11 @@ def overflow(numbers: Numbers, stored: Array) -> bool:
 
 
 def constant_values(model: ir.Model) -> frozenset[ir.Value]:
-    """Return the initializers and all values computed only from them.
-
-    Nodes with a body, calls of functions and operators of other domains count as not
-    constant. The graph must be in topological order.
-    """
+    """Return the initializers and all values computed only from them."""
     weights = model.graph.initializers.values()
     constants = {value for value in weights if not value.is_graph_input()}
+    # Nodes with a body, calls of functions and operators of other domains count as not
+    # constant
     for node in model.graph:
         plain = is_standard(node) and not draws(node) and not has_subgraph(node)
         if plain and constants.issuperset(filter(None, node.inputs)):

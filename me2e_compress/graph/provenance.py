@@ -76,14 +76,11 @@ def stamp(node: ir.Node, past: Provenance) -> None:
 
 
 def inherit(node: ir.Node, sources: Iterable[ir.Node], *, by: str) -> None:
-    """Write the provenance of a new or changed node: that of the nodes it replaces.
-
-    Origins are united in order; the module is that of the first source, so name the
-    node whose value remains first. ``by`` is the pass's name.
-    """
+    """Write the provenance of a new or changed node: that of the nodes it replaces."""
     pasts = [past for source in sources if (past := read(source)) is not None]
     if not pasts:
         return
+    # Origins are united in order; the module is that of the first source
     origins = dict.fromkeys(name for past in pasts for name in past.origins)
     passes = dict.fromkeys(name for past in pasts for name in past.passes)
     passes[by] = None
@@ -123,10 +120,7 @@ def unstamped(before: ir.Model, after: ir.Model, by: str) -> list[str]:
 
 
 def foreign(before: ir.Model, after: ir.Model) -> list[str]:
-    """List the nodes whose origins the graph before did not have.
-
-    Empty where the graph before has no provenance itself.
-    """
+    """List the nodes whose origins the graph before, if it had any, did not have."""
     if missing(before):
         return []
     texts = {node.metadata_props[ORIGINS] for node in nodes_in(before.graph)}

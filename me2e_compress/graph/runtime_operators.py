@@ -32,10 +32,8 @@ def kernels() -> Mapping[str, Sequence[Kernel]]:
 
 
 def serves(kernel: Kernel, since: int) -> bool:
-    """Return whether a kernel runs the operator that is as it is since an opset.
-
-    One without a last version runs the version of its operator alone.
-    """
+    """Return whether a kernel runs the operator that is as it is since an opset."""
+    # One without a last version runs the version of its operator alone
     first, last, _ = kernel
     return since == first if last == _UNREPLACED else first <= since <= last
 
@@ -76,10 +74,8 @@ def since(op_type: str, opset: int) -> int:
 
 @functools.cache
 def newest_opset() -> int:
-    """Return the newest opset that onnxruntime reads and that int8 can be written in.
-
-    onnxruntime 1.32 reads opset 28 and has no QuantizeLinear of it.
-    """
+    """Return the newest opset that onnxruntime reads and int8 can be written in."""
+    # onnxruntime 1.32 reads opset 28 and has no QuantizeLinear of it
     known = onnx.defs.onnx_opset_version()
     return next(
         opset

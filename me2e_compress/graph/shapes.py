@@ -153,11 +153,9 @@ def records_shapes(model: ir.Model) -> bool:
 
 
 def without_inferable_shapes(model: ir.Model) -> ir.Model:
-    """Return a copy that records no types and shapes which inference gives again.
-
-    Those of initializers stand in the initializers; those of plugins stay.
-    """
+    """Return a copy that records no types and shapes which inference gives again."""
     copy = model.clone()
+    # Those of plugins stay; those of initializers stand in the initializers
     nodes = [node for node in copy.graph if not is_plugin(node)]
     inner = {value for node in nodes for value in node.outputs}
     known = {value: (value.type, value.shape) for value in inner}
@@ -184,10 +182,7 @@ def unshaped_plugins(model: ir.Model) -> list[ir.Node]:
 
 
 def refined(declared: ir.Shape | None, inferred: ir.Shape | None) -> ir.Shape | None:
-    """Return a declared shape with open dimensions replaced by inferred numbers.
-
-    Without a declared shape, return the inferred one.
-    """
+    """Return a declared shape, or the inferred one, with open dimensions filled in."""
     if declared is None:
         return inferred
     if inferred is None or len(declared) != len(inferred):
@@ -322,11 +317,7 @@ class Extent:
 
 
 def extent(node: ir.Node, *, weight: bool) -> Extent:
-    """Measure a MatMul or Gemm; ``weight`` tells whether the right operand is constant.
-
-    A weight of shape [K, N] (or [1, ..., K, N]) is shared by every row, whatever the
-    rank of the left operand: [1, 1, 256] x [256, 12] has one row.
-    """
+    """Measure a MatMul or Gemm; ``weight`` tells whether the right side is constant."""
     left, right = open_shape(node.inputs[0]), open_shape(node.inputs[1])
     if node.op_type == "Gemm":
         depth, columns = (None, None) if right is None else right[:2]
@@ -342,19 +333,19 @@ def extent(node: ir.Node, *, weight: bool) -> Extent:
     # Where the right operand differs from batch to batch, the rows of one batch count
     if not left:
         return Extent(None, columns, depth)
+    # A weight of shape [K, N] (or [1, ..., K, N]) is shared by every row, whatever the
+    # rank of the left operand: [1, 1, 256] x [256, 12] has one row
     shared = weight and right is not None and product(right[:-2]) == 1
     rows = product(left[:-1]) if shared or len(left) == 1 else left[-2]
     return Extent(rows, columns, depth if left[-1] is None else left[-1])
 
 
 def is_one_matrix(product: ir.Node) -> bool:
-    """Return whether a MatMul multiplies every row by the same matrix.
-
-    Its right operand is [K, N], or [1, ..., K, N] of at most the left operand's rank.
-    """
+    """Return whether a MatMul multiplies every row by the same matrix."""
     left, right = product.inputs[0], static_shape(product.inputs[1])
     if right is None or len(right) < 2:
         return False
+    # [K, N], or [1, ..., K, N] of at most the left operand's rank
     rank = rank_of(left) or 0
     return len(right) == 2 or (math.prod(right[:-2]) == 1 and len(right) <= rank)
 

@@ -117,11 +117,9 @@ def _check_text(message: Message) -> None:
 
 
 def _check_type(port: onnx.ValueInfoProto, *, required: bool) -> None:
-    """Check a type: a size below 0 becomes open, an undefined type is removed.
-
-    Only tensors, sequences and optionals are supported.
-    """
+    """Check a type: a size below 0 becomes open, an undefined type is removed."""
     kind, about = port.type.WhichOneof("value"), port.type.tensor_type
+    # Only tensors, sequences and optionals are supported
     if kind in ("map_type", "sparse_tensor_type") or (kind is None and required):
         raise GraphError(
             f"{port.name!r} is not a tensor: its type is {kind or 'missing'}"
@@ -232,10 +230,7 @@ class _NodeChecker:
         start: Sequence[str],
         outside: Names,
     ) -> Names:
-        """Check nodes; return every name of their graph that is known after the last.
-
-        ``start`` has the inputs and initializers of the graph.
-        """
+        """Check nodes; return the names of their graph, ``start`` among them."""
         # Every name is made once
         makers = dict.fromkeys(start, "an input or initializer")
         for node in nodes:
@@ -407,15 +402,13 @@ def refusal(
 
 @contextlib.contextmanager
 def _lenient(written: onnx.ModelProto) -> Iterator[None]:
-    """Give outputs without a shape an empty one while the checker runs.
-
-    The IR version becomes 4 at least: before, every initializer had to be an input too.
-    """
+    """Give outputs without a shape an empty one while the checker runs."""
     kinds = [value.type for value in written.graph.output]
     tensors = [kind.tensor_type for kind in kinds if kind.HasField("tensor_type")]
     bare = [tensor for tensor in tensors if not tensor.HasField("shape")]
     for tensor in bare:
         tensor.shape.SetInParent()
+    # The IR version becomes 4 at least: before, every initializer had to be an input
     version = written.ir_version
     written.ir_version = max(version, PLAIN_INITIALIZERS_SINCE_IR)
     try:

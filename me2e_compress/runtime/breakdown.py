@@ -100,10 +100,7 @@ def break_down(
 
 
 def node_runs(lines: Iterable[str]) -> Iterator[tuple[int, list[NodeRun]]]:
-    """Yield the microseconds and the nodes, in order, of each profiled inference.
-
-    ``lines`` is what onnxruntime's profiler wrote, one event a line.
-    """
+    """Yield the microseconds and nodes of each inference, from a profile's lines."""
     nodes: list[NodeRun] = []
     for line in lines:
         text = line.strip().rstrip(",")

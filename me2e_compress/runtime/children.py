@@ -121,13 +121,11 @@ def process_pool(workers: int) -> Iterator[ProcessPoolExecutor]:
 def run_script(
     script: Path, arguments: Sequence[str], timeout_s: float | None = None
 ) -> "subprocess.CompletedProcess[str]":
-    """Run a Python file, which imports nothing of this package, and return its output.
-
-    A script that takes longer than ``timeout_s`` is killed: subprocess.TimeoutExpired.
-    """
+    """Run a Python file that imports nothing of this package; return what it wrote."""
     command = [sys.executable, "-P", __file__, str(script), *arguments]
     read_end, write_end = os.pipe()  # nothing is written: it closes with this process
     try:
+        # What takes longer is killed, and raises TimeoutExpired
         return subprocess.run(
             command,
             check=False,

@@ -51,10 +51,7 @@ def _missing_types(node: ir.Node, opset: int) -> str:
 def _tensor_types(
     node: ir.Node, schema: onnx.defs.OpSchema
 ) -> list[tuple[str, str, str]] | None:
-    """Return (constraint, type as onnxruntime writes it, its name) of all tensors.
-
-    None where a type is not known, or is one that onnxruntime casts by itself.
-    """
+    """Return (constraint, type as onnxruntime writes it, its name) of all tensors."""
     plain_types = dict[tuple[str, str], str]()
     sides = ((node.inputs, schema.inputs), (node.outputs, schema.outputs))
     for values, formals in sides:
@@ -64,7 +61,7 @@ def _tensor_types(
                 continue
             kind = value.dtype
             if kind is None or kind in _CAST_BY_ITSELF:
-                return None
+                return None  # not known, or cast by onnxruntime itself
             if not isinstance(value.type, ir.TensorType):
                 return None  # a sequence, of whatever
             word = kind.name.lower()

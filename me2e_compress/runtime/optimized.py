@@ -18,10 +18,8 @@ _SEPARATORS = "/_"
 
 
 def optimize(model: ir.Model, provider: Provider = CPU) -> ir.Model:
-    """Return a graph as onnxruntime's optimizations leave it on this machine.
-
-    Its operators are those that run: ``QLinearConv``, ``FusedConv``, ``ReorderInput``.
-    """
+    """Return a graph as onnxruntime's optimizations leave it on this machine."""
+    # Its operators are those that run: `QLinearConv`, `FusedConv`, `ReorderInput`
     with tempfile.TemporaryDirectory(prefix="me2e-optimized-") as folder:
         path = Path(folder) / "model.onnx"
         Session(model, threads=1, int8_kernels=True, rewritten=path, provider=provider)
@@ -31,14 +29,12 @@ def optimize(model: ir.Model, provider: Provider = CPU) -> ir.Model:
 
 
 def with_unique_names(model: ir.Model) -> ir.Model:
-    """Return a graph whose nodes have unique names: the graph itself, or a copy.
-
-    Nodes without a name, or with a shared one, are named after their first output.
-    """
+    """Return a graph whose nodes have unique names: the graph itself, or a copy."""
     counts = Counter(node.name for node in model.graph)
     if all(name and count == 1 for name, count in counts.items()):
         return model
     copy = model.clone()
+    # Nodes without a name, or with a shared one, are named after their first output
     for node in copy.graph:
         if not node.name or counts[node.name] > 1:
             node.name = f"{node.name or node.op_type}:{node.outputs[0].name}"

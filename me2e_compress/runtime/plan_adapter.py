@@ -148,10 +148,7 @@ class PlanAdapter(pydantic.BaseModel):
         return adapter
 
     def plan(self, outputs: Arrays, inputs: Arrays) -> npt.NDArray[np.float64]:
-        """Return the waypoints, metres in the model's frame, float64 [waypoints, 2].
-
-        An output of the wrong shape, or a missing choice of mode, is a GraphError.
-        """
+        """Return the waypoints in the model's frame, metres: float64 [waypoints, 2]."""
         value = np.asarray(outputs[self.output], np.float64)
         # Lay out a flat output.
         if self.shape is not None:

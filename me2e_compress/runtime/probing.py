@@ -35,10 +35,7 @@ class Probe(Protocol):
 
 
 def insert_probes(model: ir.Model, tensors: Sequence[str], probe: Probe) -> ir.Model:
-    """Return a copy of a graph with a probe right after each tensor's producer.
-
-    Its last output is :data:`READINGS`. A tensor that the graph lacks is a GraphError.
-    """
+    """Return a copy of a graph with a probe after each tensor, and their one output."""
     copy = model.clone()
     made = (value for node in copy.graph for value in node.outputs)
     known = {str(value.name): value for value in (*copy.graph.inputs, *made)}

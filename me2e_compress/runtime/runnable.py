@@ -71,16 +71,15 @@ def known_operators() -> frozenset[tuple[str, str]]:
 
 
 def unknown_nodes(model: ir.Model) -> Iterator[ir.Node]:
-    """Yield the nodes that onnxruntime does not know and that have no body in the file.
-
-    Nodes in the toolkit's own domain are included although they may have a body.
-    """
+    """Yield the nodes that onnxruntime does not know and the file has no body of."""
     known = known_operators()
     for graph_or_function in (*model.graphs(), *model.functions.values()):
         for node in graph_or_function:
             domain = "" if is_standard(node) else node.domain
             if (domain, node.op_type) in known:
                 continue
+            # Nodes in the toolkit's own domain are included although they may have a
+            # body
             if node.op_identifier() not in model.functions or domain == OWN_DOMAIN:
                 yield node
 
@@ -121,10 +120,7 @@ def make_runnable(
 
 
 def _unshare_weights(model: ir.Model) -> ir.Model:
-    """Return a graph in which no two nodes read one int8 weight or zero point.
-
-    A graph that shares none is returned itself.
-    """
+    """Return a graph in which no two nodes read one int8 weight or zero point."""
     # With `NO_OVERFLOW` onnxruntime (1.31) writes each as uint8 under one new name, and
     # refuses the second
     if not any(_shared_weights(model)):

@@ -383,10 +383,7 @@ def replay(
     frames: Iterable[Frame],
     outputs: Sequence[str] | None = None,
 ) -> Iterator[dict[str, Array]]:
-    """Run a model over a recording and yield its outputs; see :func:`feed_forward`.
-
-    ``outputs`` None yields all.
-    """
+    """Run a model over a recording and yield its outputs; see :func:`feed_forward`."""
     wanted = list(session.outputs) if outputs is None else list(outputs)
     for _, values, _ in feed_forward(session, frames, wanted):
         yield {name: values[name] for name in wanted}
@@ -430,10 +427,8 @@ def feed_forward(
 
 
 def detached(outputs: Mapping[str, Array]) -> dict[str, Array]:
-    """Copy outputs out of onnxruntime's memory.
-
-    An output keeps the whole working memory of its session alive, 1.7 GB on VAD-tiny.
-    """
+    """Copy outputs out of onnxruntime's memory."""
+    # An output keeps the whole working memory of its session alive, 1.7 GB on VAD-tiny
     return {name: np.array(value) for name, value in outputs.items()}
 
 
@@ -454,10 +449,7 @@ def dim_name(dim: int | str | None) -> str:
 def zero_state(
     name: str, port: SessionPort, sizes: Mapping[int | str | None, int] | None = None
 ) -> Array:
-    """Return zeros for a recurrent input, its open dimensions of the named sizes.
-
-    If a size is not known, a GraphError has the command that fixes it.
-    """
+    """Return zeros for a recurrent input, its open dimensions of the named sizes."""
     known = sizes or {}
     shape = [each if isinstance(each, int) else known.get(each) for each in port.shape]
     sizes_known = [size for size in shape if size is not None]

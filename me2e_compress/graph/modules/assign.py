@@ -90,15 +90,13 @@ def detect(model: ir.Model) -> ModuleMap:
 
 
 def map_of(model: ir.Model, name: str | None) -> ModuleMap:
-    """Load the preset or TOML file of a name, or the preset that fits.
-
-    A graph that no preset fits is one module, named ``model``.
-    """
+    """Load the preset or TOML file of a name, or the preset that fits."""
     if name is not None:
         return ModuleMap.load(name)
     try:
         return detect(model)
     except ModuleMapError:
+        # A graph that no preset fits is one module, named `model`
         return ModuleMap.whole()
 
 
@@ -242,10 +240,7 @@ def by_parameter(
     by_scope: Mapping[ir.Node, str],
     constant: Collection[ir.Node],
 ) -> dict[ir.Node, str]:
-    """Return the module of every node that named parameters reach.
-
-    Nodes come in graph order. ``by_scope`` is needed to recognise merged initializers.
-    """
+    """Return the module of every node, in graph order, that named parameters reach."""
     # From initializers through constant arithmetic to the first nodes that compute
     claims: dict[ir.Value, str | None] = {}
     placed: dict[ir.Node, str] = {}
@@ -333,15 +328,12 @@ def itemise(
     module_of: Callable[[ir.Node], str],
     macs: Callable[[ir.Node], int | None] | None = None,
 ) -> tuple[Item, ...]:
-    """Count each module, in the order of the map; modules without nodes are zeros.
-
-    An initializer counts once: for the module that its name says, else for the first
-    node that reads it. One that nothing reads and no name places counts nowhere.
-    """
+    """Count each module, in the order of the map; modules without nodes are zeros."""
     nodes: dict[str, list[ir.Node]] = {name: [] for name in modules.names()}
     for node in model.graph.all_nodes():
         nodes.setdefault(module_of(node), []).append(node)
-    # Weights by the module that owns them
+    # An initializer counts once: for the module that its name says, else for the first
+    # node that reads it. One that nothing reads and no name places counts nowhere
     elements, size = dict.fromkeys(nodes, 0), dict.fromkeys(nodes, 0)
     for graph in (model.graph, *model.graph.subgraphs()):
         for value in graph.initializers.values():

@@ -76,10 +76,7 @@ def parameter_path(name: str | None) -> str:
 
 
 def scope_of(node: ir.Node) -> str:
-    """Return the dotted path of the torch module whose forward made a node.
-
-    Empty if there is none: nodes of the outermost forward, or renamed by a tool.
-    """
+    """Return the dotted path of the torch module whose forward made a node, or ""."""
     props = node.metadata_props
     if props:
         # The dynamo exporter's metadata, without the node itself: a list of paths, each
@@ -115,10 +112,7 @@ def leaving(model: ir.Model, holds: Callable[[ir.Node], bool]) -> tuple[ir.Value
 
 
 def entering(model: ir.Model, holds: Callable[[ir.Node], bool]) -> tuple[ir.Value, ...]:
-    """List the values that some nodes read, without weights and their own values.
-
-    They are in the order in which they are first read.
-    """
+    """List the values that some nodes read, without weights and their own values."""
     members = {node: None for node in model.graph if holds(node)}
     read = dict.fromkeys(value for node in members for value in node.inputs)
     return tuple(

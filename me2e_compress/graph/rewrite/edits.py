@@ -166,10 +166,8 @@ def _empty(body: ir.Graph) -> None:
 
 
 def remove_dead(graph: ir.Graph) -> int:
-    """Remove unread nodes and initializers; return how many there were.
-
-    Initializers that were read only by removed nodes do not count.
-    """
+    """Remove unread nodes and initializers; return how many there were."""
+    # Initializers that were read only by removed nodes do not count
     idle = sum(len(_idle(inner)) for inner in graphs_of(graph))
     count = 0
     for inner in reversed(list(graphs_of(graph))):

@@ -61,11 +61,9 @@ class Kit:
         return add_constant(self.graph, array, name, self.names)
 
     def refill(self, node: ir.Node, index: int, array: Array, name: str) -> None:
-        """Replace the array of a constant operand, or add an operand of this name.
-
-        An initializer that no other node reads keeps its name.
-        """
+        """Replace the array of a constant operand, or add an operand of this name."""
         old = input_at(node, index)
+        # An initializer that no other node reads keeps its name
         if old is not None and old.is_initializer() and sole_reader(old) is node:
             flat = np.ascontiguousarray(array).reshape(array.shape)
             old.const_value = ir.tensor(flat, name=old.name)
@@ -95,10 +93,7 @@ class Kit:
         inputs: Sequence[ir.Value | None],
         attributes: Mapping[str, int | float | str | Sequence[int]] | None = None,
     ) -> ir.Value:
-        """Insert a standard operator before the last matched node; return its output.
-
-        Its type and shape are inferred after the pass.
-        """
+        """Insert a standard operator before the last matched node; return its value."""
         root = self.match.root
         name = fresh_name(f"{root.outputs[0].name}_{op_type}", self.names)
         node = ir.node(op_type, inputs, attributes, name=name)
@@ -108,10 +103,7 @@ class Kit:
         return node.outputs[0]
 
     def absorb(self, first: ir.Node, *others: ir.Node) -> None:
-        """Remove the last matched node; the first of these nodes makes its output.
-
-        All of them inherit its provenance.
-        """
+        """Remove the last matched node; the first of these nodes makes its output."""
         root = self.match.root
         for node in (first, *others):
             provenance.inherit(node, (node, root), by=self.by)

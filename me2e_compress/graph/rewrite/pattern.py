@@ -158,10 +158,7 @@ def constant(*, scalar: bool = False, floating: bool = True) -> Constant:
 def op(
     types: str | tuple[str, ...], *inputs: Pattern, more: bool = False
 ) -> OperatorPattern:
-    """Build the pattern of the first output of an operator, or of one of several.
-
-    With ``more``, the operator may have more operands, which may be anything.
-    """
+    """Build the pattern of an operator's first output; ``more`` operands may follow."""
     names = (types,) if isinstance(types, str) else types
     return OperatorPattern(names, inputs, more)
 

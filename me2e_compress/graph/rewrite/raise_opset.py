@@ -97,10 +97,8 @@ def write_in(
 
 
 def _changes(node: ir.Node, own: int, after: int) -> bool:
-    """Return whether a standard operator differs between two opsets.
-
-    If and Loop only take more types; Scan had an axis of batches.
-    """
+    """Return whether a standard operator differs between two opsets."""
+    # If and Loop only take more types; Scan had an axis of batches
     if has_subgraph(node) and (node.op_type != "Scan" or own >= _SCAN_AS_IS):
         return False
     before = since(node.op_type, own) if is_standard(node) else 0
@@ -108,12 +106,10 @@ def _changes(node: ir.Node, own: int, after: int) -> bool:
 
 
 def alone(node: ir.Node, opset: int) -> onnx.ModelProto:
-    """Build a model of one node without its name; unknown types become float32.
-
-    Its values are named by position: ``i0``, ``i1``, ..., ``o0``, ...
-    """
+    """Build a model of one node without its name; unknown types become float32."""
     inputs = list(dict.fromkeys(value for value in node.inputs if value is not None))
     outputs = _named(node.outputs)
+    # Values are named by position: `i0`, `i1`, ..., `o0`, ...
     names = {value: f"i{place}" for place, value in enumerate(inputs)}
     names |= {value: f"o{place}" for place, value in enumerate(outputs)}
 

@@ -91,11 +91,7 @@ class JoinedStack:
 
     @classmethod
     def load(cls, path: Path) -> Self:
-        """Read a TOML file and the files it names, and join them.
-
-        Raises:
-            GraphError: names the TOML file, the part and the tensor that does not fit.
-        """
+        """Read a TOML file and the files it names, and join them, or a GraphError."""
         content = StackFile.load(path)
         try:
             parts = {entry.name: Part.load(entry, path) for entry in content.part}

@@ -67,10 +67,7 @@ class PowerSamples:
 
 @contextlib.contextmanager
 def call_repeatedly(period_s: float, call: Callable[[], None]) -> Iterator[None]:
-    """Call a function periodically in a thread while the context is open.
-
-    An EnergyError of the call is raised when the context is left.
-    """
+    """Call a function periodically in a thread while the context is open."""
     stop, errors = Event(), list[EnergyError]()
 
     def repeat() -> None:
@@ -88,7 +85,7 @@ def call_repeatedly(period_s: float, call: Callable[[], None]) -> Iterator[None]
     finally:
         stop.set()
         thread.join()
-    # An error in the thread is raised here.
+    # An error in the thread is raised where the context is left
     if errors:
         raise errors[0]
 
@@ -167,10 +164,7 @@ class EnergyMeter:
         return dataclasses.replace(window, joules=joules)
 
     def _window(self, frames: int, wait: Callable[[], object]) -> Window:
-        """Measure what happens meanwhile; its joules are 0 where power is integrated.
-
-        A counter that stands still, or goes back, is an EnergyError.
-        """
+        """Measure what happens meanwhile, without joules where power is integrated."""
         reader = self._reader
         before = reader.joules() if reader.counts else 0.0
         begin = self._clock()
