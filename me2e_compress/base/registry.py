@@ -297,13 +297,14 @@ class Option:
 
 @dataclasses.dataclass(frozen=True)
 class Entry:
-    """One name of a registry, as ``list`` shows it.
+    """One name of a registry.
 
     Attributes:
         name: as in recipes and commands.
-        source: the package, with its version; all that claim the name.
+        source: the package; with its version; of a name that several packages claim,
+            all of them.
         doc: first line of its docstring.
-        options: in the order of its fields.
+        options: in order; that of its fields.
         error: why it cannot be used; empty if it can.
     """
 

@@ -118,21 +118,17 @@ def _einsum(node: ir.Node) -> int | None:
     sizes: dict[str, int] = {}
     for term, value in zip(terms, node.inputs, strict=True):
         shape = static_shape(value)
-        letters = None if shape is None else _letters(term, len(shape))
-        if shape is None or letters is None:
+        if shape is None:
             return None
+        # Name every dimension, those of an ellipsis by number from its end
+        before, dots, after = term.partition("...")
+        more = len(shape) - len(before) - len(after)
+        if more < 0 or (more and not dots):
+            return None
+        letters = [*before, *(str(more - at) for at in range(more)), *after]
         for letter, size in zip(letters, shape, strict=True):
             sizes[letter] = max(size, sizes.get(letter, 1))
     return math.prod(sizes.values())
-
-
-def _letters(term: str, rank: int) -> list[str] | None:
-    """Name every dimension of an Einsum's operand, those of an ellipsis by number."""
-    before, dots, after = term.partition("...")
-    more = rank - len(before) - len(after)
-    if more < 0 or (more and not dots):
-        return None
-    return [*before, *(str(more - at) for at in range(more)), *after]
 
 
 def _recurrent(node: ir.Node) -> int | None:

@@ -118,8 +118,15 @@ def assign(model: ir.Model, modules: ModuleMap) -> Assignment:
     }
     scopes = {node: scope_of(node) for node in nodes}
     paths = dict.fromkeys(scopes.values()) | dict.fromkeys(_parameters(model))
-    if not placed:
-        _check_required(modules, paths)
+    # Required patterns must match, unless the graph was imported before
+    required = [] if placed else modules.required()
+    claims = {claim for path in paths if required for claim in modules.claims(path)}
+    for module, pattern in required:
+        if (module, pattern) not in claims:
+            raise ModuleMapError(
+                f"map {modules.name}: pattern {pattern!r} of module {module} matches"
+                f" no parameter and no scope; there are {_sample(paths)}"
+            )
     # Parameter: names of the initializers that reach the node, directly or through
     # constant arithmetic (Transpose, Cast, Reshape of a weight). Scope: the torch
     # module whose forward made it
@@ -150,19 +157,6 @@ def assign(model: ir.Model, modules: ModuleMap) -> Assignment:
     return Assignment(modules, {node: placed[node] for node in nodes})
 
 
-def _check_required(modules: ModuleMap, paths: Collection[str]) -> None:
-    """Refuse a map if a required pattern matches neither a parameter nor a scope."""
-    if not (required := modules.required()):
-        return
-    claims = {claim for path in paths for claim in modules.claims(path)}
-    for module, pattern in required:
-        if (module, pattern) not in claims:
-            raise ModuleMapError(
-                f"map {modules.name}: pattern {pattern!r} of module {module} matches"
-                f" no parameter and no scope; there are {_sample(paths)}"
-            )
-
-
 def _sample(paths: Iterable[str]) -> str:
     tops = list(dict.fromkeys(".".join(path.split(".")[:2]) for path in paths if path))
     return join_names(tops, 8) or "no scopes and no named parameters"
@@ -187,7 +181,15 @@ def _spread(
     # 1. A node whose results are all read by one module, directly or through other
     # unnamed nodes, belongs to that module: it prepares its input
     place = {node: index for index, node in enumerate(nodes)}
-    modules = dict(known) | _single_destinations(nodes, known)
+    goals: dict[ir.Node, str | None] = {}
+    for node in reversed(nodes):
+        if node in known:
+            continue
+        readers = {known.get(r) or goals.get(r) for r in node.successors()}
+        outside = any(value.is_graph_output() for value in node.outputs)
+        goals[node] = readers.pop() if len(readers) == 1 and not outside else None
+    modules = dict(known)
+    modules |= {node: module for node, module in goals.items() if module is not None}
     # 2. Any other node belongs to the module of its last producer
     for node in nodes:
         makers = [m for m in node.predecessors() if m in modules and m not in constant]
@@ -196,29 +198,15 @@ def _spread(
     # 3. A node without such a producer, as a constant, belongs to the module of its
     # first consumer
     for node in reversed(nodes):
-        readers = [reader for reader in node.successors() if reader in modules]
-        if node not in modules and readers:
-            modules[node] = modules[min(readers, key=place.__getitem__)]
+        followers = [reader for reader in node.successors() if reader in modules]
+        if node not in modules and followers:
+            modules[node] = modules[min(followers, key=place.__getitem__)]
     # 4. A node without such neighbours belongs to the module of the node before it (in
     # a subgraph: of the node with the subgraph), the first nodes to that of the next
     last = next(modules[node] for node in nodes if node in modules)
     for node in nodes:
         last = modules.setdefault(node, last)
     return modules
-
-
-def _single_destinations(
-    nodes: Sequence[ir.Node], known: Mapping[ir.Node, str]
-) -> dict[ir.Node, str]:
-    """Return the unknown nodes whose results all end up in one module."""
-    goals: dict[ir.Node, str | None] = {}
-    for node in reversed(nodes):
-        if node in known:
-            continue
-        readers = {known.get(r) or goals.get(r) for r in node.successors()}
-        outside = any(value.is_graph_output() for value in node.outputs)
-        goals[node] = readers.pop() if len(readers) == 1 and not outside else None
-    return {node: module for node, module in goals.items() if module is not None}
 
 
 def constant_nodes(nodes: Sequence[ir.Node]) -> frozenset[ir.Node]:
@@ -251,7 +239,11 @@ def by_parameter(
             if value is not None
             and (module := _claim(value, claims, modules, by_scope)) is not None
         ]
-        votes = _module_of_copy(node, modules, constant) or votes
+        # A parameter that equals another: TorchScript's exporter writes the first, and
+        # the others as an Identity of that under their names
+        if node.op_type == "Identity" and node in constant:
+            copy = modules.match(parameter_path(node.outputs[0].name))
+            votes = votes if copy is None else [copy]
         if votes:
             placed[node] = votes[0]
         if node in constant:
@@ -265,18 +257,6 @@ def by_parameter(
         if alone and readers[0].op_type == "Add" and readers[0] in placed:
             placed[node] = placed[readers[0]]
     return placed
-
-
-def _module_of_copy(
-    node: ir.Node, modules: ModuleMap, constant: Collection[ir.Node]
-) -> list[str]:
-    """Return the module of a parameter that is stored as a copy of an equal one."""
-    # TorchScript's exporter writes the first of equal parameters, and the others as an
-    # Identity of that under their names
-    if node.op_type != "Identity" or node not in constant:
-        return []
-    module = modules.match(parameter_path(node.outputs[0].name))
-    return [] if module is None else [module]
 
 
 def _claim(

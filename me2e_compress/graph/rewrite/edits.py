@@ -200,8 +200,6 @@ def lift_constants(model: ir.Model) -> int:
     before = _constants(model)
     if not before:
         return 0
-    for node in before:
-        _spell_strings(node)
     common.LiftConstantsToInitializersPass(lift_all_constants=True, size_limit=0)(model)
     return len(before) - len(_constants(model))
 
@@ -210,20 +208,3 @@ def _constants(model: ir.Model) -> list[ir.Node]:
     nodes = (node for node in nodes_in(model.graph) if node.domain == "")
     constants = (node for node in nodes if node.op_type == "Constant")
     return [node for node in constants if not node.outputs[0].is_graph_output()]
-
-
-def _spell_strings(node: ir.Node) -> None:
-    # onnx_ir encodes the short forms as ASCII; the tensor form holds any text.
-    one = node.attributes.get("value_string")
-    many = node.attributes.get("value_strings")
-    if one is None and many is None:
-        return
-    texts = [one.as_string()] if one is not None else []
-    texts += list(many.as_strings()) if many is not None else []
-    tensor = ir.StringTensor(
-        [text.encode() for text in texts],
-        shape=ir.Shape([] if one is not None else [len(texts)]),
-        name=node.outputs[0].name,
-    )
-    node.attributes.clear()
-    node.attributes["value"] = ir.AttrTensor("value", tensor)

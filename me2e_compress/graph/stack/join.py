@@ -360,22 +360,19 @@ def _rename_apart(models: Mapping[str, ir.Model], public: Collection[str]) -> No
                     known[name] = free
                 item.name = known[name]
 
-    apart({part: list(_inner_values(model)) for part, model in models.items()}, public)
-    nodes = {
-        part: [node for body in graphs_of(model.graph) for node in body]
-        for part, model in models.items()
-    }
+    # Every value but the graph's own inputs and outputs, then nodes
+    values, nodes = dict[str, list[ir.Value]](), dict[str, list[ir.Node]]()
+    for part, model in models.items():
+        graphs = list(graphs_of(model.graph))
+        nodes[part] = [node for body in graphs for node in body]
+        inner = [
+            v for body in graphs for v in (*body.inputs, *body.initializers.values())
+        ]
+        inner += [value for node in nodes[part] for value in node.outputs]
+        ends = {*model.graph.inputs, *model.graph.outputs}
+        values[part] = [value for value in inner if value not in ends]
+    apart(values, public)
     apart(nodes, ())
-
-
-def _inner_values(model: ir.Model) -> Iterator[ir.Value]:
-    """Yield every value but the graph's own inputs and outputs."""
-    ends = {*model.graph.inputs, *model.graph.outputs}
-    for body in graphs_of(model.graph):
-        made = (value for node in body for value in node.outputs)
-        for value in (*body.inputs, *list(body.initializers.values()), *made):
-            if value not in ends:
-                yield value
 
 
 def _functions(models: Mapping[str, ir.Model]) -> list[ir.Function]:

@@ -144,7 +144,7 @@ class EnergyResult:
         window_s: mean seconds of a window.
         counter: ``nvml-total`` or another.
         counter_step_s: seconds between its updates.
-        idle_w: watts of the idle device, the model loaded, before and after.
+        idle_w: watts of the idle device; mean of before and after, the model loaded.
         throttled: why the device slowed itself down in a window.
         device: name of the device.
         scope: what the counter covers: a board, packages, rails.
