@@ -18,11 +18,11 @@ from me2e_compress.runtime.breakdown import break_down
 from me2e_compress.runtime.energy import EnergyResult
 from me2e_compress.runtime.energy.energy_counter import check_counter
 from me2e_compress.runtime.energy.meter import measure_energy
-from me2e_compress.runtime.imported_latency import read_latencies
 from me2e_compress.runtime.latency_trace import (
     LatencyTrace,
     Microseconds,
     OthersLoad,
+    read_latencies,
     shares_table,
     time_shares,
 )

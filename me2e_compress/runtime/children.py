@@ -1,13 +1,10 @@
-"""Child processes that run no code of the current folder and never outlive the parent.
+"""Child processes, none of which runs code of the current folder.
 
-Every process of this package is started here, or within :func:`sheltered`. This file is
-a program too, ``python -P children.py SCRIPT WORDS``, which exits with its parent. It
-imports nothing of the package, so that the script starts at once.
+Every process of this package is started here, or within :func:`sheltered`.
 """
 
 import contextlib
 import os
-import runpy
 import signal
 import subprocess
 import sys
@@ -18,8 +15,6 @@ from multiprocessing import active_children, parent_process, resource_tracker
 from multiprocessing.context import SpawnContext, SpawnProcess
 from pathlib import Path
 
-# Option of prctl(2): the signal to receive when the parent dies.
-PR_SET_PDEATHSIG = 1
 # Silences the warning about locks that the tracker cleans up after a kill
 _TRACKER_IS_SILENT = "ignore::UserWarning:multiprocessing.resource_tracker"
 _STARTING = threading.RLock()
@@ -122,40 +117,13 @@ def run_script(
     script: Path, arguments: Sequence[str], timeout_s: float | None = None
 ) -> "subprocess.CompletedProcess[str]":
     """Run a Python file that imports nothing of this package; return what it wrote."""
-    command = [sys.executable, "-P", __file__, str(script), *arguments]
-    read_end, write_end = os.pipe()  # nothing is written: it closes with this process
-    try:
-        # What takes longer is killed, and raises TimeoutExpired
-        return subprocess.run(
-            command,
-            check=False,
-            stdin=read_end,
-            capture_output=True,
-            text=True,
-            errors="replace",
-            timeout=timeout_s,
-        )
-    finally:
-        os.close(read_end)
-        os.close(write_end)
-
-
-def main() -> None:
-    """Watch the parent and run the script."""
-    if sys.platform == "linux":  # native code that holds Python's lock ends, too
-        import ctypes
-
-        ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
-
-    def wait_for_parent() -> None:
-        while os.read(0, 1):  # the parent holds standard input open
-            pass
-        os._exit(1)
-
-    threading.Thread(target=wait_for_parent, daemon=True).start()
-    del sys.argv[0]
-    runpy.run_path(sys.argv[0], run_name="__main__")
-
-
-if __name__ == "__main__":
-    main()
+    # What takes longer is killed, and raises TimeoutExpired
+    return subprocess.run(
+        [sys.executable, "-P", str(script), *arguments],
+        check=False,
+        stdin=subprocess.DEVNULL,
+        capture_output=True,
+        text=True,
+        errors="replace",
+        timeout=timeout_s,
+    )

@@ -15,7 +15,7 @@ import pytest
 import me2e_compress
 
 SCRIPT = """
-import json, os, signal, sys, threading, time
+import json, os, signal, sys, time
 from pathlib import Path
 from me2e_compress.runtime import children
 
@@ -30,30 +30,15 @@ def stay():
 if __name__ == "__main__":
     import onnxruntime
     place = Path(sys.argv[1])
-    script = place / "sleeper.py"
     said = children.run_script(place / "printer.py", ["word"])
     with children.process_pool(1) as processes:
         worker, is_deaf = processes.submit(look).result()
         processes.submit(stay)
-        sleeper = threading.Thread(
-            target=children.run_script, args=(script, [str(place / "pid")])
-        )
-        sleeper.start()
-        while not (place / "pid").exists():
-            time.sleep(0.02)
         print(json.dumps({"worker": worker, "deaf": is_deaf, "said": said.stdout}))
         sys.stdout.flush()
         time.sleep(600)
 """
 PRINTER = "import sys, numpy, json; print(sys.argv[1], sys.flags.safe_path)"
-SLEEPER = """
-import os, sys, time
-from pathlib import Path
-path = Path(sys.argv[1])
-path.with_name("draft").write_text(str(os.getpid()))
-path.with_name("draft").rename(path)
-time.sleep(600)
-"""
 TRAP = """
 from pathlib import Path
 Path(__file__).with_suffix(".sprung").touch()
@@ -87,7 +72,7 @@ def family(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Family]:
     folder.mkdir()
     for name in TRAPS:
         (folder / f"{name}.py").write_text(TRAP)
-    scripts = {"parent": SCRIPT, "printer": PRINTER, "sleeper": SLEEPER}
+    scripts = {"parent": SCRIPT, "printer": PRINTER}
     for name, text in scripts.items():
         (place / f"{name}.py").write_text(textwrap.dedent(text))
     ours = str(Path(me2e_compress.__file__).parents[1])

@@ -6,8 +6,7 @@ import pytest
 
 from me2e_compress.base.errors import EvaluationError
 from me2e_compress.commands.profile import import_profile
-from me2e_compress.runtime.imported_latency import read_latencies
-from me2e_compress.runtime.latency_trace import LatencyTrace
+from me2e_compress.runtime.latency_trace import LatencyTrace, read_latencies
 from tests.evaluators.highway.drivers import straight_on
 from tests.support.command import Cli
 
