@@ -1,16 +1,15 @@
 """Measure the latency of a warm model, alone on this machine."""
 
 import platform
-import time
 from collections import deque
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from itertools import chain, islice, repeat
 from pathlib import Path
 
 from me2e_compress.base.display import plural
 from me2e_compress.base.errors import EvaluationError
 from me2e_compress.graph import sha256_of
-from me2e_compress.runtime.frames import Array, Frames
+from me2e_compress.runtime.frames import Frames
 from me2e_compress.runtime.latency_trace import LatencyTrace, OthersLoad
 from me2e_compress.runtime.providers import CPU, PROVIDERS, Provider
 from me2e_compress.runtime.session import Session, replay
@@ -37,14 +36,16 @@ def profile(
     """
     wanted = len(frames) if samples is None else samples
     check_counts(wanted, warm_up, frames)
-    session = TimedSession(model, threads=threads, provider=provider, metadata=metadata)
-    # Warm up and measure in one replay of the repeated recording.
-    endless = chain.from_iterable(repeat(frames))
+    session = Session(
+        model, threads=threads, int8_kernels=True, provider=provider, metadata=metadata
+    )
+    # Warm up and measure in one replay of the repeated recording
+    endless, durations_us = chain.from_iterable(repeat(frames)), list[int]()
     for done, _ in enumerate(islice(replay(session, endless), warm_up + wanted), 1):
+        durations_us.append(session.last_us)
         on_sample(max(0, done - warm_up), wanted)
     machine = machine_text(threads, provider)
-    durations_us = tuple(session.taken_us[warm_up:])
-    return LatencyTrace(sha256_of(model), machine, durations_us)
+    return LatencyTrace(sha256_of(model), machine, tuple(durations_us[warm_up:]))
 
 
 def machine_text(threads: int, provider: Provider = CPU) -> str:
@@ -61,39 +62,6 @@ def check_counts(samples: int, warm_up: int, frames: Frames) -> None:
             f"{samples} samples after {warm_up} of warm-up on {len(frames)} frames: "
             "at least one sample and one frame are needed"
         )
-
-
-class TimedSession(Session):
-    """A session that records how long each run took.
-
-    ``taken_us`` lists the microseconds of each run.
-    """
-
-    def __init__(
-        self,
-        model: Path,
-        *,
-        threads: int,
-        provider: Provider = CPU,
-        metadata: Mapping[str, str] | None = None,
-    ) -> None:
-        super().__init__(
-            model,
-            threads=threads,
-            int8_kernels=True,
-            provider=provider,
-            metadata=metadata,
-        )
-        self.taken_us = list[int]()
-
-    def run(
-        self, feeds: Mapping[str, Array], outputs: Sequence[str] | None = None
-    ) -> dict[str, Array]:
-        """Run once and record the time."""
-        begun = time.perf_counter_ns()
-        values = super().run(feeds, outputs)
-        self.taken_us.append((time.perf_counter_ns() - begun) // 1_000)
-        return values
 
 
 def processor() -> str:
@@ -136,9 +104,10 @@ def record_traces(
     """
     check_counts(samples, warm_up, frames)
     sessions = {
-        name: TimedSession(
+        name: Session(
             path,
             threads=threads,
+            int8_kernels=True,
             provider=provider,
             metadata=(metadata or {}).get(name),
         )
@@ -158,8 +127,9 @@ def record_traces(
         for done in range(0, samples, BLOCK_RUNS):
             block = min(BLOCK_RUNS, samples - done)
             for position, (name, session) in enumerate(sessions.items()):
-                deque(islice(runs[name], BLOCK_WARM_UP + block), maxlen=0)
-                durations_us[name] += session.taken_us[-block:]
+                timed = islice(runs[name], BLOCK_WARM_UP + block)
+                block_us = [session.last_us for _ in timed]
+                durations_us[name] += block_us[BLOCK_WARM_UP:]
                 on_sample(done * len(models) + position * block, total, name)
     machine = in_turn_text(threads, provider)
     return {

@@ -6,6 +6,7 @@ although a protobuf message ends at 2 GiB.
 """
 
 import tempfile
+import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TypeAlias, cast
@@ -241,7 +242,7 @@ _OPTIMIZED = ort.GraphOptimizationLevel.ORT_ENABLE_ALL
 
 
 class Session:
-    """An onnxruntime session.
+    """An onnxruntime session; ``last_us`` has the microseconds of its last run.
 
     Args:
         model: the graph, or the file that holds it.
@@ -309,7 +310,8 @@ class Session:
         self._each_run = ort.RunOptions()
         if release:
             self._each_run.add_run_config_entry(_SHRINK, "cpu:0")
-        # Open the graph, and read its ports and metadata.
+        # Open the graph, and read its ports and metadata
+        self.last_us = 0
         self._lent: Weights = {}
         without = () if stock else None
         if isinstance(model, ir.Model):
@@ -354,6 +356,7 @@ class Session:
         ``feeds`` has one array for every input; other names are ignored. An input that
         is missing or does not fit is a FramesError, a node that fails a GraphError.
         """
+        begun_ns = time.perf_counter_ns()
         if missing := [name for name in self.inputs if name not in feeds]:
             reason = not_fed_back(missing[0], self.inputs, self.outputs)
             raise FramesError(
@@ -371,7 +374,9 @@ class Session:
             ) from error
         except REFUSALS as error:
             raise GraphError(f"onnxruntime failed: {_on_one_line(error)}") from error
-        return dict(zip(names, values, strict=True))
+        outputs_by_name = dict(zip(names, values, strict=True))
+        self.last_us = (time.perf_counter_ns() - begun_ns) // 1_000
+        return outputs_by_name
 
     def end_profile(self) -> Path:
         """Write the profile; return its file, which has one event a line."""

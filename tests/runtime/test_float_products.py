@@ -21,7 +21,6 @@ from me2e_compress.passes.import_normalize import ImportNormalize
 from me2e_compress.passes.quantize_int8 import QuantizeInt8
 from me2e_compress.runtime.int8_values import write_float_products
 from me2e_compress.runtime.optimized import optimize
-from me2e_compress.runtime.profile import TimedSession
 from me2e_compress.runtime.providers import CPU
 from me2e_compress.runtime.runnable import int8_entry, make_runnable
 from me2e_compress.runtime.session import Session
@@ -158,7 +157,7 @@ def test_what_is_timed_is_what_onnxruntime_runs(tmp_path: Path) -> None:
         for s in (False, True)
     )
 
-    timed = TimedSession(path, threads=1).run(frame)["y"]
+    timed = Session(path, threads=1, int8_kernels=True).run(frame)["y"]
 
     np.testing.assert_array_equal(timed, kernels)
     assert np.abs(plain - kernels).max() > 1

@@ -11,13 +11,12 @@ from me2e_compress.runtime.frames import Array, Frame
 from me2e_compress.runtime.latency_trace import LatencyTrace, time_shares
 from me2e_compress.runtime.profile import (
     BLOCK_RUNS,
-    TimedSession,
     machine_text,
     processor,
     profile,
     record_traces,
 )
-from me2e_compress.runtime.session import replay
+from me2e_compress.runtime.session import Session, replay
 from tests.support.command import write_frames
 from tests.support.nets import save_text
 
@@ -50,12 +49,12 @@ def test_every_sample_is_one_warm_inference(model: Path) -> None:
 
 
 def test_state_is_fed_while_it_is_timed(model: Path) -> None:
-    session = TimedSession(model, threads=1)
+    session = Session(model, threads=1)
 
     totals = [float(values["total_out"][0]) for values in replay(session, FRAMES)]
 
     assert totals == [1.0, 2.0, 3.0]
-    assert len(session.taken_us) == 3
+    assert session.last_us >= 0
 
 
 @pytest.mark.parametrize(("frames", "samples"), [([], None), (FRAMES, 0)])
