@@ -63,7 +63,80 @@ class RangeFinding:
 
 def review(ranges: Ranges) -> tuple[RangeFinding, ...]:
     """Return findings on ranges, of their own values alone; warnings first."""
-    findings = [*_range_findings(ranges), *_port_findings(ranges)]
+
+    def of_kind(activities: Mapping[str, Activity], kind: Activity) -> dict[str, None]:
+        return dict.fromkeys(name for name, did in activities.items() if did == kind)
+
+    # Tensors: the range of each over its root mean square, the worst first
+    crests = sorted(ranges.crests.items(), key=lambda item: -item[1])
+    findings = [
+        *_name_finding(
+            "rounds to zero",
+            "warning",
+            f"range of {ROUND_CREST} or more times the root mean square, where most"
+            " elements round to zero",
+            {name: crest for name, crest in crests if crest >= ROUND_CREST},
+            "Look for a frame in other units or with a wrong number type; else clip by"
+            " --method, or keep the readers float",
+        ),
+        *_name_finding(
+            "few elements",
+            "note",
+            f"range of over {OUTLIER_CREST} times the root mean square, which a few"
+            " elements make",
+            {n: crest for n, crest in crests if OUTLIER_CREST < crest < ROUND_CREST},
+        ),
+        *_name_finding(
+            "clipped",
+            "warning",
+            "range below the root mean square, which cuts most of the signal",
+            {n: crest for n, crest in reversed(crests) if ranges.rms[n] and crest < 1},
+            "These ranges are of other frames or units, or the method clips too much:"
+            " calibrate again, by max-min",
+        ),
+        *_name_finding(
+            "dead tensor",
+            "note",
+            "tensor always zero",
+            dict.fromkeys(ranges.dead),
+            "Nothing is known of them: record frames in which they are used (agents in"
+            " view, a state that is fed, other commands)",
+        ),
+        # Inputs and outputs: one frame does not tell what changes
+        *_name_finding(
+            "unfed input",
+            "warning",
+            "input zero in every frame",
+            of_kind(ranges.inputs, "zero"),
+            "A state or history of zeros gives ranges that no second frame fits: record"
+            " scenes of frames in a row, and let `inspect` show what is fed back"
+            " (--adapter)",
+        ),
+        *_name_finding(
+            "constant input",
+            "note",
+            "input the same in every frame",
+            of_kind(ranges.inputs, "constant") if ranges.frames > 1 else {},
+            "The ranges hold for these values alone: record other commands and speeds;"
+            " camera matrices of one vehicle fit that vehicle only",
+        ),
+        *_name_finding(
+            "not finite",
+            "warning",
+            "output with NaN or infinity",
+            of_kind(ranges.outputs, "not finite"),
+            "Find the frame by `compare M.onnx M.onnx FRAMES`, and leave it out",
+        ),
+        *_name_finding(
+            "dead output",
+            "warning",
+            "output the same in every frame",
+            of_kind(ranges.outputs, "zero")
+            | (of_kind(ranges.outputs, "constant") if ranges.frames > 1 else {}),
+            "What makes them was not exercised: record frames in which they answer",
+        ),
+    ]
+    # The whole recording
     if text := ranges.not_finite:
         findings.append(RangeFinding("not finite", "warning", text, advice=NOT_FINITE))
     if ranges.scenes is not None and ranges.scenes < FEW_SCENES:
@@ -85,90 +158,6 @@ def missing_ranges(cache: Path, missing: Sequence[str]) -> tuple[RangeFinding, .
     return (
         RangeFinding("not in cache", "warning", text, tuple(missing), advice=advice),
     )
-
-
-def _range_findings(ranges: Ranges) -> Iterable[RangeFinding]:
-    """Compare the range of each tensor with its root mean square."""
-    crests = sorted(ranges.crests.items(), key=lambda item: -item[1])
-    yield from _name_finding(
-        "rounds to zero",
-        "warning",
-        f"range of {ROUND_CREST} or more times the root mean square, where most"
-        " elements round to zero",
-        {name: crest for name, crest in crests if crest >= ROUND_CREST},
-        "Look for a frame in other units or with a wrong number type; else clip by"
-        " --method, or keep the readers float",
-    )
-    yield from _name_finding(
-        "few elements",
-        "note",
-        f"range of over {OUTLIER_CREST} times the root mean square, which a few"
-        " elements make",
-        {name: crest for name, crest in crests if OUTLIER_CREST < crest < ROUND_CREST},
-    )
-    yield from _name_finding(
-        "clipped",
-        "warning",
-        "range below the root mean square, which cuts most of the signal",
-        {
-            name: crest
-            for name, crest in reversed(crests)
-            if ranges.rms[name] and crest < 1
-        },
-        "These ranges are of other frames or units, or the method clips too much:"
-        " calibrate again, by max-min",
-    )
-    yield from _name_finding(
-        "dead tensor",
-        "note",
-        "tensor always zero",
-        dict.fromkeys(ranges.dead),
-        "Nothing is known of them: record frames in which they are used (agents in"
-        " view, a state that is fed, other commands)",
-    )
-
-
-def _port_findings(ranges: Ranges) -> Iterable[RangeFinding]:
-    """Yield findings on inputs and outputs that are constant, zero or not finite."""
-    yield from _name_finding(
-        "unfed input",
-        "warning",
-        "input zero in every frame",
-        _of_kind(ranges.inputs, "zero"),
-        "A state or history of zeros gives ranges that no second frame fits: record"
-        " scenes of frames in a row, and let `inspect` show what is fed back"
-        " (--adapter)",
-    )
-    if ranges.frames > 1:
-        yield from _name_finding(
-            "constant input",
-            "note",
-            "input the same in every frame",
-            _of_kind(ranges.inputs, "constant"),
-            "The ranges hold for these values alone: record other commands and speeds;"
-            " camera matrices of one vehicle fit that vehicle only",
-        )
-    yield from _name_finding(
-        "not finite",
-        "warning",
-        "output with NaN or infinity",
-        _of_kind(ranges.outputs, "not finite"),
-        "Find the frame by `compare M.onnx M.onnx FRAMES`, and leave it out",
-    )
-    still = _of_kind(ranges.outputs, "zero")
-    if ranges.frames > 1:
-        still |= _of_kind(ranges.outputs, "constant")
-    yield from _name_finding(
-        "dead output",
-        "warning",
-        "output the same in every frame",
-        still,
-        "What makes them was not exercised: record frames in which they answer",
-    )
-
-
-def _of_kind(activities: Mapping[str, Activity], kind: Activity) -> dict[str, None]:
-    return dict.fromkeys(name for name, did in activities.items() if did == kind)
 
 
 def _name_finding(
