@@ -45,7 +45,7 @@ def is_marked(path: Path) -> bool:
         head = stream.read(_END_BYTES)
         stream.seek(max(0, os.fstat(stream.fileno()).st_size - _END_BYTES))
         ends = head, stream.read(_END_BYTES)
-    return _IN_ONNX in head or any(BYTES in each for each in ends)
+    return _IN_ONNX in head or any(BYTES in end for end in ends)
 
 
 # Of each open block: the places where something was put, and what was there.

@@ -58,7 +58,7 @@ class Table:
     def escape_controls(self) -> "Table":
         """Return it with what cannot be seen as escapes, titles and cells on a line."""
         rows = (
-            tuple(replace(each, text=_escape_newlines(each.text)) for each in row)
+            tuple(replace(cell, text=_escape_newlines(cell.text)) for cell in row)
             for row in self.rows
         )
         return replace(

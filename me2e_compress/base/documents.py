@@ -133,12 +133,12 @@ def _check_strings(value: object) -> None:
     """Raise a MalformedError of lone surrogates, which no file can hold."""
     waiting = [value]
     while waiting:
-        each = waiting.pop()
-        if isinstance(each, dict):
-            waiting += (*each.keys(), *each.values())
-        elif isinstance(each, list):
-            waiting += each
-        elif isinstance(each, str) and _LONE_SURROGATE.search(each):
+        item = waiting.pop()
+        if isinstance(item, dict):
+            waiting += (*item.keys(), *item.values())
+        elif isinstance(item, list):
+            waiting += item
+        elif isinstance(item, str) and _LONE_SURROGATE.search(item):
             raise MalformedError("a string holds half a surrogate pair")
 
 

@@ -49,8 +49,8 @@ def with_install_hint(error: Exception) -> Exception:
         if frame.f_code.co_name == "<module>"
     )
     named = error.name or "" if isinstance(error, ImportError) else ""
-    candidates = [each.partition(".")[0] for each in (*running, named)]
-    module = next((each for each in reversed(candidates) if each in _EXTRA_OF), "")
+    candidates = [name.partition(".")[0] for name in (*running, named)]
+    module = next((name for name in reversed(candidates) if name in _EXTRA_OF), "")
     if not module:
         return error
     if util.find_spec(module) is None:

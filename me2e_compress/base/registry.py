@@ -115,7 +115,8 @@ class Registry(Generic[T]):
 
     def with_options(self, item: T, options: Mapping[str, object]) -> T:
         """Make an item like another, with other options; see :meth:`build`."""
-        values = {each.name: getattr(item, each.name) for each in fields_of(type(item))}
+        names = [field.name for field in fields_of(type(item))]
+        values = {name: getattr(item, name) for name in names}
         return self.make(type(item), {**values, **options})
 
     def parse(
@@ -189,7 +190,7 @@ class Registry(Generic[T]):
         written = {name: text for name, text in item.numbers.items() if name in texts}
         options, more = {**item.options, **written}, more or {}
         if item.value is not None:
-            first = next((each for each in fields_of(cls) if not each.kw_only), None)
+            first = next((field for field in fields_of(cls) if not field.kw_only), None)
             if first is None:
                 raise self.error(f"{item.name} takes no value, found {item.value!r}")
             options = {first.name: item.value}
@@ -199,7 +200,8 @@ class Registry(Generic[T]):
 
     def _entries(self, name: str) -> tuple[EntryPoint, ...]:
         """List what is to be loaded for a name; more than one is a conflict."""
-        theirs = tuple(each for each in _entry_points(self.group) if each.name == name)
+        points = _entry_points(self.group)
+        theirs = tuple(entry for entry in points if entry.name == name)
         if name not in self.builtin:
             return theirs
         return (EntryPoint(name, self.builtin[name], self.group), *theirs)
@@ -347,8 +349,8 @@ def options_of(cls: type) -> tuple[Option, ...]:
 def _option_docs(cls: type) -> Mapping[str, str]:
     """Return what the section Attributes (or Args) says, by field; a base's, too."""
     docs = dict[str, str]()
-    for each in reversed(cls.__mro__):
-        section = _SECTION.search(inspect.cleandoc(each.__doc__ or "") + "\n")
+    for base in reversed(cls.__mro__):
+        section = _SECTION.search(inspect.cleandoc(base.__doc__ or "") + "\n")
         options = [] if section is None else _OPTION.findall(section.group(1))
         docs |= {name: " ".join(text.split()) for name, text in options}
     return docs

@@ -99,7 +99,7 @@ def write_value(value: object) -> str:
     if isinstance(value, tuple | list):
         return "[" + ", ".join(write_value(item) for item in value) + "]"
     if isinstance(value, Mapping):
-        pairs = (f"{_key(name)}={write_value(each)}" for name, each in value.items())
+        pairs = (f"{_key(name)}={write_value(item)}" for name, item in value.items())
         return "{" + ", ".join(pairs) + "}"
     if value is None or isinstance(value, bool | int | float | str):
         return json.dumps(value)
@@ -109,9 +109,9 @@ def write_value(value: object) -> str:
 def fields_changed(value: "DataclassInstance") -> dict[str, object]:
     """Return the fields of a dataclass by name, without those at their default."""
     return {
-        each.name: own
-        for each in dataclasses.fields(value)
-        if (own := getattr(value, each.name)) != each.default
+        field.name: own
+        for field in dataclasses.fields(value)
+        if (own := getattr(value, field.name)) != field.default
     }
 
 

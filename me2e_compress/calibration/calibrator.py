@@ -74,10 +74,10 @@ class Extremes:
         mean = ir.node("Div", [total.outputs[0], some.outputs[0]])
         # All readings are 1-D, so that they can be joined.
         flat = [
-            ir.node("Reshape", [each.outputs[0], one]) for each in (low, high, mean)
+            ir.node("Reshape", [node.outputs[0], one]) for node in (low, high, mean)
         ]
         nodes = [low, high, total, size, count, some, mean, *flat]
-        return nodes, [each.outputs[0] for each in flat]
+        return nodes, [node.outputs[0] for node in flat]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -373,13 +373,13 @@ class _Job:
 def _numeric_names(values: Iterable[ir.Value]) -> tuple[str, ...]:
     """Return the names of inputs or outputs of a type that numpy has."""
     numbers = [
-        each
-        for each in values
-        if not each.is_initializer()
-        and isinstance(each.type, ir.TensorType)
-        and each.type.dtype.numpy() in DTYPES.values()
+        value
+        for value in values
+        if not value.is_initializer()
+        and isinstance(value.type, ir.TensorType)
+        and value.type.dtype.numpy() in DTYPES.values()
     ]
-    return tuple(str(each.name) for each in numbers)
+    return tuple(str(value.name) for value in numbers)
 
 
 def probed_session(
@@ -439,7 +439,7 @@ def schedule_probes(model: ir.Model) -> None:
         while pending:
             node = pending.pop()
             order.append(node)
-            pending += [each for out in node.outputs for each in ready(out)]
+            pending += [reader for out in node.outputs for reader in ready(out)]
 
     # Place nodes without inputs, readers of inputs, then the rest.
     place([node for node in waiting if not waiting[node]])

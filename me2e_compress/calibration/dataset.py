@@ -181,7 +181,7 @@ class CalibrationSet:
         self.files = tuple(sorted(folder.glob("*.npz")))
         if not self.files:
             raise FramesError(f"{folder}: holds no .npz frames")
-        if odd := [each for each in self.files if not each.is_file()]:
+        if odd := [file for file in self.files if not file.is_file()]:
             raise FramesError(f"{odd[0]}: not a regular file")
         # The index tells where scenes begin, and what is pixels.
         path = folder / "scenes.json"
@@ -269,8 +269,8 @@ class CalibrationSet:
             try:
                 with zipfile.ZipFile(path) as archive:
                     entries = sorted(
-                        (each.filename, each.file_size, each.CRC)
-                        for each in archive.infolist()
+                        (member.filename, member.file_size, member.CRC)
+                        for member in archive.infolist()
                     )
             except (OSError, zipfile.BadZipFile) as error:
                 line = error_line(error)
@@ -287,7 +287,7 @@ class CalibrationSet:
         # Constants, by `freeze-inputs` or in the file, may be there with the same
         # values
         frozen, weights = frozen_inputs(model), model.graph.initializers
-        inputs = [str(each.name) for each in model.graph.inputs]
+        inputs = [str(value.name) for value in model.graph.inputs]
         for name in self.pixels:
             if name not in inputs and name not in frozen:
                 raise FramesError(

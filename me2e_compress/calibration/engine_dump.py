@@ -32,7 +32,7 @@ class EngineDump:
         self.path = Path(path)
         if not self.path.exists():
             raise FramesError(f"{self.path}: no such folder")
-        self.stems = tuple(sorted(each.stem for each in self.path.glob("*.npz")))
+        self.stems = tuple(sorted(file.stem for file in self.path.glob("*.npz")))
         if not self.stems:
             raise FramesError(
                 f"{self.path}: no .npz; JSON of other tools: docs/engine-dumps.md, in"
@@ -61,15 +61,15 @@ class EngineDump:
 
     def check(self, frames: CalibrationSet) -> None:
         """Check that every frame was answered, and with the same tensors of numbers."""
-        stems = {each.stem: None for each in frames.files}
+        stems = {file.stem: None for file in frames.files}
         if len(self) != len(frames):
-            missing = [each for each in stems if each not in self.stems]
+            missing = [stem for stem in stems if stem not in self.stems]
             first = f"{missing[0]} is not answered: " if missing else ""
             raise FramesError(
                 f"{self.path}: {first}answers to {plural(len(self), 'frame')},"
                 f" {frames.folder} has {len(frames)}: the dump is of other frames"
             )
-        unknown = [each for each in self.stems if each not in stems]
+        unknown = [stem for stem in self.stems if stem not in stems]
         if unknown:
             raise FramesError(
                 f"{self.path}: {unknown[0]} is answered and is no frame of"
@@ -77,18 +77,18 @@ class EngineDump:
             )
         for index in range(len(self)):
             tensors = self[index]
-            if missing := [each for each in self.names if each not in tensors]:
+            if missing := [name for name in self.names if name not in tensors]:
                 label = self.label(index)
                 raise FramesError(
                     f"{label}: {missing[0]} is missing; other frames have it"
                 )
-            if more := [each for each in tensors if each not in self.names]:
+            if more := [name for name in tensors if name not in self.names]:
                 raise FramesError(
                     f"{self.label(0)}: {more[0]} is missing; other frames have it"
                 )
-            for name, each in tensors.items():
-                if each.dtype.kind not in "fiub":
+            for name, array in tensors.items():
+                if array.dtype.kind not in "fiub":
                     raise FramesError(
-                        f"{self.label(index)}: {name} is {each.dtype}, which is no"
+                        f"{self.label(index)}: {name} is {array.dtype}, which is no"
                         " number; write bfloat16 as float32"
                     )

@@ -43,7 +43,7 @@ def read_cache(path: Path) -> Ranges:
         reach = _parse_lines(path, lines, 0, " ", float)
     if not reach:
         raise FramesError(f"{path}: a calibration cache without a tensor")
-    bounds = {name: (-each, each) for name, each in reach.items()}
+    bounds = {name: (-bound, bound) for name, bound in reach.items()}
     return Ranges(bounds, IMPORTED, 0, "", "")
 
 

@@ -111,7 +111,8 @@ class HistogramObserver(Observer):
     def ranges(self, seen: Statistics) -> tuple[Bounds, Bounds]:
         """Clip every tensor at the edge of its histogram."""
         # A tensor without elements keeps all bins
-        edges = [self.edge(each) if each.any() else BINS for each in seen.histograms()]
+        histograms = seen.histograms()
+        edges = [self.edge(row) if row.any() else BINS for row in histograms]
         reach = np.ldexp(np.array(edges, np.float64) / BINS, seen.exponents)
         return within(seen, reach.astype(np.float32))
 

@@ -91,7 +91,7 @@ class Ranges:
     @property
     def dead(self) -> tuple[str, ...]:
         """The tensors that were zero in every frame, not those that a method cut."""
-        zero = [name for name, each in self.tensors.items() if each == (0.0, 0.0)]
+        zero = [name for name, bounds in self.tensors.items() if bounds == (0.0, 0.0)]
         return tuple(name for name in zero if not self.rms.get(name))
 
     @property
@@ -208,7 +208,7 @@ def rms_of(seen: Statistics) -> dict[str, float]:
         return {}
     root = np.sqrt(seen.mean_squares.astype(np.float64).mean(axis=0))
     pairs = zip(seen.tensors, root.tolist(), strict=True)
-    return {name: float(f"{each:.4g}") for name, each in pairs if math.isfinite(each)}
+    return {name: float(f"{rms:.4g}") for name, rms in pairs if math.isfinite(rms)}
 
 
 def _activities_of(

@@ -117,8 +117,8 @@ class _Draft:
                 return Begin(scenes[-1], places[-1])
         # Begin anew.
         self.folder.mkdir(exist_ok=True)  # it stays, because it may be locked
-        for each in self.folder.iterdir():
-            each.unlink()
+        for leftover in self.folder.iterdir():
+            leftover.unlink()
         (self.folder / PROGRESS).touch()  # from now on it is known as ours
         return Begin()
 

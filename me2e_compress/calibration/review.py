@@ -146,7 +146,7 @@ def review(ranges: Ranges) -> tuple[RangeFinding, ...]:
             " other routes, in other traffic and light"
         )
         findings.append(RangeFinding("few scenes", "note", text, advice=advice))
-    return tuple(sorted(findings, key=lambda each: each.severity, reverse=True))
+    return tuple(sorted(findings, key=lambda finding: finding.severity, reverse=True))
 
 
 def missing_ranges(cache: Path, missing: Sequence[str]) -> tuple[RangeFinding, ...]:
@@ -170,6 +170,6 @@ def _name_finding(
     """Yield a finding on the names, if any; ``text`` begins with the noun to count."""
     if ratio_of:
         noun, rest = text.split(" ", 1)
-        ratios = tuple(each for each in ratio_of.values() if each is not None)
+        ratios = tuple(ratio for ratio in ratio_of.values() if ratio is not None)
         line = f"{plural(len(ratio_of), noun)} {rest}"
         yield RangeFinding(kind, severity, line, tuple(ratio_of), ratios, advice)

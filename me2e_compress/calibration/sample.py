@@ -34,7 +34,7 @@ def spread(whole: CalibrationSet, count: int, run: int = 1) -> CalibrationSet:
         at = bisect.bisect_right(ends, start)
         start = max(ends[at - 1], min(start, ends[at] - length))
         picked.update(range(start, start + length))
-    return whole.part(sorted(whole.places[each] for each in picked))
+    return whole.part(sorted(whole.places[place] for place in picked))
 
 
 def hold_out(

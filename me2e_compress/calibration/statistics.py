@@ -181,17 +181,19 @@ def first_bad_node(
         session = Session(probed, optimize=False, frugal=True, provider=provider)
         readings = session.run(inputs, [READINGS])[READINGS].astype(np.float32)
         bad = is_not_finite(readings.reshape(len(tensors), -1))
-        return {name for name, each in zip(tensors, bad, strict=True) if each}
+        return {name for name, is_bad in zip(tensors, bad, strict=True) if is_bad}
 
     # Only where something read is not finite, look at every tensor
     watched = [name for name in floats if name in read]
     if not watched or not not_finite(watched):
         return ""
     names = not_finite(floats)
+    # NaN that reaches none of the tensors read is no cause, such as a mask of -infinity
+    # before a Softmax
     ends = {*read} & names
     for node in reversed(model.graph):
         if any(value.name in ends for value in node.outputs):
-            ends |= {str(each.name) for each in reads_of(node)} & names
+            ends |= {str(value.name) for value in reads_of(node)} & names
     for value in made:
         if value.name in ends and (first := value.producer()) is not None:
             behind = f"; {plural(len(ends) - 1, 'tensor')} behind it"

@@ -21,14 +21,14 @@ LAYOUT_OPERATORS = VIEWS | {"Transpose"}
 
 # Element-wise operators of two operands, which broadcast
 ELEMENTWISE = (
-    *("Add", "And", "Div", "Equal", "Greater", "GreaterOrEqual", "Less"),
-    *("LessOrEqual", "Max", "Min", "Mul", "Or", "Pow", "Sub", "Xor"),
-)
+    "Add", "And", "Div", "Equal", "Greater", "GreaterOrEqual", "Less",
+    "LessOrEqual", "Max", "Min", "Mul", "Or", "Pow", "Sub", "Xor",
+)  # fmt: skip
 
 _RANDOM = (
-    *("Bernoulli", "Multinomial", "RandomNormal", "RandomNormalLike"),
-    *("RandomUniform", "RandomUniformLike"),
-)
+    "Bernoulli", "Multinomial", "RandomNormal", "RandomNormalLike", "RandomUniform",
+    "RandomUniformLike",
+)  # fmt: skip
 
 
 def is_standard(node: ir.Node) -> bool:
@@ -190,10 +190,10 @@ FLOATS = frozenset({ir.DataType.DOUBLE, ir.DataType.FLOAT, ir.DataType.FLOAT16})
 
 # All element types that numpy itself computes with
 NATIVE = FLOATS | {
-    *(ir.DataType.BOOL, ir.DataType.INT8, ir.DataType.INT16, ir.DataType.INT32),
-    *(ir.DataType.INT64, ir.DataType.UINT8, ir.DataType.UINT16, ir.DataType.UINT32),
+    ir.DataType.BOOL, ir.DataType.INT8, ir.DataType.INT16, ir.DataType.INT32,
+    ir.DataType.INT64, ir.DataType.UINT8, ir.DataType.UINT16, ir.DataType.UINT32,
     ir.DataType.UINT64,
-}
+}  # fmt: skip
 
 
 def maker(value: ir.Value | None, *op_types: str) -> ir.Node | None:

@@ -78,7 +78,7 @@ def _fit_opset(model: ir.Model, path: Path) -> str:
     # 22, RMSNormalization from 23 on), else a newer one
     older = range(min(opset, newest), OLDEST_OPSET - 1, -1)
     nearest = (*older, *range(opset + 1, newest + 1))
-    able = [each for each in nearest if not _lacking(model, opset, each)]
+    able = [other for other in nearest if not _lacking(model, opset, other)]
     refusals = []
     # Operators that did not change stay; others are converted one by one, so that names
     # and metadata stay

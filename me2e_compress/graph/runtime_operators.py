@@ -24,10 +24,10 @@ ADDED = ("QuantizeLinear", "DequantizeLinear")
 def kernels() -> Mapping[str, Sequence[Kernel]]:
     """Return the CPU's kernels of ONNX's own operators, by operator; 8 ms, once."""
     listed: dict[str, list[Kernel]] = {}
-    for each in _native.get_all_opkernel_def():
-        if each.provider == "CPUExecutionProvider" and not each.domain:
-            kernel = (*each.version_range, dict(each.type_constraints))
-            listed.setdefault(each.op_name, []).append(kernel)
+    for definition in _native.get_all_opkernel_def():
+        if definition.provider == "CPUExecutionProvider" and not definition.domain:
+            kernel = (*definition.version_range, dict(definition.type_constraints))
+            listed.setdefault(definition.op_name, []).append(kernel)
     return listed
 
 
@@ -54,7 +54,7 @@ def has_operator(op_type: str, opset: int) -> bool:
     # graph: that of Swish holds a Constant, which is another from 25 on
     if not schema.has_function:
         return bool(schema.has_context_dependent_function)
-    version = max(each for each in schema.function_opset_versions if each <= opset)
+    version = max(other for other in schema.function_opset_versions if other <= opset)
     body = onnx.FunctionProto.FromString(
         schema.get_function_with_opset_version(version)
     )

@@ -138,4 +138,7 @@ def _sum_times(
         sorted(sums.items(), key=lambda item: (item[0] == OUTSIDE, -item[1].sum()))
         for sums in (modules, operators)
     )
-    return Breakdown(*({n: tuple(us.tolist()) for n, us in each} for each in by_cost))
+    modules_us, operators_us = (
+        {name: tuple(samples.tolist()) for name, samples in part} for part in by_cost
+    )
+    return Breakdown(modules_us, operators_us)

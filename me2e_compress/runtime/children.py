@@ -97,8 +97,8 @@ def kill_on_error() -> Iterator[None]:
     try:
         yield
     except BaseException:
-        for each in set(active_children()) - others:
-            each.kill()
+        for child in set(active_children()) - others:
+            child.kill()
         raise
 
 

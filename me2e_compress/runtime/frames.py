@@ -29,7 +29,7 @@ class Frame:
 
     def __repr__(self) -> str:
         """Show the index and the shapes, not the arrays."""
-        shapes = (f"{name} {list(each.shape)}" for name, each in self.arrays.items())
+        shapes = (f"{name} {list(array.shape)}" for name, array in self.arrays.items())
         starts = ", starts a scene" if self.starts_scene else ""
         return f"<Frame: {self.index}{starts}; {', '.join(shapes)}>"
 

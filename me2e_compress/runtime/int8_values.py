@@ -63,15 +63,15 @@ def write_float_products(graph: ir.Graph) -> int:
     Result:  y = MatMulIntegerToFloat(Reshape(x), w, scale of x, scales of w,
                  zero point of x, zero points of w, b)                   b float32 [N]
     """
-    products = [each for node in graph if (each := _match_product(node)) is not None]
+    matches = [match for node in graph if (match := _match_product(node)) is not None]
     names = rewrite.value_names(graph)
     opset = graph.opset_imports[""]
-    for each in products:
-        _replace(each, FusedCall(each.gemm, opset=opset, by="session", names=names))
-    if products:
+    for match in matches:
+        _replace(match, FusedCall(match.gemm, opset=opset, by="session", names=names))
+    if matches:
         graph.opset_imports.setdefault(DOMAIN, 1)
         rewrite.remove_dead(graph)
-    return len(products)
+    return len(matches)
 
 
 def _replace(product: _Product, call: FusedCall) -> None:
@@ -90,7 +90,7 @@ def _match_product(node: ir.Node) -> _Product | None:
     """Describe a quantized Gemm that is read in float; None for other nodes."""
     if node.op_type != "Gemm" or not is_standard(node) or node.attributes:
         return None
-    if any(each.op_type == "QuantizeLinear" for each in node.outputs[0].consumers()):
+    if "QuantizeLinear" in {node.op_type for node in node.outputs[0].consumers()}:
         return None
     reshape = maker(node.inputs[0], "Reshape")
     left = _quantized(node.inputs[0] if reshape is None else reshape.inputs[0])
@@ -140,9 +140,9 @@ def use_int8_kernel(node: ir.Node, opset: int, names: set[str] | None) -> None:
         return
     # Repeat the reshapes on the integers.
     call = FusedCall(node, opset=opset, by="session", names=names)
-    for each in reversed(reshapes):
-        options = {key: item.as_int() for key, item in each.attributes.items()}
-        rows = call.add("Reshape", [rows, each.inputs[1]], options)
+    for layout in reversed(reshapes):
+        options = {key: item.as_int() for key, item in layout.attributes.items()}
+        rows = call.add("Reshape", [rows, layout.inputs[1]], options)
     zero = zero or call.constant(np.zeros(1, kind.numpy()), "zero")
     # Switch the call to the int8 kernel.
     before, count = node.inputs[0], len(node.inputs)

@@ -39,7 +39,7 @@ def _missing_types(node: ir.Node, opset: int) -> str:
     if tensor_types is None:
         return ""
     listed = kernels().get(node.op_type, ())
-    usable = [each for each in listed if serves(each, schema.since_version)]
+    usable = [kernel for kernel in listed if serves(kernel, schema.since_version)]
     if not usable:
         return f"opset {opset}"
     for _, _, types in usable:

@@ -152,8 +152,8 @@ def _percentile_texts(samples: Sequence[int]) -> list[str]:
 def shares_table(title: str, kind: str, parts: Microseconds) -> Table:
     """Return a row for each part of a kind: share, then percentiles, milliseconds."""
     rows = [
-        (each.name, f"{each.share:.1%}", *_percentile_texts(parts[each.name]))
-        for each in time_shares(parts)
+        (part.name, f"{part.share:.1%}", *_percentile_texts(parts[part.name]))
+        for part in time_shares(parts)
     ]
     columns = (kind, "share", "p50 ms", "p90 ms", "p99 ms", "max ms")
     count = min(map(len, parts.values()), default=0)
@@ -163,7 +163,7 @@ def shares_table(title: str, kind: str, parts: Microseconds) -> Table:
 def _percentiles_note(count: int) -> str:
     """Return the note of a table on percentiles that need more samples, or ""."""
     why = {f"p{percent}": too_few(percent, count) for percent in PERCENTILES}
-    return missing_note({name: each for name, each in why.items() if each})
+    return missing_note({name: reason for name, reason in why.items() if reason})
 
 
 # Microseconds of one inference or more; a list in a file
@@ -218,7 +218,7 @@ class LatencyTrace:
 
     def to_json(self) -> dict[str, Any]:
         """Return p50, p90, p99 and max with the samples; None with too few samples."""
-        modules = {name: list(each) for name, each in self.modules_us.items()}
+        modules = {name: list(samples) for name, samples in self.modules_us.items()}
         names = (*(f"p{percent}_us" for percent in PERCENTILES), "max_us")
         # What was not measured is left out.
         return {
@@ -283,16 +283,16 @@ def read_latencies(path: Path) -> ImportedLatency:
         # computing, copying out; TensorRT's samples/common/sampleReporting.cpp).
         # `--exportProfile`: `count`, then layers with `averageMs`; there are no single
         # inferences, so the sum of the averages is one sample
-        first = next((each for each in document if isinstance(each, dict)), {})
+        first = next((entry for entry in document if isinstance(entry, dict)), {})
         if "count" not in first:
             times = TypeAdapter(_NonEmpty[_Time]).validate_python(document)
-            samples = tuple(round(1e3 * each.latencyMs) for each in times)
+            samples = tuple(round(1e3 * time_ms.latencyMs) for time_ms in times)
             return ImportedLatency(samples, "times of trtexec")
         # Sum layers of the same name: trtexec repeats the names in loops.
         layers = dict[str, int]()
-        for each in TypeAdapter(_NonEmpty[_Layer]).validate_python(document[1:]):
-            total_us = layers.get(each.name, 0) + round(1e3 * each.averageMs)
-            layers[each.name] = total_us
+        for layer in TypeAdapter(_NonEmpty[_Layer]).validate_python(document[1:]):
+            total_us = layers.get(layer.name, 0) + round(1e3 * layer.averageMs)
+            layers[layer.name] = total_us
         by_cost = sorted(layers.items(), key=lambda item: -item[1])
         layers_us = {name: (total_us,) for name, total_us in by_cost}
         total = (sum(layers.values()),)

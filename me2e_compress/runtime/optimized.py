@@ -71,8 +71,8 @@ def origins(source: ir.Model, compiled: ir.Model) -> dict[str, ir.Node]:
             for value in node.inputs
             if (maker := producer_of(value)) is not None
         )
-    return {str(node.name): each for node, each in known.items() if each is not None}
+    return {str(node.name): made for node, made in known.items() if made is not None}
 
 
 def _first_known(nodes: Iterable[ir.Node | None]) -> ir.Node | None:
-    return next((each for each in nodes if each is not None), None)
+    return next((node for node in nodes if node is not None), None)

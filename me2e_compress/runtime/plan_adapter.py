@@ -199,7 +199,7 @@ class PlanAdapter(pydantic.BaseModel):
     def check_modes(self, modes: int) -> None:
         """Check that something selects one of several modes; GraphError if not."""
         picks = self.default_mode, self.command_input, self.scores
-        if modes > 1 and all(each is None for each in picks):
+        if modes > 1 and all(pick is None for pick in picks):
             raise GraphError(
                 f"{self.output} has {modes} modes and nothing picks one: name"
                 f" command_input, scores or default_mode, in the metadata {PLAN} or in"

@@ -71,7 +71,7 @@ class Provider(abc.ABC):
 
     def claims(self, op_type: str) -> bool:
         """Return whether a user's library holds an operator's name, and so runs it."""
-        return any(file_contains(each, op_type.encode()) for each in self.plugins)
+        return any(file_contains(library, op_type.encode()) for library in self.plugins)
 
     def is_installed(self) -> bool:
         """Return whether this onnxruntime has it; its device may still be missing."""
@@ -180,7 +180,7 @@ class TensorRtProvider(Provider):
 
     def attach(self, options: ort.SessionOptions) -> None:
         """Register the libraries of onnxruntime operators, and load CUDA."""
-        ours = tuple(each for each in self.plugins if not self._is_plugin(each))
+        ours = tuple(path for path in self.plugins if not self._is_plugin(path))
         self.check()
         CudaProvider(self.device, plugins=ours).attach(options)
 
@@ -195,7 +195,7 @@ class TensorRtProvider(Provider):
             for kind in ("engine", "timing"):
                 options[f"trt_{kind}_cache_enable"] = "True"
                 options[f"trt_{kind}_cache_path"] = str(self.cache)
-        theirs = [str(each) for each in self.plugins if self._is_plugin(each)]
+        theirs = [str(library) for library in self.plugins if self._is_plugin(library)]
         if theirs:
             options["trt_extra_plugin_lib_paths"] = ";".join(theirs)
         return [(self.native, options), *CudaProvider(self.device).chain()]
@@ -234,7 +234,8 @@ class TensorRtRtxProvider(Provider):
             ort.register_execution_provider_library(
                 self.native, module.get_library_path()
             )
-        devices = [each for each in ort.get_ep_devices() if each.ep_name == self.native]
+        known = ort.get_ep_devices()
+        devices = [device for device in known if device.ep_name == self.native]
         if not devices:
             raise ProviderError(f"provider {self.name}: there is no RTX GPU here")
         cache = {} if self.cache is None else {"nv_runtime_cache_path": str(self.cache)}

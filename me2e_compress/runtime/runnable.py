@@ -58,7 +58,7 @@ def int8_entry() -> tuple[str, str]:
 _BY = "session"
 _AS_WRITTEN = ort.GraphOptimizationLevel.ORT_DISABLE_ALL
 _FLOAT_KERNELS = ("MultiScaleDeformableAttention", "RawDeformableAttention")
-_COMPILED = {each.op_type: each for each in kernels.KERNELS}
+_COMPILED = {kernel.op_type: kernel for kernel in kernels.KERNELS}
 
 
 @functools.cache

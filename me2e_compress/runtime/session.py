@@ -128,13 +128,13 @@ def _open_lent(
     # Lend the large weights that are read, and write the rest into the graph.
     lent: dict[str, ir.TensorProtocol] = {}
     inline: list[ir.TensorProtocol] = []
-    for each in model.graphs():
-        for name, value in each.initializers.items():
+    for body in model.graphs():
+        for name, value in body.initializers.items():
             tensor = value.const_value
             if tensor is None:
                 continue
             if (
-                each is model.graph
+                body is model.graph
                 and tensor.dtype in _LENDABLE
                 and tensor.nbytes
                 and (tensor.nbytes >= LENT_BYTES or _is_external(tensor))
@@ -443,7 +443,7 @@ def run_once(model: ir.Model, feeds: Mapping[str, Array]) -> dict[str, Array]:
 
 
 def _ports(arguments: Sequence[ort.NodeArg]) -> dict[str, SessionPort]:
-    return {each.name: SessionPort(each.type, tuple(each.shape)) for each in arguments}
+    return {port.name: SessionPort(port.type, tuple(port.shape)) for port in arguments}
 
 
 def dim_name(dim: int | str | None) -> str:
@@ -456,7 +456,7 @@ def zero_state(
 ) -> Array:
     """Return zeros for a recurrent input, its open dimensions of the named sizes."""
     known = sizes or {}
-    shape = [each if isinstance(each, int) else known.get(each) for each in port.shape]
+    shape = [dim if isinstance(dim, int) else known.get(dim) for dim in port.shape]
     sizes_known = [size for size in shape if size is not None]
     if len(sizes_known) < len(shape):
         axis = shape.index(None)

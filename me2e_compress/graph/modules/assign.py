@@ -274,10 +274,10 @@ def _claim(
     return claims[value]
 
 
+# Types of shapes, indices, masks and texts
 _NOT_WEIGHTS = (
-    *(ir.DataType.INT64, ir.DataType.INT32, ir.DataType.BOOL),
-    ir.DataType.STRING,
-)
+    ir.DataType.INT64, ir.DataType.INT32, ir.DataType.BOOL, ir.DataType.STRING,
+)  # fmt: skip
 
 
 @dataclasses.dataclass(frozen=True)
@@ -326,10 +326,8 @@ def itemise(
             size[owner] = size.get(owner, 0) + tensor.nbytes
             if tensor.dtype not in _NOT_WEIGHTS:
                 elements[owner] = elements.get(owner, 0) + tensor.size
-    return tuple(
-        Item(
-            *(module, len(own), elements[module], size[module]),
-            *((None, None) if macs is None else total_macs(map(macs, own))),
-        )
-        for module, own in nodes.items()
-    )
+    items = list[Item]()
+    for module, own in nodes.items():
+        counts = (None, None) if macs is None else total_macs(map(macs, own))
+        items.append(Item(module, len(own), elements[module], size[module], *counts))
+    return tuple(items)

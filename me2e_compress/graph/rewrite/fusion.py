@@ -157,12 +157,11 @@ class Fused:
     def notes(self) -> tuple[str, ...]:
         """Return sentences for the report."""
         what = ", ".join(f"{name} ({count})" for name, count in self.done.items())
-        left = (f"left {count}: {reason}" for reason, count in self.refused.items())
-        return (
-            *((f"fused: {what}",) if what else ()),
-            *((f"removed: {self.unread} unread",) if self.unread else ()),
-            *left,
-        )
+        notes = [f"fused: {what}"] if what else []
+        if self.unread:
+            notes.append(f"removed: {self.unread} unread")
+        notes += [f"left {count}: {why}" for why, count in self.refused.items()]
+        return tuple(notes)
 
 
 def fuse(model: ir.Model, fusions: Sequence[Fusion], *, by: str) -> Fused:
@@ -221,5 +220,5 @@ class _Run:
         if reason is not None:
             refused[reason] += 1
             return False
-        remove_unread(each.outputs[0] for each in matched.nodes)
+        remove_unread(node.outputs[0] for node in matched.nodes)
         return True

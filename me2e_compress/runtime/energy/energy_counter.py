@@ -140,7 +140,7 @@ class EnergyRecording:
             for begin, end in ends
             if self.times_s[end] - self.times_s[begin] >= schedule.idle_s
         ]
-        return sum(each.watts for each in idle) / len(idle) if idle else None
+        return sum(window.watts for window in idle) / len(idle) if idle else None
 
     def _window(self, begin: int, end: int) -> Window:
         joules = float(self.joules[end] - self.joules[begin])
@@ -195,7 +195,7 @@ def open_counter(text: str = AUTO) -> Reader | EnergyRecording | Absent:
         counters = [ENERGY_COUNTERS.parse(text)]
     else:
         kinds = map(ENERGY_COUNTERS.get, ENERGY_COUNTERS.usable())
-        counters = [ENERGY_COUNTERS.make(each, {}) for each in kinds if each.automatic]
+        counters = [ENERGY_COUNTERS.make(kind, {}) for kind in kinds if kind.automatic]
     answers = list[str]()
     for counter in counters:
         opened = counter.open()

@@ -95,13 +95,13 @@ def estimate(windows: Sequence[Window], step_s: float) -> tuple[float, float, fl
     """
     from scipy.special import stdtrit  # takes a moment to import
 
-    frames = np.array([each.frames for each in windows], float)
-    taken = np.array([each.taken_s for each in windows])
-    watts = np.array([each.watts for each in windows])
+    frames = np.array([window.frames for window in windows], float)
+    taken = np.array([window.taken_s for window in windows])
+    watts = np.array([window.watts for window in windows])
     per_frame = watts * taken / frames
     # Warm-up and drift are no noise: a straight line over time, or a parabola, is
     # fitted, and Student's t applies to the residuals
-    middle = np.array([(each.begin_s + each.end_s) / 2 for each in windows])
+    middle = np.array([(window.begin_s + window.end_s) / 2 for window in windows])
     degree = 2 if len(windows) >= PARABOLA_WINDOWS else 1
     freedom = len(windows) - 1 - degree
     drift = np.polynomial.Polynomial.fit(middle, per_frame, degree)
@@ -246,22 +246,22 @@ def summarise(
     """
     counter, device, scope, step_s = by
     j_per_frame, low, high = estimate(windows, step_s)
-    frames = sum(each.frames for each in windows)
-    frame_s = sum(each.taken_s for each in windows) / frames
+    frames = sum(window.frames for window in windows)
+    frame_s = sum(window.taken_s for window in windows) / frames
     return EnergyResult(
-        joules=sum(each.joules for each in windows),
+        joules=sum(window.joules for window in windows),
         frames=frames,
         j_per_frame=j_per_frame,
         net_j_per_frame=None if idle_w is None else j_per_frame - idle_w * frame_s,
         low=low,
         high=high,
         windows=len(windows),
-        window_s=float(np.mean([each.taken_s for each in windows])),
+        window_s=float(np.mean([window.taken_s for window in windows])),
         counter=counter,
         counter_step_s=step_s,
         idle_w=idle_w,
         throttled=tuple(dict.fromkeys(throttled)),
         device=device,
         scope=scope,
-        window_j_per_frame=tuple(each.joules / each.frames for each in windows),
+        window_j_per_frame=tuple(window.joules / window.frames for window in windows),
     )

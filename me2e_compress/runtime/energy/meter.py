@@ -52,7 +52,7 @@ class PowerSamples:
     def joules(self, begin_s: float, end_s: float) -> float:
         """Return the energy between two times; an EnergyError of too few samples."""
         times, watts = np.array(self._taken or [(0.0, 0.0)]).T
-        count = sum(begin_s <= each <= end_s for each, _ in self._taken)
+        count = sum(begin_s <= time_s <= end_s for time_s, _ in self._taken)
         if count < FEWEST_SAMPLES:
             raise EnergyError(
                 f"{self._reader.counter} of {self._reader.device}: power was read"
@@ -145,10 +145,10 @@ class EnergyMeter:
             idle.append(self._window(0, rest))
             self._sleep(2 * SAMPLED_S)  # the last sample of power comes after it
         # Idle power is the mean of before and after.
-        idle_w = fmean(self._integrated(each).watts for each in idle)
+        idle_w = fmean(self._integrated(window).watts for window in idle)
         return {
             name: summarise(
-                [self._integrated(each) for each in windows[name]],
+                [self._integrated(window) for window in windows[name]],
                 (reader.counter, reader.device, reader.scope, reader.step_s),
                 idle_w,
                 slowed[name],
@@ -187,7 +187,7 @@ class EnergyMeter:
         while self._clock() < until or not all(taken.values()):
             for name, run in work.items():
                 taken[name] += self._lead_in(run)
-        return {name: median(each) for name, each in taken.items()}
+        return {name: median(times) for name, times in taken.items()}
 
     def _lead_in(self, run: Work) -> list[float]:
         """Run frames for `lead_in_s`; return the seconds of each."""
