@@ -169,7 +169,7 @@ class Registry(Generic[T]):
     def option_schema(self, base: type) -> CoreSchema:
         """Return pydantic's schema of an option that takes any item, or its text."""
         return core_schema.no_info_before_validator_function(
-            lambda given: self.parse(given) if isinstance(given, str) else given,
+            lambda value: self.parse(value) if isinstance(value, str) else value,
             core_schema.is_instance_schema(base),
         )
 
@@ -339,8 +339,8 @@ def options_of(cls: type) -> tuple[Option, ...]:
         default, kind = default_of(field), field.type
         if not isinstance(kind, str):  # bounds of pydantic's are left out
             kind = inspect.formatannotation(get_type_hints(cls)[field.name])
-        given = default is dataclasses.MISSING
-        text = None if given else write_value(default)
+        is_required = default is dataclasses.MISSING
+        text = None if is_required else write_value(default)
         doc = docs.get(field.name, "")
         options.append(Option(field.name, _PATH.sub("", kind), text, doc))
     return tuple(options)

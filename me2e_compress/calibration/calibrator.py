@@ -251,7 +251,7 @@ class Calibrator:
         job.run()
         if self.checkpoint is not None:
             self.checkpoint.unlink(missing_ok=True)
-        return job.seen
+        return job.statistics
 
 
 class _Job:
@@ -292,7 +292,7 @@ class _Job:
         counts = self.begun.results.get("counts", blank_counts if counting else None)
         ports = len(blank.inputs) + len(blank.outputs)
         checksums = self.begun.results.get("checksums", np.empty((0, ports)))
-        self.seen = dataclasses.replace(
+        self.statistics = dataclasses.replace(
             blank,
             measured=np.asarray(measured, np.float32),
             checksums=np.asarray(checksums, np.int64),
@@ -302,34 +302,34 @@ class _Job:
 
     def run(self) -> None:
         """Measure every tensor on the frames that are not done yet."""
-        rows, sums = list(self.seen.measured), self.seen.checksums.tolist()
-        ports = (*self.seen.inputs, *self.seen.outputs)
+        rows, sums = list(self.statistics.measured), self.statistics.checksums.tolist()
+        ports = (*self.statistics.inputs, *self.statistics.outputs)
         for readings, arrays, place in self._frames():
             # Refuse what has no range, and name the node that made it
             sums.append([checksum(arrays[name]) for name in ports])
-            extremes, cause = readings[:, :3], self.seen.not_finite
+            extremes, cause = readings[:, :3], self.statistics.not_finite
             if not cause and (is_not_finite(extremes).any() or NOT_FINITE in sums[-1]):
-                seen = {*self.seen.tensors, *self.places, *self.seen.outputs}
+                tensors_read = {*self.statistics.tensors, *self.places, *self.statistics.outputs}
                 provider = self.settings.provider
-                cause = first_bad_node(self.model, arrays, seen, Extremes(), provider)
-            watched = extremes[: len(self.seen.tensors)]
-            check_finite(watched, self.seen.tensors, place, cause)
+                cause = first_bad_node(self.model, arrays, tensors_read, Extremes(), provider)
+            watched = extremes[: len(self.statistics.tensors)]
+            check_finite(watched, self.statistics.tensors, place, cause)
             rows.append(watched)
             after = dataclasses.replace(
-                self.seen,
+                self.statistics,
                 measured=np.stack(rows),
                 checksums=np.array(sums, np.int64),
                 not_finite=cause,
             )
             # Bring both histograms to the bins of the larger reach
-            if self.seen.counts is not None:
+            if self.statistics.counts is not None:
                 frame = readings[: len(watched), 3:].astype(np.int64)
                 counts = rebinned(frame, after.exponents - exponents_of(watched))
                 counts += rebinned(
-                    self.seen.counts, after.exponents - self.seen.exponents
+                    self.statistics.counts, after.exponents - self.statistics.exponents
                 )
                 after = dataclasses.replace(after, counts=counts)
-            self.seen = after
+            self.statistics = after
 
     def _frames(self) -> Iterator[tuple[Floats, Mapping[str, Array], int]]:
         """Run the frames that are left, and store the progress from time to time.
@@ -342,7 +342,7 @@ class _Job:
             return
         session = probed_session(
             self.model,
-            (*self.seen.tensors, *self.places),
+            (*self.statistics.tensors, *self.places),
             self.probe,
             threads=self.settings.threads,
             optimize=self.settings.optimize,
@@ -354,17 +354,17 @@ class _Job:
         runs = feed_forward(session, rest, floats, state)
         for done, (inputs, values, after) in enumerate(runs, begin + 1):
             readings = values[READINGS].astype(np.float32)
-            place = self.seen.frames[done - 1]
+            place = self.statistics.frames[done - 1]
             yield readings.reshape(-1, self.probe.width), {**inputs, **values}, place
             last = done == len(self.frames)
             if self.settings.checkpoint and (done % self.settings.every == 0 or last):
                 results: dict[str, Array] = {
-                    "measured": self.seen.measured,
-                    "checksums": self.seen.checksums,
-                    "not_finite": np.array(self.seen.not_finite),
+                    "measured": self.statistics.measured,
+                    "checksums": self.statistics.checksums,
+                    "not_finite": np.array(self.statistics.not_finite),
                 }
-                if self.seen.counts is not None:
-                    results["counts"] = self.seen.counts
+                if self.statistics.counts is not None:
+                    results["counts"] = self.statistics.counts
                 self.checkpoint.write(CalibrationState(done, results, after))
             if self.progress:
                 self.progress(done, len(self.frames))

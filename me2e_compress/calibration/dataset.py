@@ -297,11 +297,11 @@ class CalibrationSet:
         for path in self.files:
             # Names, types and shapes first, as they are fed
             arrays = load_arrays(path)
-            fed = self._convert_pixels(path, arrays, PixelInput.fed_header)
-            for name in fed:
+            ports = self._convert_pixels(path, arrays, PixelInput.fed_header)
+            for name in ports:
                 if (array := array_of(weights.get(name))) is not None:
                     frozen.setdefault(name, digest_of(array))
-            inputs_fed = {name: fed[name] for name in fed if name not in frozen}
+            inputs_fed = {name: ports[name] for name in ports if name not in frozen}
             _check_frame(inputs_fed, model, str(path))
             # Then numbers
             for name, array in arrays.items():

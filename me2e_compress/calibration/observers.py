@@ -59,16 +59,16 @@ class Observer(abc.ABC):
     counts: ClassVar[bool] = False
 
     @abc.abstractmethod
-    def ranges(self, seen: Statistics) -> tuple[Bounds, Bounds]:
+    def ranges(self, statistics: Statistics) -> tuple[Bounds, Bounds]:
         """Return the low and the high bound of every tensor's range.
 
         Both are finite and do not exceed the observed extremes, see :func:`within`.
         """
 
 
-def within(seen: Statistics, reach: Bounds) -> tuple[Bounds, Bounds]:
+def within(statistics: Statistics, reach: Bounds) -> tuple[Bounds, Bounds]:
     """Clip the extremes of every tensor at plus and minus its reach."""
-    lows, highs = seen.lows.min(axis=0), seen.highs.max(axis=0)
+    lows, highs = statistics.lows.min(axis=0), statistics.highs.max(axis=0)
     low, high = np.maximum(lows, -reach), np.minimum(highs, reach)
     # If all observed values are beyond the reach, the range shrinks to the nearest one
     return np.minimum(low, highs), np.maximum(high, lows)
@@ -83,9 +83,9 @@ class MaxMin(Observer):
 
     name: ClassVar[str] = "max-min"
 
-    def ranges(self, seen: Statistics) -> tuple[Bounds, Bounds]:
+    def ranges(self, statistics: Statistics) -> tuple[Bounds, Bounds]:
         """Return the extremes over all frames."""
-        return seen.lows.min(axis=0), seen.highs.max(axis=0)
+        return statistics.lows.min(axis=0), statistics.highs.max(axis=0)
 
 
 # Number of magnitudes in each of the bins: int64 [bins].
@@ -108,13 +108,13 @@ class HistogramObserver(Observer):
     def edge(self, counts: Counts) -> int:
         """Return the number of bins of a histogram that stay in the range."""
 
-    def ranges(self, seen: Statistics) -> tuple[Bounds, Bounds]:
+    def ranges(self, statistics: Statistics) -> tuple[Bounds, Bounds]:
         """Clip every tensor at the edge of its histogram."""
         # A tensor without elements keeps all bins
-        histograms = seen.histograms()
+        histograms = statistics.histograms()
         edges = [self.edge(row) if row.any() else BINS for row in histograms]
-        reach = np.ldexp(np.array(edges, np.float64) / BINS, seen.exponents)
-        return within(seen, reach.astype(np.float32))
+        reach = np.ldexp(np.array(edges, np.float64) / BINS, statistics.exponents)
+        return within(statistics, reach.astype(np.float32))
 
 
 @dataclasses.dataclass(frozen=True)

@@ -63,21 +63,23 @@ class Ranges:
     not_finite: str = ""
 
     @classmethod
-    def of(cls, seen: Statistics, method: Observer) -> Self:
+    def of(cls, statistics: Statistics, method: Observer) -> Self:
         """Compute ranges from the statistics of a calibration."""
-        lows, highs = method.ranges(seen)
+        lows, highs = method.ranges(statistics)
         bounds = zip(lows.tolist(), highs.tolist(), strict=True)
         return cls(
-            dict(zip(seen.tensors, bounds, strict=True)),
+            dict(zip(statistics.tensors, bounds, strict=True)),
             OBSERVERS.text(method, defaults=True),
-            len(seen.frames),
-            seen.model,
-            seen.source,
-            rms=rms_of(seen),
-            scenes=len(seen.scenes) or None,
-            inputs=_activities_of(seen, seen.inputs, 0),
-            outputs=_activities_of(seen, seen.outputs, len(seen.inputs)),
-            not_finite=seen.not_finite,
+            len(statistics.frames),
+            statistics.model,
+            statistics.source,
+            rms=rms_of(statistics),
+            scenes=len(statistics.scenes) or None,
+            inputs=_activities_of(statistics, statistics.inputs, 0),
+            outputs=_activities_of(
+                statistics, statistics.outputs, len(statistics.inputs)
+            ),
+            not_finite=statistics.not_finite,
         )
 
     @property
@@ -202,21 +204,21 @@ class Ranges:
             )
 
 
-def rms_of(seen: Statistics) -> dict[str, float]:
+def rms_of(statistics: Statistics) -> dict[str, float]:
     """Return root mean squares, to four digits; a square may be beyond float32."""
-    if not seen.tensors:
+    if not statistics.tensors:
         return {}
-    root = np.sqrt(seen.mean_squares.astype(np.float64).mean(axis=0))
-    pairs = zip(seen.tensors, root.tolist(), strict=True)
+    root = np.sqrt(statistics.mean_squares.astype(np.float64).mean(axis=0))
+    pairs = zip(statistics.tensors, root.tolist(), strict=True)
     return {name: float(f"{rms:.4g}") for name, rms in pairs if math.isfinite(rms)}
 
 
 def _activities_of(
-    seen: Statistics, names: Sequence[str], begin: int
+    statistics: Statistics, names: Sequence[str], begin: int
 ) -> dict[str, Activity]:
     """Return what inputs or outputs did, from their checksums from column ``begin``."""
     activities = dict[str, Activity]()
-    for name, column in zip(names, seen.checksums.T[begin:], strict=False):
+    for name, column in zip(names, statistics.checksums.T[begin:], strict=False):
         if (column == NOT_FINITE).any():
             activities[name] = "not finite"
         elif (column != column[0]).any():

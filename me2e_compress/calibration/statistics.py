@@ -68,8 +68,8 @@ class Statistics:
         # The value is that of the last frame with an element, else of the first such
         # frame; 0 if there is none
         last = np.maximum.accumulate(np.where(empty, -1, rows), axis=0)
-        taken = np.where(last < 0, np.argmin(empty, axis=0), last)
-        filled = self.measured[taken, np.arange(len(self.tensors))]
+        frame_of = np.where(last < 0, np.argmin(empty, axis=0), last)
+        filled = self.measured[frame_of, np.arange(len(self.tensors))]
         return np.where(empty.all(axis=0, keepdims=True).T, np.float32(0), filled)
 
     @property

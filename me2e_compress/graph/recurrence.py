@@ -116,10 +116,10 @@ def _misfit(
     inputs: Mapping[str, SessionPort],
     outputs: Mapping[str, SessionPort],
 ) -> str:
-    taken, given = inputs[source], outputs[answer]
+    port_in, port_out = inputs[source], outputs[answer]
     return (
-        f"output {answer} is {given.type} of rank {len(given.shape)}, input {source}"
-        f" {taken.type} of rank {len(taken.shape)}"
+        f"output {answer} is {port_out.type} of rank {len(port_out.shape)}, input"
+        f" {source} {port_in.type} of rank {len(port_in.shape)}"
     )
 
 

@@ -49,10 +49,10 @@ def restore(
     known = _match(nodes, list(like.graph.all_nodes()))
     if node_names:
         names = {n: p.name for n, p in known.items() if p.name and _alike(n, p)}
-        taken = {node.name for node in nodes if node not in names}
+        used = {node.name for node in nodes if node not in names}
         for node, name in names.items():
-            if name not in taken:
-                taken.add(name)
+            if name not in used:
+                used.add(name)
                 node.name = name
     _inherit_from_neighbours(nodes, known, by)
 

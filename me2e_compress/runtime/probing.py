@@ -62,13 +62,13 @@ def _probe_tensor(
 ) -> Sequence[ir.Value]:
     """Insert the nodes that measure one tensor; return its 1-D readings."""
     nodes: list[ir.Node] = []
-    seen = value
+    measured = value
     if value.dtype not in (None, ir.DataType.FLOAT):
         nodes.append(ir.node("Cast", [value], {"to": ir.DataType.FLOAT.value}))
-        seen = nodes[0].outputs[0]
-        seen.shape, seen.dtype = value.shape, ir.DataType.FLOAT
+        measured = nodes[0].outputs[0]
+        measured.shape, measured.dtype = value.shape, ir.DataType.FLOAT
     # Names tell which tensor a probe measures.
-    measuring, readings = probe.read(where, seen, at)
+    measuring, readings = probe.read(where, measured, at)
     nodes += measuring
     for order, node in enumerate(nodes):
         node.name = f"{READINGS}/{value.name}/{order}_{node.op_type}"

@@ -20,7 +20,7 @@ class Rms(Observer):
     name: ClassVar[str] = "rms"
     times: float = 4.0
 
-    def ranges(self, seen: Statistics) -> tuple[Bounds, Bounds]:
-        """Return bounds no wider than what was seen."""
-        mean_squares = seen.readings[:, :, 2].mean(axis=0)
-        return within(seen, np.float32(self.times) * np.sqrt(mean_squares))
+    def ranges(self, statistics: Statistics) -> tuple[Bounds, Bounds]:
+        """Return bounds no wider than what was statistics."""
+        mean_squares = statistics.readings[:, :, 2].mean(axis=0)
+        return within(statistics, np.float32(self.times) * np.sqrt(mean_squares))

@@ -85,8 +85,8 @@ def replace_value(old: ir.Value, new: ir.Value, names: set[str] | None = None) -
         raise GraphError(f"output {old.name} cannot be made of {new.name}: add a node")
     name, shape, kind = old.name, old.shape, old.type
     old.replace_all_uses_with(new, replace_graph_outputs=True)
-    taken = value_names(graph) if names is None else names
-    old.name = fresh_name(f"{name}_replaced", taken)
+    used = value_names(graph) if names is None else names
+    old.name = fresh_name(f"{name}_replaced", used)
     new.name, new.shape, new.type = name, shape, kind
 
 

@@ -232,9 +232,9 @@ def _solve(
         return _solve(rest, match, inner)
     values = {**match.values, pattern: value}
     for way in pattern.ways(value):
-        taken = tuple(dict.fromkeys((*match.nodes, *way.nodes)))
+        nodes = tuple(dict.fromkeys((*match.nodes, *way.nodes)))
         solved = _solve(
-            way.goals + rest, Match(match.root, taken, values), inner + way.inner
+            way.goals + rest, Match(match.root, nodes, values), inner + way.inner
         )
         if solved is not None:
             return solved

@@ -114,12 +114,12 @@ class JoinedStack:
         for part in self.order:
             for name, port in self.parts[part].inputs.items():
                 source = self.sources[End(part, name)]
-                given = f"state: {self.recurrent.get(source.name)}"
+                origin = f"state: {self.recurrent.get(source.name)}"
                 if source.part:
-                    given = str(source)
+                    origin = str(source)
                 elif source.name not in self.recurrent:
-                    given = "frames"
-                yield part, name, given, _form(port)
+                    origin = "frames"
+                yield part, name, origin, _form(port)
 
     def _port(self, end: End, *, output: bool = False) -> SessionPort:
         part = self.parts[end.part]
@@ -166,11 +166,11 @@ class JoinedStack:
             if not source.part:
                 continue
             waits[taker.part].append(source.part)
-            given, taken = self._port(source, output=True), self._port(taker)
-            if _misfit(given, taken):
+            port_out, port_in = self._port(source, output=True), self._port(taker)
+            if _misfit(port_out, port_in):
                 raise GraphError(
-                    f"{taker} takes {_form(taken)}, and {source}, which feeds it, is"
-                    f" {_form(given)}"
+                    f"{taker} takes {_form(port_in)}, and {source}, which feeds it, is"
+                    f" {_form(port_out)}"
                 )
         try:
             return tuple(graphlib.TopologicalSorter(waits).static_order())
@@ -213,11 +213,11 @@ class JoinedStack:
                 pairs[name] = names.get(end, other)
         for (_, name), output in state.items():
             answer = names[self._output(output, f"[state] {name}")]
-            given, taken = outputs[answer], self.inputs[name]
-            if _misfit(given, taken):
+            port_out, port_in = outputs[answer], self.inputs[name]
+            if _misfit(port_out, port_in):
                 raise GraphError(
-                    f"[state] {name} takes {_form(taken)}, and {answer}, which is fed"
-                    f" back to it, is {_form(given)}"
+                    f"[state] {name} takes {_form(port_in)}, and {answer}, which is fed"
+                    f" back to it, is {_form(port_out)}"
                 )
             pairs[name] = answer
         # The naming rules complete the pairs
@@ -253,15 +253,15 @@ def _ambiguous(where: str, name: str, givers: list[End]) -> GraphError:
     return GraphError(f"{where}: {parts} both give {name}: say {ways}, by [edges]")
 
 
-def _misfit(given: SessionPort, taken: SessionPort) -> bool:
+def _misfit(port_out: SessionPort, port_in: SessionPort) -> bool:
     """Return whether an output can never feed an input; an empty shape is unknown."""
-    if given.type != taken.type:
+    if port_out.type != port_in.type:
         return True
-    if not given.shape or not taken.shape:
+    if not port_out.shape or not port_in.shape:
         return False
-    return len(given.shape) != len(taken.shape) or any(
+    return len(port_out.shape) != len(port_in.shape) or any(
         isinstance(one, int) and isinstance(other, int) and one != other
-        for one, other in zip(given.shape, taken.shape, strict=True)
+        for one, other in zip(port_out.shape, port_in.shape, strict=True)
     )
 
 
@@ -280,7 +280,7 @@ def _merged(stack: JoinedStack) -> ir.Model:
     _rename_apart(models, {*names.values(), *inputs})
     # Move nodes and weights; inputs become what feeds them
     nodes, weights = list[ir.Node](), list[ir.Value]()
-    taken, given = dict[str, ir.Value](), dict[End, ir.Value]()
+    inputs_by_name, outputs_by_end = dict[str, ir.Value](), dict[End, ir.Value]()
     for part in stack.order:
         graph, file = models[part].graph, parts[part]
         takers, outputs = list(graph.inputs), _outputs(graph, file)
@@ -294,23 +294,23 @@ def _merged(stack: JoinedStack) -> ir.Model:
         for value, name in zip(takers, file.inputs, strict=True):
             source = stack.sources[End(part, name)]
             if source.part:
-                known = given[source]
+                known = outputs_by_end[source]
             else:
                 value.name = source.name
-                known = taken.setdefault(source.name, value)
+                known = inputs_by_name.setdefault(source.name, value)
             if known is not value:
                 ir.convenience.replace_all_uses_with(value, known)
         for value, name in zip(outputs, file.outputs, strict=True):
             end = End(part, name)
-            value.name, given[end] = names[end], value
+            value.name, outputs_by_end[end] = names[end], value
     imports = {
         domain: version
         for model in models.values()
         for domain, version in model.opset_imports.items()
     }
     joined = ir.Graph(
-        [taken[name] for name in inputs],
-        [given[end] for end in names],
+        [inputs_by_name[name] for name in inputs],
+        [outputs_by_end[end] for end in names],
         nodes=nodes,
         initializers=weights,
         opset_imports=imports,
@@ -344,13 +344,13 @@ def _rename_apart(models: Mapping[str, ir.Model], public: Collection[str]) -> No
         named: Mapping[str, list[ir.Value] | list[ir.Node]], reserved: Collection[str]
     ) -> None:
         per_part = ({item.name for item in items} for items in named.values())
-        seen = Counter(name for names in per_part for name in names if name)
-        used = {*seen, *reserved}
+        counts = Counter(name for names in per_part for name in names if name)
+        used = {*counts, *reserved}
         for part, items in named.items():
             known = dict[str, str]()
             for item in items:
                 name = item.name
-                if not name or (seen[name] == 1 and name not in reserved):
+                if not name or (counts[name] == 1 and name not in reserved):
                     continue
                 if name not in known:
                     free = f"/{part}{name}" if name[0] == "/" else f"{part}.{name}"

@@ -96,9 +96,9 @@ def estimate(windows: Sequence[Window], step_s: float) -> tuple[float, float, fl
     from scipy.special import stdtrit  # takes a moment to import
 
     frames = np.array([window.frames for window in windows], float)
-    taken = np.array([window.taken_s for window in windows])
+    lengths_s = np.array([window.taken_s for window in windows])
     watts = np.array([window.watts for window in windows])
-    per_frame = watts * taken / frames
+    per_frame = watts * lengths_s / frames
     # Warm-up and drift are no noise: a straight line over time, or a parabola, is
     # fitted, and Student's t applies to the residuals
     middle = np.array([(window.begin_s + window.end_s) / 2 for window in windows])
@@ -111,8 +111,8 @@ def estimate(windows: Sequence[Window], step_s: float) -> tuple[float, float, fl
     # step alone allows, its error replaces the spread: a window of whole steps and r
     # more seconds holds one step more or less by chance, a standard deviation of
     # power x sqrt(r (step - r)), for the worst r that the step leaves open
-    from_whole = np.abs(taken - step_s * np.round(taken / step_s))
-    past_step = np.minimum(from_whole + STEP_TOLERANCE * taken, step_s / 2)
+    from_whole = np.abs(lengths_s - step_s * np.round(lengths_s / step_s))
+    past_step = np.minimum(from_whole + STEP_TOLERANCE * lengths_s, step_s / 2)
     ends = watts / frames * np.sqrt(past_step * (step_s - past_step))
     variance = max(float(residuals @ residuals) / freedom, float(np.mean(ends**2)))
     quantile = float(stdtrit(freedom, 0.975))  # both sides 95 %

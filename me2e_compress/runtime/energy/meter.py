@@ -182,12 +182,12 @@ class EnergyMeter:
 
     def _warm_up(self, work: Mapping[str, Work]) -> dict[str, float]:
         """Warm up all models in turn; return the seconds of a frame of each."""
-        taken: dict[str, list[float]] = {name: [] for name in work}
+        frame_times: dict[str, list[float]] = {name: [] for name in work}
         until = self._clock() + self._schedule.warm_up_s
-        while self._clock() < until or not all(taken.values()):
+        while self._clock() < until or not all(frame_times.values()):
             for name, run in work.items():
-                taken[name] += self._lead_in(run)
-        return {name: median(times) for name, times in taken.items()}
+                frame_times[name] += self._lead_in(run)
+        return {name: median(times) for name, times in frame_times.items()}
 
     def _lead_in(self, run: Work) -> list[float]:
         """Run frames for `lead_in_s`; return the seconds of each."""
