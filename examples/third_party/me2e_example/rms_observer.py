@@ -21,6 +21,6 @@ class Rms(Observer):
     times: float = 4.0
 
     def ranges(self, statistics: Statistics) -> tuple[Bounds, Bounds]:
-        """Return bounds no wider than what was statistics."""
+        """Return bounds no wider than what was measured."""
         mean_squares = statistics.readings[:, :, 2].mean(axis=0)
         return within(statistics, np.float32(self.times) * np.sqrt(mean_squares))

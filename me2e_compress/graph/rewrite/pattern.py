@@ -58,12 +58,10 @@ class Way:
     Attributes:
         goals: the patterns of the operands, with the values that must match them.
         nodes: the matched nodes, the last one first.
-        inner: the outputs of these nodes, which only the pattern may read.
     """
 
     goals: tuple[Goal, ...] = ()
     nodes: tuple[ir.Node, ...] = ()
-    inner: tuple[ir.Value, ...] = ()
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -114,7 +112,7 @@ class OperatorPattern(Pattern):
             return
         for operands in self._orders(node):
             goals = tuple(zip(self.inputs, operands, strict=True))
-            yield Way(goals, (node,), (value,))
+            yield Way(goals, (node,))
 
     def _orders(self, node: ir.Node) -> Iterator[tuple[ir.Value, ...]]:
         inputs = list(node.inputs)
@@ -145,14 +143,8 @@ class Either(Pattern):
             yield Way(((option, value),))
 
 
-def var(name: str, *, computed: bool = False) -> Variable:
-    """Build the pattern of any value, or of any value that is not a constant."""
-    return Variable(name, computed)
-
-
-def constant(*, scalar: bool = False, floating: bool = True) -> Constant:
-    """Build the pattern of a constant, as :class:`Constant` says."""
-    return Constant(scalar, floating)
+# The words in which patterns are written
+var, constant = Variable, Constant
 
 
 def op(
@@ -213,40 +205,32 @@ def match(pattern: Pattern, node: ir.Node) -> Match | None:
     """Match a pattern that ends in a node; None if it does not match."""
     if any(is_read(value) for value in node.outputs[1:]):
         return None
-    return _solve(((pattern, node.outputs[0]),), Match(node, (), {}), ())
+    return _solve(((pattern, node.outputs[0]),), Match(node, (), {}))
 
 
-def _solve(
-    goals: tuple[Goal, ...], match: Match, inner: tuple[ir.Value, ...]
-) -> Match | None:
+def _solve(goals: tuple[Goal, ...], match: Match) -> Match | None:
     """Match the first goal in all its ways until the other goals match too."""
     if not goals:
-        # No other node may read the outputs of inner nodes
-        last = match.root.outputs[0]
-        closed = all(value is last or _is_inside(value, match) for value in inner)
-        return match if closed else None
+        # No other node may read what inner nodes make
+        inner = [node for node in match.nodes if node is not match.root]
+        return match if all(_is_inside(node, match) for node in inner) else None
     (pattern, value), rest = goals[0], goals[1:]
     if pattern in match.values:
-        if match.values[pattern] is not value:
-            return None
-        return _solve(rest, match, inner)
+        return _solve(rest, match) if match.values[pattern] is value else None
     values = {**match.values, pattern: value}
     for way in pattern.ways(value):
         nodes = tuple(dict.fromkeys((*match.nodes, *way.nodes)))
-        solved = _solve(
-            way.goals + rest, Match(match.root, nodes, values), inner + way.inner
-        )
+        solved = _solve(way.goals + rest, Match(match.root, nodes, values))
         if solved is not None:
             return solved
     return None
 
 
-def _is_inside(value: ir.Value, match: Match) -> bool:
-    node = value.producer()
+def _is_inside(node: ir.Node, match: Match) -> bool:
+    result = node.outputs[0]
     return (
-        node is not None
-        and node.graph is match.root.graph
-        and not value.is_graph_output()
+        node.graph is match.root.graph
+        and not result.is_graph_output()
         and not any(is_read(other) for other in node.outputs[1:])
-        and all(reader in match.nodes for reader in value.consumers())
+        and all(reader in match.nodes for reader in result.consumers())
     )
