@@ -110,14 +110,7 @@ def _cast(value: ir.Value, to: ir.DataType) -> ir.Node:
 
 _STATE = "state/"
 
-
-@dataclasses.dataclass(frozen=True)
-class CalibrationState:
-    """Frames done, results so far, and the state for the next frame."""
-
-    done: int = 0
-    results: Mapping[str, Array] = dataclasses.field(default_factory=dict)
-    state: Mapping[str, Array] = dataclasses.field(default_factory=dict)
+Arrays: TypeAlias = dict[str, Array]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -130,10 +123,10 @@ class CalibrationCheckpoint:
     path: Path | None
     key: Mapping[str, object]
 
-    def read(self) -> CalibrationState:
-        """Read the progress; an empty one if there is no file."""
+    def read(self) -> tuple[int, Arrays, Arrays]:
+        """Read frames done, results so far, and the state for the next frame."""
         if self.path is None or not self.path.is_file():
-            return CalibrationState()
+            return 0, {}, {}
         try:
             arrays = load_arrays(self.path, "a checkpoint")
             key = documents.from_json(str(arrays.pop("key")))
@@ -151,24 +144,20 @@ class CalibrationCheckpoint:
                 f"{self.path}: stale: a checkpoint of another {stale[0]}; remove it to"
                 " begin again"
             )
-        return CalibrationState(
-            done,
-            {name: a for name, a in arrays.items() if not name.startswith(_STATE)},
-            {
-                name.removeprefix(_STATE): array
-                for name, array in arrays.items()
-                if name.startswith(_STATE)
-            },
-        )
+        # The state shares the archive, under a prefix
+        states = [name for name in arrays if name.startswith(_STATE)]
+        state = {name.removeprefix(_STATE): arrays.pop(name) for name in states}
+        return done, arrays, state
 
-    def write(self, progress: CalibrationState) -> None:
-        """Write the progress atomically."""
+    def write(
+        self, done: int, results: Mapping[str, Array], state: Mapping[str, Array]
+    ) -> None:
+        """Write frames done, results so far, and the state atomically."""
         if self.path is None:
             return
-        state = {_STATE + name: array for name, array in progress.state.items()}
-        # The state shares the archive, under a prefix.
-        head = {"key": np.array(json.dumps(self.key)), "done": np.array(progress.done)}
-        write_bytes(self.path, npz_bytes({**head, **progress.results, **state}))
+        head = {"key": np.array(json.dumps(self.key)), "done": np.array(done)}
+        states = {_STATE + name: array for name, array in state.items()}
+        write_bytes(self.path, npz_bytes({**head, **results, **states}))
 
 
 Progress: TypeAlias = Callable[[int, int], None]
@@ -283,21 +272,21 @@ class _Job:
             "kind of statistics": "counts" if counting else "extremes",
         }
         self.checkpoint = CalibrationCheckpoint(settings.checkpoint, key)
-        self.begun = self.checkpoint.read()
+        self.done, results, self.state = self.checkpoint.read()
         known = set(blank.tensors)
         self.places = [name for name in index_inputs(model) if name not in known]
-        # Continue from the checkpoint, if there is one.
-        measured = self.begun.results.get("measured", blank.measured)
+        # Continue from the checkpoint, if there is one
+        measured = results.get("measured", blank.measured)
         blank_counts = np.zeros((len(blank.tensors), BINS), np.int64)
-        counts = self.begun.results.get("counts", blank_counts if counting else None)
+        counts = results.get("counts", blank_counts if counting else None)
         ports = len(blank.inputs) + len(blank.outputs)
-        checksums = self.begun.results.get("checksums", np.empty((0, ports)))
+        checksums = results.get("checksums", np.empty((0, ports)))
         self.statistics = dataclasses.replace(
             blank,
             measured=np.asarray(measured, np.float32),
             checksums=np.asarray(checksums, np.int64),
             counts=None if counts is None else np.asarray(counts, np.int64),
-            not_finite=str(self.begun.results.get("not_finite", "")),
+            not_finite=str(results.get("not_finite", "")),
         )
 
     def run(self) -> None:
@@ -309,9 +298,15 @@ class _Job:
             sums.append([checksum(arrays[name]) for name in ports])
             extremes, cause = readings[:, :3], self.statistics.not_finite
             if not cause and (is_not_finite(extremes).any() or NOT_FINITE in sums[-1]):
-                tensors_read = {*self.statistics.tensors, *self.places, *self.statistics.outputs}
+                tensors_read = {
+                    *self.statistics.tensors,
+                    *self.places,
+                    *self.statistics.outputs,
+                }
                 provider = self.settings.provider
-                cause = first_bad_node(self.model, arrays, tensors_read, Extremes(), provider)
+                cause = first_bad_node(
+                    self.model, arrays, tensors_read, Extremes(), provider
+                )
             watched = extremes[: len(self.statistics.tensors)]
             check_finite(watched, self.statistics.tensors, place, cause)
             rows.append(watched)
@@ -337,7 +332,7 @@ class _Job:
         Yields the readings of each frame, float32 [tensors and places, width of the
         probe], its inputs and outputs, and its index.
         """
-        begin = self.begun.done
+        begin = self.done
         if begin >= len(self.frames):
             return
         session = probed_session(
@@ -348,7 +343,7 @@ class _Job:
             optimize=self.settings.optimize,
             provider=self.settings.provider,
         )
-        state = self.begun.state if begin else None
+        state = self.state if begin else None
         floats = [name for name, port in session.outputs.items() if port.type in DTYPES]
         rest = (self.frames[index] for index in range(begin, len(self.frames)))
         runs = feed_forward(session, rest, floats, state)
@@ -365,7 +360,7 @@ class _Job:
                 }
                 if self.statistics.counts is not None:
                     results["counts"] = self.statistics.counts
-                self.checkpoint.write(CalibrationState(done, results, after))
+                self.checkpoint.write(done, results, after)
             if self.progress:
                 self.progress(done, len(self.frames))
 

@@ -10,7 +10,7 @@ import pytest
 
 from me2e_compress import graph
 from me2e_compress.base.atomic import BYTES, MARK, is_marked, write_document
-from me2e_compress.calibration.calibrator import CalibrationCheckpoint, CalibrationState
+from me2e_compress.calibration.calibrator import CalibrationCheckpoint
 from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.calibration.recording import write_recording
 from me2e_compress.fidelity.sensitivity import Int8Choice, write_recipe
@@ -46,7 +46,7 @@ WRITERS: dict[str, Callable[[Path], object]] = {
     "w.onnx": lambda path: graph.save(weighted(900), path, external=True),
     "e.onnx": export,
     "r.toml": recipe,
-    "c.npz": lambda path: CalibrationCheckpoint(path, {}).write(CalibrationState()),
+    "c.npz": lambda path: CalibrationCheckpoint(path, {}).write(0, {}, {}),
     "frames": record,
     "routes.json": lambda path: save_routes(load_routes(), path),
 }
