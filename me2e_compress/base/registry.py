@@ -158,7 +158,11 @@ class Registry(Generic[T]):
             field.name: values[field.name]
             for field in fields
             if not callable(values[field.name])
-            and (defaults or is_in_text(field, values[field.name]))
+            and (
+                defaults
+                or field.metadata.get("written")
+                or values[field.name] != default_of(field)
+            )
         }
         return write_item(item.name, chosen, short=len(fields) == 1)
 
@@ -235,11 +239,6 @@ def fields_of(cls: type) -> tuple["dataclasses.Field[Any]", ...]:
 
 # Metadata of a field that a text names even at its default
 IN_TEXT: Mapping[str, bool] = {"written": True}
-
-
-def is_in_text(field: "dataclasses.Field[Any]", value: object) -> bool:
-    """Return whether a text includes an option: most are left out at their default."""
-    return bool(field.metadata.get("written")) or value != default_of(field)
 
 
 def default_of(field: "dataclasses.Field[Any]") -> object:

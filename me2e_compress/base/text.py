@@ -10,10 +10,7 @@ import dataclasses
 import json
 import re
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, NoReturn
-
-if TYPE_CHECKING:
-    from _typeshed import DataclassInstance
+from typing import NoReturn
 
 _NAME = re.compile(r"[A-Za-z][\w.-]*", re.ASCII)
 _BEGINNING = re.compile(rf"{_NAME.pattern}(?=[:{{]|\Z)", re.ASCII)
@@ -95,7 +92,10 @@ def write_value(value: object) -> str:
     # has a text of its own
     own = type(value).__str__ is not object.__str__
     if dataclasses.is_dataclass(value) and not isinstance(value, type) and not own:
-        return write_value(fields_changed(value))
+        pairs = (
+            (field, getattr(value, field.name)) for field in dataclasses.fields(value)
+        )
+        return write_value({f.name: own for f, own in pairs if own != f.default})
     if isinstance(value, tuple | list):
         return "[" + ", ".join(write_value(item) for item in value) + "]"
     if isinstance(value, Mapping):
@@ -104,15 +104,6 @@ def write_value(value: object) -> str:
     if value is None or isinstance(value, bool | int | float | str):
         return json.dumps(value)
     return json.dumps(str(value))
-
-
-def fields_changed(value: "DataclassInstance") -> dict[str, object]:
-    """Return the fields of a dataclass by name, without those at their default."""
-    return {
-        field.name: own
-        for field in dataclasses.fields(value)
-        if (own := getattr(value, field.name)) != field.default
-    }
 
 
 def _key(name: object) -> str:

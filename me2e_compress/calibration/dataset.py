@@ -193,18 +193,23 @@ class CalibrationSet:
             content = documents.from_json(documents.read_bytes(path))
         index = content if isinstance(content, dict) else {}
         self.places: Sequence[int] = range(len(self.files))
-        self._starts = _starts_of(path, index, len(self.files))
+        # Scenes ascend from 0
+        starts, count = index.get("scenes"), len(self.files)
+        if not isinstance(starts, list) or not all(type(at) is int for at in starts):
+            raise FramesError(f'{path}: must hold {{"scenes": [0, ...]}}')
+        rising = all(a < b for a, b in itertools.pairwise(starts))
+        if not starts or starts[0] != 0 or not rising or starts[-1] >= count:
+            raise FramesError(
+                f"{path}: scenes must rise from 0 and stay below the {count} frames,"
+                f" found {starts}"
+            )
+        self._starts = tuple(starts)
         if unknown := [key for key in index if key not in _KEYS]:
             raise FramesError(
                 f"{path}: unknown key {unknown[0]!r}; there are {', '.join(_KEYS)}"
             )
-        # Old recordings, and those without pixels, have no such entry.
+        # Old recordings, and those without pixels, have no such entry
         pixels = index.get("pixels")
-        version = pixels.get("version") if isinstance(pixels, dict) else None
-        if isinstance(version, int) and version > 1:
-            raise FramesError(
-                f"{path}: pixels of version {version}: a later me2e-compress wrote them"
-            )
         with documents.reading(path, FramesError, "pixels"):
             entry = (
                 PixelInputs() if pixels is None else PixelInputs.model_validate(pixels)
@@ -407,17 +412,3 @@ def draw_frames(model: ir.Model, *, seed: int, count: int) -> Iterator[Frame]:
         Frame(index, index == 0, {str(v.name): draw_array(v) for v in ports})
         for index in range(count)
     )
-
-
-def _starts_of(path: Path, index: Mapping[str, object], count: int) -> tuple[int, ...]:
-    """Return the indices where scenes begin, ascending from 0; else a FramesError."""
-    starts = index.get("scenes")
-    if not isinstance(starts, list) or not all(type(at) is int for at in starts):
-        raise FramesError(f'{path}: must hold {{"scenes": [0, ...]}}')
-    rising = all(a < b for a, b in itertools.pairwise(starts))
-    if not starts or starts[0] != 0 or not rising or starts[-1] >= count:
-        raise FramesError(
-            f"{path}: scenes must rise from 0 and stay below the {count} frames,"
-            f" found {starts}"
-        )
-    return tuple(starts)

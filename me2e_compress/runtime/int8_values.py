@@ -67,23 +67,19 @@ def write_float_products(graph: ir.Graph) -> int:
     names = rewrite.value_names(graph)
     opset = graph.opset_imports[""]
     for match in matches:
-        _replace(match, FusedCall(match.gemm, opset=opset, by="session", names=names))
+        call = FusedCall(match.gemm, opset=opset, by="session", names=names)
+        integers, step, middle = match.left
+        # The Reshape moves to the integers
+        if match.reshape is not None:
+            integers = call.add("Reshape", [integers, match.reshape.inputs[1]])
+        weight, scales, zeros = match.weight
+        inputs = [integers, weight, step, scales, middle, zeros]
+        inputs.append(call.constant(match.bias, "bias"))
+        call.put(call.add("MatMulIntegerToFloat", inputs, domain=DOMAIN))
     if matches:
         graph.opset_imports.setdefault(DOMAIN, 1)
         rewrite.remove_dead(graph)
     return len(matches)
-
-
-def _replace(product: _Product, call: FusedCall) -> None:
-    """Write a MatMulIntegerToFloat in place of a Gemm."""
-    integers, step, middle = product.left
-    # The Reshape moves to the integers
-    if product.reshape is not None:
-        integers = call.add("Reshape", [integers, product.reshape.inputs[1]])
-    weight, scales, zeros = product.weight
-    inputs = [integers, weight, step, scales, middle, zeros]
-    inputs.append(call.constant(product.bias, "bias"))
-    call.put(call.add("MatMulIntegerToFloat", inputs, domain=DOMAIN))
 
 
 def _match_product(node: ir.Node) -> _Product | None:
