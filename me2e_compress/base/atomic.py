@@ -42,6 +42,7 @@ def is_marked(path: Path) -> bool:
     if not path.is_file():
         return False
     with path.open("rb") as stream:
+        # The mark is in the first or last bytes, however large the file
         head = stream.read(_END_BYTES)
         stream.seek(max(0, os.fstat(stream.fileno()).st_size - _END_BYTES))
         ends = head, stream.read(_END_BYTES)
@@ -54,6 +55,7 @@ _SETS: list[list[tuple[Path, Path]]] = []
 
 def put_in_place(draft: Path, path: Path) -> None:
     """Rename a draft to its path, in the same file system; replace a file or folder."""
+    # A file is replaced at once
     if not draft.is_dir():
         _back_up(path)
         os.replace(draft, path)
@@ -128,6 +130,7 @@ def writing_errors(path: Path, error: Callable[[str], Exception]) -> Iterator[No
 def write_bytes(path: Path, content: bytes) -> None:
     """Write a file atomically: a draft in the same folder is renamed to it."""
     with naming_file(path):
+        # The draft is on disk before it takes the place
         handle, draft = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
         try:
             with os.fdopen(handle, "wb") as file:

@@ -71,6 +71,7 @@ class Table:
 
     def markdown(self) -> str:
         """Return GitHub's Markdown, intervals in brackets, every text escaped."""
+        # Words stand left, numbers right
         rule = "|---|" + "---:|" * (len(self.columns) - 1)
         rows = [[escape_markdown(cell_text(cell)) for cell in row] for row in self.rows]
         lines = [_markdown_row(self.columns), rule, *map(_markdown_row, rows)]

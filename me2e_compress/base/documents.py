@@ -131,6 +131,7 @@ def _decode(text: bytes | str) -> str:
 
 def _check_strings(value: object) -> None:
     """Raise a MalformedError of lone surrogates, which no file can hold."""
+    # Without recursion: documents may be deep
     waiting = [value]
     while waiting:
         item = waiting.pop()

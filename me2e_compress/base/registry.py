@@ -100,6 +100,7 @@ class Registry(Generic[T]):
             there = ", ".join(known) or "none"
             line = f"{name} has no option {unknown[0]!r}; it has {there}"
             raise self.error(line)
+        # pydantic checks every option by the type of its field
         try:
             made: T = _adapter(cls).validate_python(dict(options))
         except pydantic.ValidationError as error:
@@ -220,6 +221,7 @@ class Registry(Generic[T]):
         except Exception as error:  # whatever an import of theirs may raise: chained
             line = f"{type(error).__name__}: {' '.join(str(error).split())}"
             raise self.error(f"{what} cannot be imported: {line}") from error
+        # A class that can be built, and is called as it is registered
         if not is_frozen_dataclass(cls):
             raise self.error(f"{what} is not a frozen dataclass")
         if inspect.isabstract(cls):
@@ -326,6 +328,7 @@ def describe(registry: Registry[T]) -> tuple[Entry, ...]:
         except Me2eError as error:
             entries.append(Entry(name, source, error=str(error)))
             continue
+        # What can be used is described by its docstring and fields
         first_line = (inspect.getdoc(cls) or "").partition("\n")[0]
         entries.append(Entry(name, source, first_line, options_of(cls)))
     return tuple(entries)

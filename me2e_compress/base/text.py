@@ -92,10 +92,12 @@ def write_value(value: object) -> str:
     # has a text of its own
     own = type(value).__str__ is not object.__str__
     if dataclasses.is_dataclass(value) and not isinstance(value, type) and not own:
-        pairs = (
-            (field, getattr(value, field.name)) for field in dataclasses.fields(value)
+        fields = [
+            (f.name, getattr(value, f.name), f) for f in dataclasses.fields(value)
+        ]
+        return write_value(
+            {name: item for name, item, f in fields if item != f.default}
         )
-        return write_value({f.name: own for f, own in pairs if own != f.default})
     if isinstance(value, tuple | list):
         return "[" + ", ".join(write_value(item) for item in value) + "]"
     if isinstance(value, Mapping):
@@ -119,9 +121,11 @@ class _Reader:
 
     def item(self) -> ParsedItem:
         name = self.expect(_NAME, "a name is expected")
+        # name:value
         if self.take(":"):
             value = self.expect(_SHORT, f"a value is expected behind {name}:")
             return ParsedItem(name, value=value)
+        # name{option=value, ...}, or the name alone
         numbers = dict[str, str]()
         options = self.options(numbers) if self.take("{") else {}
         return ParsedItem(name, options, numbers=numbers)
@@ -148,12 +152,14 @@ class _Reader:
         return self.string(self.expect(_QUOTED, "option=value is expected"))
 
     def value(self) -> object:
+        # Lists, mappings and strings by their first mark
         if self.take("["):
             return self.sequence()
         if self.take("{"):
             return self.options()
         if quoted := self.match(_QUOTED):
             return self.string(quoted)
+        # A word with braces is an item of its own, which its owner reads
         word = self.expect(_WORD, "a value is expected")
         if self.text.startswith("{", self.at):
             return word + self.braces()

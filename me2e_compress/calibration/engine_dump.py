@@ -61,6 +61,7 @@ class EngineDump:
 
     def check(self, frames: CalibrationSet) -> None:
         """Check that every frame was answered, and with the same tensors of numbers."""
+        # The same frames
         stems = {file.stem: None for file in frames.files}
         if len(self) != len(frames):
             missing = [stem for stem in stems if stem not in self.stems]
@@ -75,6 +76,7 @@ class EngineDump:
                 f"{self.path}: {unknown[0]} is answered and is no frame of"
                 f" {frames.folder}, whose first is {frames.files[0].stem}"
             )
+        # And the same tensors of numbers in each
         for index in range(len(self)):
             tensors = self[index]
             if missing := [name for name in self.names if name not in tensors]:

@@ -37,6 +37,7 @@ def _hash_graph(hasher: "hashlib.blake2b", graph: ir.Graph) -> None:
 
 def _hash_nodes(hasher: "hashlib.blake2b", nodes: Iterable[ir.Node]) -> None:
     for node in nodes:
+        # Order of inputs and outputs matters, that of metadata does not
         head = (
             node.domain,
             node.op_type,

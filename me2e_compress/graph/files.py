@@ -128,6 +128,7 @@ def save(model: ir.Model, path: str | Path, *, external: bool | None = None) -> 
     path = Path(path)
     if not path.parent.is_dir():
         raise GraphError(f"{path}: no such folder {path.parent}")
+    # Data files of the model itself must not be written over
     stored = external_tensors(model)
     names, own = data_names(path), {os.path.realpath(tensor.path) for tensor in stored}
     for data in names:
@@ -306,6 +307,7 @@ def _anchored(tensor: ir.ExternalTensor, path: Path) -> ir.ExternalTensor:
     if not data.is_file():
         missing = path.parent / str(tensor.location)
         raise GraphError(f"{path}: its weights file {missing} is missing")
+    # The file must hold what the model says, and be one that onnx reads
     status = data.stat()
     end = (tensor.offset or 0) + max(tensor.length or 0, tensor.nbytes)
     if status.st_size < end:
@@ -313,11 +315,12 @@ def _anchored(tensor: ir.ExternalTensor, path: Path) -> ir.ExternalTensor:
             f"{path}: {data} is cut short: {tensor.name} ends at byte {end},"
             f" the file at {status.st_size}"
         )
-    if status.st_nlink > 1:  # what onnx and onnx-ir refuse to read
+    if status.st_nlink > 1:
         raise GraphError(
             f"{path}: the data of {tensor.name} lie in {data}, a file with"
             f" {status.st_nlink} hard links, which onnx refuses: copy it"
         )
+    # The same tensor, anchored at the folder of the file that was checked
     return ir.ExternalTensor(
         data.name,
         tensor.offset,

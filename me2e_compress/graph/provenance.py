@@ -137,6 +137,7 @@ def _unsigned(before: ir.Model, after: ir.Model, by: str) -> list[ir.Node]:
     known: dict[str | None, ir.Node] = {}
     for node in nodes_in(before.graph):
         known.setdefault(node.name, node)  # of two with one name, the first counts
+    # A node that names the pass, or is as it was
     return [
         node
         for node in nodes_in(after.graph)

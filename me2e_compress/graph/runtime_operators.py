@@ -105,6 +105,7 @@ def reads(opset: int, ir_version: int = SURE_IR) -> bool:
         opset_imports=[onnx.helper.make_opsetid("", opset)],
         ir_version=ir_version,
     )
+    # A graph of one Relu is opened, and nothing logged
     options = ort.SessionOptions()
     options.log_severity_level = 4
     try:

@@ -197,6 +197,7 @@ def without_weights(model: ir.Model) -> onnx.ModelProto:
     """Write the model with its large weights as inputs; the model stays as it was."""
     graph = model.graph
     inputs, initializers = list(graph.inputs), list(graph.initializers.values())
+    # Weights become inputs while the graph is written, and weights again at the end
     try:
         for value in initializers:
             tensor = value.const_value

@@ -102,6 +102,7 @@ def _product(node: ir.Node) -> int | None:
     left, out = static_shape(node.inputs[0]), static_shape(node.outputs[0])
     if left is None or out is None:
         return None
+    # [..., M, K] x [..., K, N]: K times the elements of [..., M, N]
     gemm = node.op_type == "Gemm"
     flipped = gemm and bool(node.attributes.get_int("transA", 0))
     return math.prod(out) * (left[0 if flipped else -1] if left else 1)
@@ -145,6 +146,7 @@ def _attention(node: ir.Node) -> int | None:
     known = [shape for value in read if (shape := static_shape(value))]
     if len(known) != sum(value is not None for value in read):
         return None
+    # [batch, heads, tokens, width], or heads within the last axis
     query, key, value, *past = known
     if len(query) == 4:
         width, out = query[1] * query[3], query[1] * value[3]

@@ -107,6 +107,7 @@ def _inherit_from_neighbours(
         makers = [m for m in node.predecessors() if m in place and provenance.read(m)]
         if provenance.read(node) is None and makers:
             provenance.inherit(node, (max(makers, key=place.__getitem__),), by=by)
+    # Consumers, for nodes without such a producer
     for node in reversed(nodes):
         readers = [reader for reader in node.successors() if provenance.read(reader)]
         if provenance.read(node) is None and readers:

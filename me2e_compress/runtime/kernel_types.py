@@ -54,6 +54,7 @@ def _tensor_types(
     """Return (constraint, type as onnxruntime writes it, its name) of all tensors."""
     plain_types = dict[tuple[str, str], str]()
     sides = ((node.inputs, schema.inputs), (node.outputs, schema.outputs))
+    # The last formal parameter may stand for many tensors
     for values, formals in sides:
         for index, value in enumerate(values):
             formal = formals[min(index, len(formals) - 1)]

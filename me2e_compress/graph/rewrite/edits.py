@@ -85,6 +85,7 @@ def replace_value(old: ir.Value, new: ir.Value, names: set[str] | None = None) -
         raise GraphError(f"output {old.name} cannot be made of {new.name}: add a node")
     name, shape, kind = old.name, old.shape, old.type
     old.replace_all_uses_with(new, replace_graph_outputs=True)
+    # The new value takes over name and type of the output
     used = value_names(graph) if names is None else names
     old.name = fresh_name(f"{name}_replaced", used)
     new.name, new.shape, new.type = name, shape, kind
@@ -121,6 +122,7 @@ def put(
         raise GraphError(f"node {old.name} is not in a graph")
     if read := [value.name for value in old.outputs[1:] if is_read(value)]:
         raise GraphError(f"node {old.name} cannot be replaced: {read[0]} is read too")
+    # The new node takes the place, the name and the origins of the old
     new = ir.node(
         op_type, inputs, attributes, domain=domain, name=old.name, num_outputs=1
     )

@@ -17,16 +17,7 @@ from me2e_compress.graph.nodes import (
     opset_of,
     sole_reader,
 )
-from me2e_compress.graph.rewrite.edits import (
-    add_constant,
-    fresh_name,
-    put,
-    remove_dead,
-    remove_node,
-    remove_unread,
-    replace_value,
-    value_names,
-)
+from me2e_compress.graph.rewrite import edits
 from me2e_compress.graph.rewrite.pattern import Match, Pattern, match
 
 # A fusion can complete the pattern of another: real graphs need two or three.
@@ -58,7 +49,7 @@ class Kit:
 
     def constant(self, array: Array, name: str) -> ir.Value:
         """Register an initializer in the graph, under this name if it is free."""
-        return add_constant(self.graph, array, name, self.names)
+        return edits.add_constant(self.graph, array, name, self.names)
 
     def refill(self, node: ir.Node, index: int, array: Array, name: str) -> None:
         """Replace the array of a constant operand, or add an operand of this name."""
@@ -82,7 +73,7 @@ class Kit:
     ) -> None:
         """Replace all matched nodes by one operator, of any domain."""
         root, *sources = self.match.nodes
-        put(
+        edits.put(
             root, op_type, inputs, by=self.by, sources=sources,
             attributes=attributes, domain=domain,
         )  # fmt: skip
@@ -95,7 +86,7 @@ class Kit:
     ) -> ir.Value:
         """Insert a standard operator before the last matched node; return its value."""
         root = self.match.root
-        name = fresh_name(f"{root.outputs[0].name}_{op_type}", self.names)
+        name = edits.fresh_name(f"{root.outputs[0].name}_{op_type}", self.names)
         node = ir.node(op_type, inputs, attributes, name=name)
         node.outputs[0].name = name
         provenance.inherit(node, self.match.nodes, by=self.by)
@@ -107,8 +98,8 @@ class Kit:
         root = self.match.root
         for node in (first, *others):
             provenance.inherit(node, (node, root), by=self.by)
-        replace_value(root.outputs[0], first.outputs[0])
-        remove_node(root)
+        edits.replace_value(root.outputs[0], first.outputs[0])
+        edits.remove_node(root)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -173,9 +164,9 @@ def fuse(model: ir.Model, fusions: Sequence[Fusion], *, by: str) -> Fused:
     for fusion in fusions:
         for root in sorted(fusion.pattern.roots()):
             table.setdefault(root, []).append(fusion)
-    run = _Run(Facts(opset_of(model)), by, value_names(model.graph), table)
+    run = _Run(Facts(opset_of(model)), by, edits.value_names(model.graph), table)
     # Unread nodes would read inner values of patterns
-    fused = Fused(unread=remove_dead(model.graph))
+    fused = Fused(unread=edits.remove_dead(model.graph))
     for _ in range(ROUNDS):
         done: Counter[str] = Counter()
         fused.refused.clear()  # those of the last round are left
@@ -184,7 +175,7 @@ def fuse(model: ir.Model, fusions: Sequence[Fusion], *, by: str) -> Fused:
         if not done:
             break
         fused.done.update(done)
-        remove_dead(model.graph)
+        edits.remove_dead(model.graph)
     for node in nodes_in(model.graph):
         if not is_standard(node):
             model.graph.opset_imports.setdefault(node.domain, 1)
@@ -220,5 +211,5 @@ class _Run:
         if reason is not None:
             refused[reason] += 1
             return False
-        remove_unread(node.outputs[0] for node in matched.nodes)
+        edits.remove_unread(node.outputs[0] for node in matched.nodes)
         return True

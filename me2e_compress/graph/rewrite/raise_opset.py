@@ -16,13 +16,7 @@ from me2e_compress.graph.nodes import (
     is_standard,
     opset_of,
 )
-from me2e_compress.graph.rewrite.edits import (
-    add_constant,
-    fresh_name,
-    remove_node,
-    replace_value,
-    value_names,
-)
+from me2e_compress.graph.rewrite import edits
 from me2e_compress.graph.runtime_operators import since
 from me2e_compress.graph.shapes import infer_shapes
 
@@ -85,7 +79,7 @@ def write_in(
         elif not _is_same(known[key].graph, old.graph):
             return 0, f"{called} of a function is another there"
     # Nothing changes unless every node can be converted
-    own, names = opset_of(model), value_names(model.graph)
+    own, names = opset_of(model), edits.value_names(model.graph)
     for node, instead in made.items():
         _replace(node, instead, own, names, by)
     for body, _ in bodies(model):
@@ -118,6 +112,7 @@ def alone(node: ir.Node, opset: int) -> onnx.ModelProto:
         typed.type = typed.type or ir.TensorType(ir.DataType.FLOAT)
         return ir.serde.serialize_value(typed)
 
+    # The node itself, without names that two equal nodes differ by
     proto = ir.serde.serialize_node(node)
     proto.name, proto.doc_string = "", ""
     del proto.metadata_props[:]
@@ -174,7 +169,7 @@ def _replace(
         if inner.const_value is not None:
             array = inner.const_value.numpy()
             label = f"{node.name}_{inner.name}"
-            inner.replace_all_uses_with(add_constant(graph, array, label, names))
+            inner.replace_all_uses_with(edits.add_constant(graph, array, label, names))
     # Move the nodes; the last of the same operator keeps the name
     nodes, results = list(instead), list(instead.outputs)
     instead.outputs.clear()
@@ -189,15 +184,15 @@ def _replace(
         new.name = node.name if last else f"{node.name}_{new.op_type}_{place}"
         for value in new.outputs:
             if value not in results and value.name:
-                value.name = fresh_name(f"{node.name}_{value.name}", names)
+                value.name = edits.fresh_name(f"{node.name}_{value.name}", names)
         new.metadata_props.update(node.metadata_props)
         provenance.inherit(new, [node], by=by)
     graph.insert_before(node, nodes)
     for old, new_value in zip(_named(node.outputs), results, strict=True):
         new_value.shape, new_value.type, name = old.shape, old.type, old.name
-        replace_value(old, new_value, names)
+        edits.replace_value(old, new_value, names)
         new_value.name = name
-    remove_node(node)
+    edits.remove_node(node)
 
 
 def _named(values: Sequence[ir.Value]) -> list[ir.Value]:

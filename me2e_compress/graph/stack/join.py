@@ -150,6 +150,8 @@ class JoinedStack:
         """Return the source of an input: an edge, a state or an output of that name."""
         if taker in edges:
             return edges[taker]
+        # A state is an input of the stack; otherwise the one output of that name feeds
+        # it
         declared = self.parts[taker.part].recurrent().get(taker.name)
         givers = [end for end in self.outputs if end.name == taker.name]
         givers = [end for end in givers if end.part != taker.part]
@@ -165,6 +167,7 @@ class JoinedStack:
         for taker, source in self.sources.items():
             if not source.part:
                 continue
+            # A part waits for those that feed it, by types that fit
             waits[taker.part].append(source.part)
             port_out, port_in = self._port(source, output=True), self._port(taker)
             if _misfit(port_out, port_in):
@@ -228,12 +231,14 @@ class JoinedStack:
     def _check_connected(self) -> None:
         """Refuse a part that neither edges nor state connect to the first."""
         part_of = {name: end.part for end, name in self.names.items()}
+        # Pairs of parts of which one feeds the other, within a frame or at the next
         pairs = set[tuple[str, str]]()
         for taker, source in self.sources.items():
             if source.part:
                 pairs.add((taker.part, source.part))
             elif source.name in self.recurrent:
                 pairs.add((taker.part, part_of[self.recurrent[source.name]]))
+        # What is reached from the first part in either direction
         first, *others = self.parts
         reached = {first}
         for _ in self.parts:

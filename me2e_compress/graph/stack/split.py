@@ -27,10 +27,12 @@ def split_stack(stack: JoinedStack, model: ir.Model) -> dict[str, ir.Model]:
         stack.model.metadata_props,
         (*model.graph.inputs, *model.graph.outputs),
     )
+    # Metadata that were added after joining go into every part
     added = {k: v for k, v in model.metadata_props.items() if before.get(k) != v}
     ends = {str(value.name): value for value in ports}
     models = dict[str, ir.Model]()
     for part, file in stack.parts.items():
+        # Inputs and outputs of the part that passes did not remove
         sources = {name: stack.sources[End(part, name)] for name in file.inputs}
         inputs = {
             name: ends[public]

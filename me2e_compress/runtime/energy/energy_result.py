@@ -246,6 +246,7 @@ def summarise(
     """
     counter, device, scope, step_s = by
     j_per_frame, low, high = estimate(windows, step_s)
+    # Idle power is taken off for the mean time of a frame
     frames = sum(window.frames for window in windows)
     frame_s = sum(window.taken_s for window in windows) / frames
     return EnergyResult(

@@ -270,6 +270,7 @@ def _open_models(
     metadata: Mapping[str, str] | None,
 ) -> dict[str, Work]:
     """Open each model, to replay endlessly the first frames that fit into memory."""
+    # Frames are held in memory: reading from disk takes energy too
     in_memory, size = list[Frame](), 0
     for frame in frames:
         size += sum(array.nbytes for array in frame.arrays.values())
