@@ -13,12 +13,10 @@ from me2e_compress.runtime.breakdown import (
     Breakdown,
     break_down,
     node_runs,
-    optimize,
-    origins,
-    with_unique_names,
 )
 from me2e_compress.runtime.frames import Frame
 from me2e_compress.runtime.latency_trace import LatencyTrace, time_shares
+from me2e_compress.runtime.optimized import optimize, origins, with_unique_names
 from me2e_compress.runtime.providers import CPU, CudaProvider, Provider
 from tests.support.nets import net
 

@@ -19,8 +19,8 @@ from me2e_compress.manager import PassManager
 from me2e_compress.passes.base import Context
 from me2e_compress.passes.import_normalize import ImportNormalize
 from me2e_compress.passes.quantize_int8 import QuantizeInt8
-from me2e_compress.runtime.breakdown import optimize
 from me2e_compress.runtime.int8_values import write_float_products
+from me2e_compress.runtime.optimized import optimize
 from me2e_compress.runtime.providers import CPU
 from me2e_compress.runtime.runnable import int8_entry, make_runnable
 from me2e_compress.runtime.session import Session

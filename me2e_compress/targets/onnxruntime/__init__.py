@@ -12,7 +12,7 @@ from me2e_compress.graph.nodes import maker
 from me2e_compress.operators import int8_inputs, int8_op_types
 from me2e_compress.quantization.costs import Costs
 from me2e_compress.quantization.decision import Decision, KeptFloat, QuantPlan
-from me2e_compress.runtime.breakdown import optimize, origins, with_unique_names
+from me2e_compress.runtime.optimized import optimize, origins, with_unique_names
 from me2e_compress.runtime.providers import CPU, Provider
 from me2e_compress.targets import LintFinding, LintRule, Target, error, warning
 from me2e_compress.targets.onnxruntime.convert import int8_layers

@@ -7,7 +7,7 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from me2e_compress.graph import array_of
-from me2e_compress.runtime.breakdown import optimize
+from me2e_compress.runtime.optimized import optimize
 from me2e_compress.runtime.session import Session
 from me2e_compress.targets.onnxruntime import OnnxRuntime
 from me2e_compress.targets.onnxruntime.convert import int8_layers

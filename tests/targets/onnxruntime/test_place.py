@@ -8,7 +8,7 @@ from me2e_compress.base.errors import FramesError
 from me2e_compress.calibration.ranges import Ranges
 from me2e_compress.graph import provenance
 from me2e_compress.quantization.plan import make_plan
-from me2e_compress.runtime.breakdown import optimize
+from me2e_compress.runtime.optimized import optimize
 from me2e_compress.targets.onnxruntime import OnnxRuntime
 from me2e_compress.targets.onnxruntime.convert import int8_layers
 from tests.support.nets import FULL, PAPER, conv_attention, drawn, placed
