@@ -62,32 +62,26 @@ class EngineDump:
     def check(self, frames: CalibrationSet) -> None:
         """Check that every frame was answered, and with the same tensors of numbers."""
         # The same frames
-        stems = {file.stem: None for file in frames.files}
-        if len(self) != len(frames):
-            missing = [stem for stem in stems if stem not in self.stems]
-            first = f"{missing[0]} is not answered: " if missing else ""
-            raise FramesError(
-                f"{self.path}: {first}answers to {plural(len(self), 'frame')},"
-                f" {frames.folder} has {len(frames)}: the dump is of other frames"
-            )
-        unknown = [stem for stem in self.stems if stem not in stems]
-        if unknown:
+        stems = dict.fromkeys(file.stem for file in frames.files)
+        if unknown := [stem for stem in self.stems if stem not in stems]:
             raise FramesError(
                 f"{self.path}: {unknown[0]} is answered and is no frame of"
                 f" {frames.folder}, whose first is {frames.files[0].stem}"
             )
+        if missing := [stem for stem in stems if stem not in self.stems]:
+            raise FramesError(
+                f"{self.path}: {missing[0]} is not answered: answers to"
+                f" {plural(len(self), 'frame')}, {frames.folder} has {len(frames)}: the"
+                " dump is of other frames"
+            )
         # And the same tensors of numbers in each
-        for index in range(len(self)):
-            tensors = self[index]
-            if missing := [name for name in self.names if name not in tensors]:
-                label = self.label(index)
-                raise FramesError(
-                    f"{label}: {missing[0]} is missing; other frames have it"
-                )
-            if more := [name for name in tensors if name not in self.names]:
-                raise FramesError(
-                    f"{self.label(0)}: {more[0]} is missing; other frames have it"
-                )
+        for index, tensors in enumerate(self):
+            for name in (*self.names, *tensors):
+                if (name in tensors) != (name in self.names):
+                    label = self.label(0 if name in tensors else index)
+                    raise FramesError(
+                        f"{label}: {name} is missing; other frames have it"
+                    )
             for name, array in tensors.items():
                 if array.dtype.kind not in "fiub":
                     raise FramesError(
