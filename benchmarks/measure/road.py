@@ -34,7 +34,6 @@ from me2e_compress.evaluators.highway.driven_frames import propose, seed_of
 from me2e_compress.evaluators.highway.runner import Listeners, drive
 from me2e_compress.metrics.measure import Estimate, mean_estimate
 from me2e_compress.metrics.route_summary import RouteSummary
-from me2e_compress.runtime.children import process_pool
 from me2e_compress.simulator.routes import (
     SCENARIO_ABILITIES,
     SHIPPED,
@@ -46,6 +45,7 @@ from me2e_compress.simulator.world import World
 from me2e_compress.study.drive_record import DriveRecord
 from models.driver.expert.blind import Blind
 from models.driver.expert.privileged import privileged
+from models.processes import process_pool
 
 NEAR_M, MOVING_MPS = 80.0, 0.3
 AHEAD_M = 40.0

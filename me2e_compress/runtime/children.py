@@ -10,8 +10,7 @@ import subprocess
 import sys
 import threading
 from collections.abc import Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
-from multiprocessing import active_children, parent_process, resource_tracker
+from multiprocessing import parent_process, resource_tracker
 from multiprocessing.context import SpawnContext, SpawnProcess
 from pathlib import Path
 
@@ -88,29 +87,6 @@ def end_with_parent() -> None:
         os._exit(1)
 
     threading.Thread(target=wait, daemon=True).start()
-
-
-@contextlib.contextmanager
-def kill_on_error() -> Iterator[None]:
-    """Kill the processes that were started in this block if it raises."""
-    others = set(active_children())
-    try:
-        yield
-    except BaseException:
-        for child in set(active_children()) - others:
-            child.kill()
-        raise
-
-
-@contextlib.contextmanager
-def process_pool(workers: int) -> Iterator[ProcessPoolExecutor]:
-    """Open a pool of so many processes, which end with this block in every case."""
-    executor = ProcessPoolExecutor(workers, spawn_context(), end_with_parent)
-    try:
-        with kill_on_error():
-            yield executor
-    finally:
-        executor.shutdown(cancel_futures=True)
 
 
 def run_script(

@@ -26,7 +26,6 @@ from me2e_compress.evaluators.highway.episode_recorder import EpisodeRecorder
 from me2e_compress.evaluators.highway.observe import ObservationBuilder
 from me2e_compress.evaluators.highway.runner import EndingRules
 from me2e_compress.metrics.episode import Ending, InfractionKind
-from me2e_compress.runtime.children import process_pool
 from me2e_compress.simulator.camera_rig import CameraRig
 from me2e_compress.simulator.routes import (
     ROAD_VERSION,
@@ -40,6 +39,7 @@ from me2e_compress.simulator.world import World
 from me2e_compress.version import __version__
 from models.driver.expert import Expert
 from models.driver.expert.blind import SPEEDS_MPS, Blind
+from models.processes import process_pool
 
 ENDS_ONLY = (
     InfractionKind.ROUTE_TIMEOUT,

@@ -9,7 +9,7 @@ from pathlib import Path
 import torch
 from torch.multiprocessing.spawn import ProcessException, spawn
 
-from me2e_compress.runtime.children import end_with_parent, kill_on_error, sheltered
+from me2e_compress.runtime.children import end_with_parent, sheltered
 from models.driver.checkpoint import TrainingCheckpoint
 from models.driver.errors import TrainingError
 from models.driver.network.config import HighwayConfig
@@ -22,6 +22,7 @@ from models.driver.process import (
     TrainingProcess,
 )
 from models.driver.process_group import ProcessGroup
+from models.processes import kill_on_error
 
 __all__ = ["Training", "train"]
 

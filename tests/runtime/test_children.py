@@ -18,6 +18,7 @@ SCRIPT = """
 import json, os, signal, sys, time
 from pathlib import Path
 from me2e_compress.runtime import children
+from models.processes import process_pool
 
 def look():
     import numpy
@@ -31,7 +32,7 @@ if __name__ == "__main__":
     import onnxruntime
     place = Path(sys.argv[1])
     said = children.run_script(place / "printer.py", ["word"])
-    with children.process_pool(1) as processes:
+    with process_pool(1) as processes:
         worker, is_deaf = processes.submit(look).result()
         processes.submit(stay)
         print(json.dumps({"worker": worker, "deaf": is_deaf, "said": said.stdout}))

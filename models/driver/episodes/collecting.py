@@ -16,7 +16,6 @@ from me2e_compress.evaluators import Drive
 from me2e_compress.evaluators.highway.runner import drive
 from me2e_compress.graph import sha256_of
 from me2e_compress.metrics.episode import Ending
-from me2e_compress.runtime.children import process_pool
 from me2e_compress.simulator.camera_rig import CameraRig
 from models.driver.episodes.collection import (
     FORMAT,
@@ -29,6 +28,7 @@ from models.driver.episodes.episode_arrays import Arrays, arrays_of
 from models.driver.episodes.recording_policy import RecordingPolicy
 from models.driver.errors import TrainingError
 from models.driver.options import claim
+from models.processes import process_pool
 
 SUFFIX, SKIPPED = ".npz", ".skipped"
 SHORTEST_US = 2_000_000
