@@ -19,6 +19,7 @@ from google.protobuf.message import Message
 from onnx import TensorProto
 from onnx.onnx_cpp2py_export.checker import CheckerContext
 
+from me2e_compress.base.display import error_line
 from me2e_compress.base.errors import GraphError
 from me2e_compress.graph.nodes import STANDARD, is_plugin, is_standard, nodes_of
 from me2e_compress.graph.shapes import without_weights
@@ -39,10 +40,6 @@ LARGEST_ELEMENTS = 2**40
 HIGHEST_RANK = 64
 
 _ELEMENT_TYPES = frozenset(TensorProto.DataType.values()) - {TensorProto.UNDEFINED}
-_DATA_FIELDS = (
-    "float_data", "int32_data", "string_data", "int64_data", "double_data",
-    "uint64_data",
-)  # fmt: skip
 _ATTRIBUTE_TYPES = frozenset(onnx.AttributeProto.AttributeType.values()) - {0}
 # The field of an attribute that has no value of its own where it is left out
 _CONTENT_FIELD = {onnx.AttributeProto.TENSOR: "t", onnx.AttributeProto.GRAPH: "g"}
@@ -153,24 +150,17 @@ def _check_tensor(tensor: TensorProto, what: str) -> None:
         raise GraphError(f"{what} has shape {list(tensor.dims)}: too many elements")
     if tensor.data_location == TensorProto.EXTERNAL:
         return
-    # Bytes in one block
-    filled = [name for name in _DATA_FIELDS if getattr(tensor, name)]
-    if filled and (len(filled) > 1 or tensor.raw_data):
-        raise GraphError(f"{what} holds its data twice")
-    bits = ir.DataType(kind).bitwidth if kind != TensorProto.STRING else None
-    if bits is not None and not filled:
-        expected, length = -(-count * bits // 8), len(tensor.raw_data)
-        if expected != length:
-            raise GraphError(f"{what} has {length} bytes, its shape says {expected}")
-        return
-    # Or elements one by one, in a field of their type
-    if kind in (TensorProto.COMPLEX64, TensorProto.COMPLEX128):
-        count *= 2  # real and imaginary part
-    elif bits in (2, 4):
-        count = -(-count * bits // 8)  # several in a byte
-    length = len(getattr(tensor, onnx.helper.tensor_dtype_to_field(kind)))
-    if count != length:
-        raise GraphError(f"{what} has {length} values, its shape says {count}")
+    # Elements stand one by one in a field of their type, or as bytes, of which onnx-ir
+    # takes too few where elements share one
+    try:
+        stored = ir.serde.deserialize_tensor(tensor)
+        stored.numpy()
+    except (ir.serde.SerdeError, ValueError, TypeError) as error:
+        line = error_line(error)
+        raise GraphError(f"{what} has shape {list(tensor.dims)}: {line}") from error
+    if tensor.raw_data and len(tensor.raw_data) != stored.nbytes:
+        length = len(tensor.raw_data)
+        raise GraphError(f"{what} has {length} bytes, its shape says {stored.nbytes}")
 
 
 Function = tuple[str, str, str]

@@ -32,8 +32,7 @@ REFUSED = {
     "ir-0": "IR version 0",
     "dims-negative": r"initializer 'w' has shape \[-4, 3, 3, 3\]",
     "dims-huge": "too many elements",
-    "raw-short": "initializer 'w' has 3 bytes, its shape says 432",
-    "two-kinds-of-data": "initializer 'w' holds its data twice",
+    "raw-short": r"initializer 'w' has shape \[4, 3, 3, 3\]: ",
     "dim-huge": "'image' has a dimension of 4611686018427387904",
     "type-99": "initializer 'w' is of element type 99, which is none",
     "input-untyped": "'image' is not a tensor: its type is missing",
@@ -116,7 +115,7 @@ def test_weights_of_two_bits(tmp_path: Path, kind: int, field: str) -> None:
     assert Session(graph.load(path)).run(feeds)["y"].tolist() == [sums]
 
     tensor.ClearField(field)
-    tensor.MergeFrom(DATA[field](weight[:2]))
+    tensor.raw_data = weight[:2]
     path.write_bytes(model.SerializeToString())
-    with pytest.raises(GraphError, match=r"'q' has 2 (bytes|values), its shape says"):
+    with pytest.raises(GraphError, match="'q' has 2 bytes, its shape says 3"):
         graph.load(path)
