@@ -97,8 +97,7 @@ def from_json(text: bytes | str, *, finite: bool = True) -> Any:
     So are NaN and infinities, unless ``finite`` is False.
     """
     try:
-        # Python's own writer writes NaN: a caller that takes it must look at the
-        # numbers
+        # Python's own writer writes NaN: who takes it must look at the numbers
         document = (_DECODER if finite else _ANY_NUMBER).decode(_decode(text))
     except RecursionError as error:
         raise MalformedError("nested too deeply") from error

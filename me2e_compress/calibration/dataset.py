@@ -289,8 +289,7 @@ class CalibrationSet:
         An array that is missing, unknown, of another shape or dtype, or not finite is a
         FramesError.
         """
-        # Constants, by `freeze-inputs` or in the file, may be there with the same
-        # values
+        # Constants may be there, with the same values
         frozen, weights = frozen_inputs(model), model.graph.initializers
         inputs = [str(value.name) for value in model.graph.inputs]
         for name in self.pixels:

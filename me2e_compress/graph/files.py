@@ -281,6 +281,12 @@ def _read_external(model: ir.Model, path: Path) -> None:
                 node.attributes[name] = ir.AttrTensors(name, tensors)
 
 
+def is_beside(path: Path, file: Path) -> bool:
+    """Return whether a path is in the folder of a file, or of what that links to."""
+    homes = os.path.realpath(file.parent), Path(os.path.realpath(file)).parent
+    return any(Path(os.path.realpath(path)).is_relative_to(home) for home in homes)
+
+
 def data_file(model: Path, tensor: ir.ExternalTensor) -> Path:
     """Find the file with a tensor's data; a GraphError if it is outside the folder."""
     # The rule is onnxruntime's: a relative path, and a link must stay in the model's
@@ -292,8 +298,7 @@ def data_file(model: Path, tensor: ir.ExternalTensor) -> Path:
             " path within the model's folder: not read"
         )
     resolved = Path(os.path.realpath(model.parent / location))
-    homes = (os.path.realpath(model.parent), Path(os.path.realpath(model)).parent)
-    if not any(resolved.is_relative_to(home) for home in homes):
+    if not is_beside(resolved, model):
         raise GraphError(
             f"{model}: the data of {tensor.name} lie at {location!r} = {resolved},"
             " outside the model's folder: not read"

@@ -223,8 +223,7 @@ def sole_reader(value: ir.Value) -> ir.Node | None:
     uses = value.uses()
     if len(uses) != 1 or value.is_graph_output():
         return None
-    # A reader in another graph than the maker, the body of an If or Loop, may run never
-    # or often
+    # A reader in the body of an If or Loop may run never, or often
     node, made = next(iter(uses)).node, value.producer()
     return node if made is None or made.graph is node.graph else None
 
@@ -284,8 +283,7 @@ def constant_values(model: ir.Model) -> frozenset[ir.Value]:
     """Return the initializers and all values computed only from them."""
     weights = model.graph.initializers.values()
     constants = {value for value in weights if not value.is_graph_input()}
-    # Nodes with a body, calls of functions and operators of other domains count as not
-    # constant
+    # Bodies, calls of functions and operators of other domains count as not constant
     for node in model.graph:
         plain = is_standard(node) and not draws(node) and not has_subgraph(node)
         if plain and constants.issuperset(filter(None, node.inputs)):

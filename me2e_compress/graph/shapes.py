@@ -119,8 +119,7 @@ def _adopt(
     graph: ir.Graph, inferred: onnx.GraphProto, interface: set[ir.Value]
 ) -> None:
     """Copy inferred types and shapes to the values of a graph and its subgraphs."""
-    # Only these are read: deserializing the whole graph would take as long as the
-    # inference
+    # To deserialize the whole graph would take as long as the inference
     known = {info.name: info for info in (*inferred.value_info, *inferred.output)}
     for node, written in zip(graph, inferred.node, strict=True):
         for value in node.outputs:

@@ -78,8 +78,7 @@ def unknown_nodes(model: ir.Model) -> Iterator[ir.Node]:
             domain = "" if is_standard(node) else node.domain
             if (domain, node.op_type) in known:
                 continue
-            # Nodes in the toolkit's own domain are included although they may have a
-            # body
+            # Nodes in the toolkit's own domain are included, whether they have a body
             if node.op_identifier() not in model.functions or domain == OWN_DOMAIN:
                 yield node
 

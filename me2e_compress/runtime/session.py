@@ -417,8 +417,7 @@ def feed_forward(
     memory = dict(state or {})
     for frame in frames:
         # At the start of a scene a recurrent input comes from the frame or is zeros;
-        # afterwards it is the output of the previous frame, even if the frame has an
-        # array
+        # later it is the last output, whatever the frame has
         if frame.starts_scene:
             memory = session.first_state(frame.arrays)
         inputs = {**frame.arrays, **memory}

@@ -150,8 +150,7 @@ class JoinedStack:
         """Return the source of an input: an edge, a state or an output of that name."""
         if taker in edges:
             return edges[taker]
-        # A state is an input of the stack; otherwise the one output of that name feeds
-        # it
+        # A state is an input of the stack; else the one output of that name is meant
         declared = self.parts[taker.part].recurrent().get(taker.name)
         givers = [end for end in self.outputs if end.name == taker.name]
         givers = [end for end in givers if end.part != taker.part]

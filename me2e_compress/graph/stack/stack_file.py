@@ -2,7 +2,6 @@
 
 import dataclasses
 import json
-import os
 import re
 from collections.abc import Mapping
 from pathlib import Path
@@ -13,7 +12,7 @@ import pydantic
 
 from me2e_compress.base import documents
 from me2e_compress.base.errors import GraphError
-from me2e_compress.graph.files import load
+from me2e_compress.graph.files import is_beside, load
 from me2e_compress.graph.recurrence import SessionPort, declared_pairs, port_of
 
 _NAME = re.compile(r"[A-Za-z0-9_-]+")
@@ -96,9 +95,7 @@ class Part:
     def load(cls, entry: PartEntry, toml: Path) -> Self:
         """Read a file; GraphError if it is missing, no graph, or outside the folder."""
         path, file = toml.parent / entry.file, entry.file
-        real = Path(os.path.realpath(path))
-        homes = os.path.realpath(toml.parent), Path(os.path.realpath(toml)).parent
-        if file.is_absolute() or not any(real.is_relative_to(home) for home in homes):
+        if file.is_absolute() or not is_beside(path, toml):
             raise GraphError(f"{file} is outside the folder of the stack: not read")
         model = load(path)
         inputs, outputs = (

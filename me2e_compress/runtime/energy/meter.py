@@ -38,33 +38,6 @@ SAMPLED_S = 0.02
 FEWEST_SAMPLES = 20
 
 
-class PowerSamples:
-    """Timed samples of a reader's power; ``clock`` returns seconds."""
-
-    def __init__(self, reader: Reader, clock: Callable[[], float]) -> None:
-        self._reader, self._clock = reader, clock
-        self._taken = list[tuple[float, float]]()
-
-    def add(self) -> None:
-        """Sample the power once."""
-        self._taken.append((self._clock(), self._reader.watts()))
-
-    def joules(self, begin_s: float, end_s: float) -> float:
-        """Return the energy between two times; an EnergyError of too few samples."""
-        times, watts = np.array(self._taken or [(0.0, 0.0)]).T
-        count = sum(begin_s <= time_s <= end_s for time_s, _ in self._taken)
-        if count < FEWEST_SAMPLES:
-            raise EnergyError(
-                f"{self._reader.counter} of {self._reader.device}: power was read"
-                f" {count} times in {end_s - begin_s:.1f} s, at least {FEWEST_SAMPLES}"
-                " are needed"
-            )
-        so_far = integrate_power(times, watts)
-        return float(
-            np.interp(end_s, times, so_far) - np.interp(begin_s, times, so_far)
-        )
-
-
 @contextlib.contextmanager
 def call_repeatedly(period_s: float, call: Callable[[], None]) -> Iterator[None]:
     """Call a function periodically in a thread while the context is open."""
@@ -117,7 +90,7 @@ class EnergyMeter:
         self._clock, self._sleep, self._every = clock, sleep, every
         self._on_window = on_window
         self._random = np.random.default_rng(self._schedule.seed)
-        self._power = PowerSamples(reader, clock)
+        self._power = list[tuple[float, float]]()  # seconds and watts
 
     def measure(self, work: Mapping[str, Work]) -> dict[str, EnergyResult]:
         """Measure models in turn; ``work`` maps each name to what runs one frame."""
@@ -129,7 +102,7 @@ class EnergyMeter:
         with (
             contextlib.nullcontext()
             if reader.counts
-            else self._every(SAMPLED_S, self._power.add)
+            else self._every(SAMPLED_S, self._sample_power)
         ):
             # The idle device with the models loaded, then a warm-up of all together
             idle = [self._window(0, rest)]
@@ -156,12 +129,23 @@ class EnergyMeter:
             for name in work
         }
 
+    def _sample_power(self) -> None:
+        self._power.append((self._clock(), self._reader.watts()))
+
     def _integrated(self, window: Window) -> Window:
         """Return a window with its integrated power where no joules are counted."""
-        if self._reader.counts:
+        reader, begin_s, end_s = self._reader, window.begin_s, window.end_s
+        if reader.counts:
             return window
-        joules = self._power.joules(window.begin_s, window.end_s)
-        return dataclasses.replace(window, joules=joules)
+        count = sum(begin_s <= time_s <= end_s for time_s, _ in self._power)
+        if count < FEWEST_SAMPLES:
+            raise EnergyError(
+                f"{reader.counter} of {reader.device}: power was read {count} times in"
+                f" {end_s - begin_s:.1f} s, at least {FEWEST_SAMPLES} are needed"
+            )
+        times, watts = np.array(self._power).T
+        so_far = np.interp([begin_s, end_s], times, integrate_power(times, watts))
+        return dataclasses.replace(window, joules=float(so_far[1] - so_far[0]))
 
     def _window(self, frames: int, wait: Callable[[], object]) -> Window:
         """Measure what happens meanwhile, without joules where power is integrated."""
