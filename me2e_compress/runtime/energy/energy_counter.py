@@ -98,21 +98,14 @@ class EnergyRecording:
     counter: str
 
     def measured(self, schedule: EnergySchedule) -> EnergyResult:
-        """Return the energy of the model; raises as :meth:`cut_windows` does."""
-        step_s = float(np.median(np.diff(self.times_s)))
-        by = (self.counter, self.device, self.scope, step_s)
-        return summarise(self.cut_windows(schedule), by, self.idle_w(schedule))
-
-    def cut_windows(self, schedule: EnergySchedule) -> list[Window]:
-        """Cut windows in a row after the warm-up; an EnergyError of too few."""
-        # Find the stretch in which frames are done, and skip the warm-up.
+        """Return the energy of the model; an EnergyError of too few windows."""
+        # Find the stretch in which frames are done, and skip the warm-up
         working = np.flatnonzero(np.diff(self.frames) > 0)
         if not len(working):
             raise EnergyError("energy recording: no frame is done in it")
-        times, last = self.times_s, int(working[-1]) + 1
-        start = times[int(working[0])] + schedule.warm_up_s
-        at = int(np.searchsorted(times, start))
-        # Cut windows, long enough and of enough frames, until the rest is too short.
+        times, first, last = self.times_s, int(working[0]), int(working[-1]) + 1
+        at = int(np.searchsorted(times, times[first] + schedule.warm_up_s))
+        # Cut windows, long enough and of enough frames, until the rest is too short
         windows = list[Window]()
         while at < last:
             end_by_time = int(np.searchsorted(times, times[at] + schedule.window_s))
@@ -128,19 +121,17 @@ class EnergyRecording:
                 f" and {schedule.window_frames} frames after a warm-up of"
                 f" {schedule.warm_up_s:g} s: at least {FEWEST_WINDOWS} are needed"
             )
-        return windows
-
-    def idle_w(self, schedule: EnergySchedule) -> float | None:
-        """Return the mean watts before and after the work; None if both are short."""
-        working = np.flatnonzero(np.diff(self.frames) > 0)
-        # The stretches before the first frame and after the last.
-        ends = ((0, int(working[0])), (int(working[-1]) + 1, len(self.times_s) - 1))
+        # Idle power is the mean before and after the work, unless both are short
         idle = [
             self._window(begin, end)
-            for begin, end in ends
-            if self.times_s[end] - self.times_s[begin] >= schedule.idle_s
+            for begin, end in ((0, first), (last, len(times) - 1))
+            if times[end] - times[begin] >= schedule.idle_s
         ]
-        return sum(window.watts for window in idle) / len(idle) if idle else None
+        idle_w = sum(window.watts for window in idle) / len(idle) if idle else None
+        step_s = float(np.median(np.diff(times)))
+        return summarise(
+            windows, (self.counter, self.device, self.scope, step_s), idle_w
+        )
 
     def _window(self, begin: int, end: int) -> Window:
         joules = float(self.joules[end] - self.joules[begin])
