@@ -1,10 +1,9 @@
-"""A finished draft takes its place in one step, and several places change as a set.
+"""Files that take their place in one step, several as a set, and bear our mark.
 
-The mark of our files: each says in its first or last bytes that we wrote it.
-
-Such a file may be replaced without a word, and any other only by force. The mark goes
-with a copy of the file and stays when the user edits it; a user who wants to keep a
-file of ours removes the mark or renames the file.
+A file of ours says in its first or last bytes that we wrote it, and may be replaced
+without a word; any other only by force. The mark goes with a copy of the file and stays
+when the user edits it; a user who wants to keep a file of ours removes the mark or
+renames the file.
 """
 
 import contextlib

@@ -72,6 +72,7 @@ def reading(
     except (MalformedError, UnicodeDecodeError) as cause:
         raise error(f"{path}: {otherwise}: {cause}") from cause
     except ValidationError as cause:
+        # Of what does not fit, the first place is named
         first = cause.errors(include_url=False)[0]
         location = ".".join(map(str, first["loc"])) or "the file"
         raise error(f"{path}: {otherwise}: {location}: {first['msg']}") from cause

@@ -137,6 +137,7 @@ class Registry(Generic[T]):
             if not name_in(text):
                 raise self._unknown_name(text) from error
             raise self.error(f"{self.kind}: {error}") from error
+        # The name decides the class, unless the caller knows it
         return self._build(item, cls or self.get(item.name), more)
 
     def parse_all(self, text: str) -> tuple[T, ...]:

@@ -2,15 +2,10 @@
 
 A recording is a folder with one ``.npz`` a frame, keyed by input name and ordered by
 file name, and ``scenes.json``: ``{"scenes": [0, 64, ...]}``, the index of the first
-frame of every scene, and which inputs are pixels (`me2e_compress.calibration.dataset`).
-
-Images in recordings: bytes on disk, normalised when they are fed.
-
-A frame of six 1600 x 928 images has 107 MB as float32 and 27 MB as bytes. A recording
-lists the inputs stored as bytes in ``scenes.json``:
-``{"pixels": {"version": 1, "inputs": {"img": {"mean": ..., "std": ..., ...}}}}``.
-Other inputs are fed unchanged. A reader that does not know the key refuses the bytes,
-since their type and shape do not fit the model.
+frame of every scene. Images may lie there as bytes, and are normalised when they are
+read: six of 1600 x 928 have 107 MB as float32 and 27 MB as bytes. ``scenes.json`` lists
+such inputs: ``{"pixels": {"version": 1, "inputs": {"img": {"mean": ..., ...}}}}``; a
+reader that does not know the key refuses the bytes, whose type and shape do not fit.
 """
 
 import copy

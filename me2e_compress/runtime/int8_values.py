@@ -1,17 +1,4 @@
-"""Let deformable attention read int8 feature maps without dequantizing them.
-
-Half of the kernel's time is spent fetching rows, which int8 makes four times smaller.
-Positions and attention weights stay in float: in int8 they cost 19 to 25 % of the
-result (measured by SparseDriveV2's deployment).
-
-Let int8 products that are read in float run by onnxruntime's faster kernel.
-
-onnxruntime makes a QGemm of a quantized Gemm. It writes the bias to every row of the
-answer first, and adds the products to it; MatMulIntegerToFloat does both while a tile
-lies in the cache, and takes 0.6 to 1.0 of the time
-(``benchmarks/measure/int8_shapes.py``). onnxruntime 1.31 makes one with a bias of no
-pattern of constant scales, so it is written as a graph is opened.
-"""
+"""Rewrite a graph, as it is opened, for kernels that read int8 themselves."""
 
 import dataclasses
 from typing import TypeAlias
@@ -63,6 +50,11 @@ def write_float_products(graph: ir.Graph) -> int:
     Result:  y = MatMulIntegerToFloat(Reshape(x), w, scale of x, scales of w,
                  zero point of x, zero points of w, b)                   b float32 [N]
     """
+    # onnxruntime makes a QGemm of a quantized Gemm. It writes the bias to every row of
+    # the answer first, and adds the products to it; MatMulIntegerToFloat does both
+    # while a tile lies in the cache, and takes 0.6 to 1.0 of the time
+    # (benchmarks/measure/int8_shapes.py). onnxruntime 1.31 makes one with a bias of no
+    # pattern of constant scales
     matches = [match for node in graph if (match := _match_product(node)) is not None]
     names = rewrite.value_names(graph)
     opset = graph.opset_imports[""]
@@ -118,6 +110,9 @@ def use_int8_kernel(node: ir.Node, opset: int, names: set[str] | None) -> None:
     Result: the same Reshape of the integers, read by the int8 kernel; nodes that nobody
         else reads are removed.
     """
+    # Half of the kernel's time is spent fetching rows, which int8 makes four times
+    # smaller. Positions and attention weights stay in float: in int8 they cost 19 to 25
+    # % of the result (measured by SparseDriveV2's deployment)
     value = node.inputs[0]
     assert value is not None
     # Look through reshapes for the integers.
