@@ -200,16 +200,16 @@ def _external_files(path: Path) -> list[Path]:
     return list(dict.fromkeys(files))
 
 
-def file_contains(path: Path, word: bytes) -> bool:
-    """Return whether a file contains some bytes."""
+def file_contains(path: Path, *words: bytes) -> bool:
+    """Return whether a file contains any of these bytes."""
     # Block by block: a mapped file would count as memory of this process
     tail = b""
     with path.open("rb") as stream:
         while block := stream.read(_BLOCK_BYTES):
             window = tail + block
-            if word in window:
+            if any(word in window for word in words):
                 return True
-            tail = window[-len(word) :]
+            tail = window[-max(map(len, words)) :]
     return False
 
 

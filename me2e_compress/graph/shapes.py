@@ -19,6 +19,50 @@ from me2e_compress.graph.nodes import (
     nodes_of,
 )
 
+# Elements that ONNX may propagate in all: about 3 s
+MOST_CARRIED = 1 << 24
+
+# Operators through which ONNX propagates elements, without those that read shapes
+_CARRY = frozenset(
+    {"Add", "Cast", "Concat", "Gather", "Mul", "Slice", "Squeeze", "Sub", "Unsqueeze"}
+)
+# Operators that make vectors whose length is a constant operand
+_FILL = frozenset({"ConstantOfShape", "Expand", "Range", "Tile"})
+
+
+def can_propagate(graph: ir.Graph) -> bool:
+    """Return whether ONNX can propagate the elements of a graph in bounded time."""
+    # ONNX may treat every vector as a shape; one of a billion elements takes minutes
+    # and all memory. Thirty Concats, each of the one before twice, make it of a scalar
+    longest: dict[ir.Value, int] = {}
+    total = 0
+    for node in nodes_in(graph):
+        if node.op_type in _FILL:  # the elements that constants ask for, at most
+            arrays = map(array_of, node.inputs)
+            counts = [array for array in arrays if array is not None]
+            whole = [count for count in counts if count.dtype.kind == "i"]
+            size = math.prod(int(n.max(initial=1)) for n in whole if n.size < 64)
+        elif node.op_type in _CARRY and node.attributes.get_int("axis", 0) in (0, -1):
+            read = [
+                longest.get(value, _length(value)) for value in node.inputs if value
+            ]
+            size = sum(read) if node.op_type == "Concat" else max(read, default=0)
+            total += size
+        else:
+            continue
+        made = node.outputs[0]
+        if made.shape is None or len(made.shape) < 2:
+            longest[made] = max(size, _length(made))
+    return total <= MOST_CARRIED
+
+
+def _length(value: ir.Value) -> int:
+    """Return the length of a vector; 1 if it or its shape is unknown."""
+    if value.shape is None or not len(value.shape):
+        return 1
+    size = value.shape[0] if len(value.shape) == 1 else 0
+    return size if isinstance(size, int) else 1
+
 
 class PluginKnowledge(Protocol):
     """Shapes and costs of plugins and fused operators, which ONNX does not know."""
@@ -73,7 +117,7 @@ def rank_of(value: ir.Value | None) -> int | None:
 def infer_shapes(
     model: ir.Model, *, strict: bool = False, written: onnx.ModelProto | None = None
 ) -> None:
-    """Infer types and shapes with ONNX, in place, with data propagation.
+    """Infer types and shapes with ONNX, in place, with data propagation if possible.
 
     A graph that ONNX cannot infer at all stays as it is. ``strict`` refuses shapes that
     contradict each other; ``written`` is this graph by :func:`without_weights`, None
@@ -101,7 +145,7 @@ def _infer_once(model: ir.Model, strict: bool, written: onnx.ModelProto | None) 
         proto = onnx.shape_inference.infer_shapes(
             without_weights(model) if written is None else written,
             strict_mode=strict,
-            data_prop=True,
+            data_prop=can_propagate(model.graph),
         )
     except (
         onnx.checker.ValidationError,

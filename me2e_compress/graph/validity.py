@@ -38,6 +38,11 @@ PLAIN_INITIALIZERS_SINCE_IR = 4
 LARGEST_VERSION = 2**31 - 1
 LARGEST_ELEMENTS = 2**40
 HIGHEST_RANK = 64
+# Calls of functions in functions: what walks through them goes as deep
+DEEPEST_CALLS = 32
+# Nodes of a graph in which every call stands for what its function holds: ONNX's
+# inference goes through all of them
+MOST_CALLED_NODES = 1_000_000
 
 _ELEMENT_TYPES = frozenset(TensorProto.DataType.values()) - {TensorProto.UNDEFINED}
 _ATTRIBUTE_TYPES = frozenset(onnx.AttributeProto.AttributeType.values()) - {0}
@@ -69,21 +74,10 @@ def check_file(model: onnx.ModelProto) -> bool:
     if not model.graph.output:
         raise GraphError("not an ONNX model (no outputs)")
     _check_text(model)
-    # Functions must be inlinable
     functions = {(f.domain, f.name, f.overload): f for f in model.functions}
     if len(functions) < len(model.functions):
         raise GraphError("two of its functions have one name")
-    calls = {
-        key: functions.keys() & set(map(_called_key, _all_nodes(function.node)))
-        for key, function in functions.items()
-    }
-    try:
-        graphlib.TopologicalSorter(calls).prepare()
-    except graphlib.CycleError as error:
-        name = min(error.args[1])[1]
-        raise GraphError(
-            f"function {name} calls itself, at once or over others"
-        ) from error
+    _check_calls(model.graph, functions)
     # Inputs of the graph have types, other values may
     initializers = {tensor.name for tensor in model.graph.initializer}
     for port in model.graph.input:
@@ -164,6 +158,38 @@ def _check_tensor(tensor: TensorProto, what: str) -> None:
 
 
 Function = tuple[str, str, str]
+
+
+def _check_calls(
+    graph: onnx.GraphProto, functions: Mapping[Function, onnx.FunctionProto]
+) -> None:
+    """Refuse functions that cannot be inlined: in a circle, too deep or too many."""
+
+    def size(nodes: Iterable[onnx.NodeProto]) -> int:
+        return sum(sizes.get(_called_key(node), 1) for node in _all_nodes(nodes))
+
+    sizes, depths = dict[Function, int](), dict[Function, int]()
+    calls = {
+        key: functions.keys() & set(map(_called_key, _all_nodes(function.node)))
+        for key, function in functions.items()
+    }
+    try:
+        # Those that are called come first
+        for key in graphlib.TopologicalSorter(calls).static_order():
+            sizes[key] = size(functions[key].node)
+            depths[key] = max((depths[called] + 1 for called in calls[key]), default=0)
+    except graphlib.CycleError as error:
+        name = min(error.args[1])[1]
+        raise GraphError(
+            f"function {name} calls itself, at once or over others"
+        ) from error
+    if max(depths.values(), default=0) > DEEPEST_CALLS:
+        raise GraphError(f"functions call each other more than {DEEPEST_CALLS} deep")
+    if (nodes := size(graph.node)) > MOST_CALLED_NODES:
+        raise GraphError(
+            f"its functions make {nodes:,} nodes of it, {MOST_CALLED_NODES:,} at most"
+            " are read"
+        )
 
 
 class _NodeChecker:

@@ -7,7 +7,8 @@ the same name and domain twice, which onnxruntime refuses.
 """
 
 import functools
-from collections.abc import Callable, Iterator
+import math
+from collections.abc import Callable, Iterable, Iterator
 
 import numpy as np
 import onnx_ir as ir
@@ -17,8 +18,11 @@ from onnxruntime.capi import onnxruntime_pybind11_state as _native  # pyright: i
 from me2e_compress import graph, operators
 from me2e_compress.base.errors import GraphError, PreconditionError
 from me2e_compress.graph.nodes import (
+    array_of,
+    bodies_of,
     input_at,
     is_standard,
+    unrenamed,
 )
 from me2e_compress.graph.rewrite import add_constant, value_names
 from me2e_compress.operators import OWN_DOMAIN, kernels
@@ -223,12 +227,65 @@ def is_fused(node: ir.Node) -> bool:
     return kernel or operators.find(node) is not None
 
 
+# Most iterations of a loop times those around it: one takes at least 5 us
+MOST_ROUNDS = 1 << 24
+
+
+def why_endless(model: ir.Model) -> str | None:
+    """Describe a loop that would run for minutes or forever; None if none is known."""
+    # Native code runs loops and ignores signals. A condition that is computed at run
+    # time may end one
+    for nodes in (model.graph, *model.functions.values()):
+        if (node := _endless_loop(nodes, 1)) is not None:
+            name = node.name or node.outputs[0].name
+            return f"Loop node {name!r} goes on for more than {MOST_ROUNDS:,} rounds"
+    return None
+
+
+def _endless_loop(nodes: Iterable[ir.Node], rounds: float) -> ir.Node | None:
+    """Return a loop of more iterations than allowed, within loops of ``rounds``."""
+    for node in nodes:
+        if not (bodies := bodies_of(node)):
+            continue
+        inside = rounds * _iterations(node)
+        if inside > MOST_ROUNDS:
+            return node
+        for body in bodies:
+            if (inner := _endless_loop(body, inside)) is not None:
+                return inner
+    return None
+
+
+def _iterations(node: ir.Node) -> float:
+    """Return the iterations of a loop if constants alone decide them; else 1."""
+    if node.op_type != "Loop" or not is_standard(node):
+        return 1
+    (body,) = bodies_of(node)
+    if len(body.inputs) < 2 or not body.outputs:
+        return 1
+    # Both conditions must be constantly true, or passed through unchanged
+    goes_on, first = unrenamed(body.outputs[0]), input_at(node, 1)
+    conditions = [] if first is None else [unrenamed(first)]
+    if goes_on is not body.inputs[1]:
+        conditions.append(goes_on)
+    for array in map(array_of, conditions):
+        if array is None or array.size != 1 or not array.item():
+            return 1
+    most = input_at(node, 0)
+    if most is None:
+        return math.inf
+    count = array_of(most)
+    return 1 if count is None or count.size != 1 else max(0, int(count.item()))
+
+
 def why_unsupported(model: ir.Model, provider: Provider = CPU) -> str | None:
-    """Return why a graph cannot be run; None if every operator is known.
+    """Return why a graph cannot be run; None if operators are known and loops end.
 
     A known operator may still lack a kernel for its element type; only building a
     :class:`~me2e_compress.runtime.session.Session` shows it.
     """
+    if reason := why_endless(model):
+        return reason
     # Fused operators are supported: a kernel or a body runs them
     unknown = {
         f"{node.domain or 'ai.onnx'}::{node.op_type}": node

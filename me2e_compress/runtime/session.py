@@ -75,7 +75,7 @@ def open_file(
     if not path.is_file():
         raise GraphError(f"{path}: no such file")
     # Most files open directly: to load one takes ten times as long as to search it.
-    if not file_contains(path, _OWN_NODE_BYTES):
+    if not file_contains(path, _OWN_NODE_BYTES, _LOOP_BYTES):
         try:
             return _open_with_retry(str(path), options, provider, without), {}
         except GraphError:
@@ -87,6 +87,8 @@ def open_file(
 
 # Bytes of a node in the toolkit's own domain; onnxruntime would run its body
 _OWN_NODE_BYTES = b":\x04me2e"
+# Bytes of a node that may never end: loaded, it is checked
+_LOOP_BYTES = b'"\x04Loop'
 
 
 def open_graph(

@@ -10,12 +10,40 @@ from onnx import TensorProto
 
 from me2e_compress import graph
 from me2e_compress.base.errors import GraphError
+from me2e_compress.graph.shapes import can_propagate, infer_shapes, static_shape
 from me2e_compress.graph.summary import macs
 from me2e_compress.manager.equivalence import random_outputs
 from tests.support.calls import calls
 from tests.support.nets import parsed
 
 OPSETS = 'opset_import: ["" : 17, "own" : 1]'
+
+
+def calling(count: int, times: int, path: Path) -> Path:
+    """Write a graph of functions, each of which calls the next so many times."""
+    text = f"<ir_version: 9, {OPSETS}>\n"
+    text += "g (float[4] x) => (float[4] y) { y = own.f0(x) }"
+    for at in range(count + 1):
+        asked = [f"a{i + 1} = own.f{at + 1}(a{i})" for i in range(times)]
+        body = " ".join(asked if at < count else [f"a{times} = Relu(a0)"])
+        text += f'\n<domain: "own", {OPSETS}>\nf{at} (a0) => (a{times}) {{ {body} }}'
+    onnx.save(onnx.parser.parse_model(text), path)
+    return path
+
+
+@pytest.mark.parametrize(
+    ("count", "times", "message"),
+    [
+        (30, 2, "make 1,073,741,824 nodes of it, 1,000,000"),
+        (400, 1, "call each other more than 32 deep"),
+    ],
+)
+def test_functions_beyond_the_bounds_are_not_read(
+    tmp_path: Path, count: int, times: int, message: str
+) -> None:
+    with pytest.raises(GraphError, match=message):
+        graph.load(calling(count, times, tmp_path / "m.onnx"))
+    assert len(graph.load(calling(12, 2, tmp_path / "m.onnx")).functions) == 13
 
 
 def nested(depth: int) -> ir.Model:
@@ -37,6 +65,35 @@ def test_macs_and_draws_of_nested_loops_take_a_walk_a_level() -> None:
     assert (macs(scan), random_outputs(model)) == (0, ())
     assert calls(lambda: macs(scan)) < 20_000
     assert calls(lambda: random_outputs(model)) < 20_000
+
+
+DOUBLED = """
+<ir_version: 9, opset_import: ["" : 17]>
+g (float[1024] x) => (float[n] y) {{
+    {}
+    y = Relu(c{})
+}}
+"""
+
+
+def doubled(times: int) -> ir.Model:
+    """Return a graph of Concats, each of the one before twice."""
+    lines = [f"c{at + 1} = Concat<axis = 0>(c{at}, c{at})" for at in range(times)]
+    return ir.from_onnx_text(DOUBLED.format("\n".join(["c0 = Relu(x)", *lines]), times))
+
+
+def test_vectors_that_double_are_not_carried_along() -> None:
+    model = doubled(30)
+    assert not can_propagate(model.graph)
+    infer_shapes(model)
+    assert static_shape(model.graph[30].outputs[0]) == (1024 << 30,)
+    assert can_propagate(doubled(4).graph)
+    made = ir.from_onnx_text(
+        '<ir_version: 9, opset_import: ["" : 17]>\n'
+        "g () => (int64[n] y) <int64[1] size = {9999999999}> {"
+        " a = ConstantOfShape(size) y = Cast<to = 7>(a) }"
+    )
+    assert not can_propagate(made.graph)
 
 
 def with_tensors(path: Path) -> Path:

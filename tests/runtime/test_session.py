@@ -5,9 +5,11 @@ import numpy as np
 import onnx_ir as ir
 import pytest
 
+from me2e_compress import graph
 from me2e_compress.base.errors import FramesError, GraphError
 from me2e_compress.graph.nodes import constant_values
 from me2e_compress.runtime.frames import Array, Frame
+from me2e_compress.runtime.runnable import why_endless
 from me2e_compress.runtime.session import Session, feed_forward, replay
 from me2e_compress.targets.weights import evaluate_constants
 from tests.support.nets import parsed
@@ -129,3 +131,60 @@ def test_the_graph_as_onnxruntime_rewrites_it_computes_the_same(tmp_path: Path) 
 
     assert again["y"].tolist() == [0, 2]
     assert [node.op_type for node in ir.load(path).graph] == ["Relu"]
+
+
+# Loops that constants keep going are refused; those that may end are not.
+
+
+LOOP = """
+g (float[4] x) => (float[4] y)
+<bool first = {{{first}}}, int64 most = {{{most}}}> {{
+    ["loop"] y = Loop ({rounds}, first, x) <body = round (
+        int64 at, bool before, float[4] a
+    ) => (bool on, float[4] b) {{
+        b = Relu(a)
+        {on}
+    }}>
+}}
+"""
+SAME, TRUE = "on = Identity(before)", "on = Constant<value = bool {1}>()"
+MAY_END = "s = ReduceSum<keepdims = 0>(b) z = Sub(s, s) on = Less(z, s)"
+
+
+def loop(most: int, on: str = SAME, rounds: str = "most", first: int = 1) -> ir.Model:
+    return parsed(LOOP.format(most=most, on=on, rounds=rounds, first=first))
+
+
+@pytest.mark.parametrize(
+    "model",
+    [loop(2**62), loop(2**62, TRUE), loop(1, rounds=""), loop(1, TRUE, rounds="")],
+    ids=["same", "true", "no limit", "true without limit"],
+)
+def test_a_loop_without_end_is_not_run(model: ir.Model, tmp_path: Path) -> None:
+    graph.save(model, tmp_path / "m.onnx")
+    for source in (model, tmp_path / "m.onnx"):
+        with pytest.raises(GraphError, match="'loop' goes on for more than 16,777,216"):
+            Session(source)
+
+
+@pytest.mark.parametrize(
+    "model",
+    [loop(2**62, MAY_END), loop(100), loop(2**62, first=0)],
+    ids=["it may end", "few rounds", "it never begins"],
+)
+def test_a_loop_that_may_end_is_run(model: ir.Model) -> None:
+    assert why_endless(model) is None
+
+
+INNER = """b = Loop (most, first, a) <body = inner (
+            int64 i, bool c, float[4] d
+        ) => (bool e, float[4] f) {
+            f = Relu(d)
+            e = Identity(c)
+        }>"""
+
+
+def test_loops_in_loops_count_together() -> None:
+    text = LOOP.format(most=1 << 13, on=SAME, rounds="most", first=1)
+    assert why_endless(parsed(text)) is None
+    assert why_endless(parsed(text.replace("b = Relu(a)", INNER)))
