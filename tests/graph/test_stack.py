@@ -62,6 +62,22 @@ def test_state_metadata_and_edges_are_what_the_toml_says(tmp_path: Path) -> None
     assert bevs(path, True, False) == [2.0, 3.0]
 
 
+def test_metadata_of_the_files_that_agree_are_joined(tmp_path: Path) -> None:
+    path = write_stack(tmp_path)
+    said = {  # by the head, which comes first, and the backbone
+        "me2e.sets": ('{"plan": 1}', '{"feats": 0}', '{"plan": 1, "feats": 0}'),
+        "other": ('{"a": 1, "b": 1}', '{"a": 2}', '{"a": 2}'),
+        "text": ("head", "backbone", "backbone"),
+    }
+    for at, part in enumerate(("head", "backbone")):
+        model = graph.load(tmp_path / f"{part}.onnx")
+        model.metadata_props.update({key: each[at] for key, each in said.items()})
+        graph.save(model, tmp_path / f"{part}.onnx")
+
+    metadata = JoinedStack.load(path).model.metadata_props
+    assert {key: metadata[key] for key in said} == {k: v[2] for k, v in said.items()}
+
+
 def again(
     stack: JoinedStack,
     folder: Path,

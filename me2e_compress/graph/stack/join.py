@@ -9,6 +9,7 @@ from typing import NamedTuple, Self
 
 import onnx_ir as ir
 
+from me2e_compress.base import documents
 from me2e_compress.base.errors import GraphError
 from me2e_compress.graph.nodes import STANDARD, graphs_of, nodes_of, opset_of
 from me2e_compress.graph.recurrence import RECURRENT, SessionPort, recurrence
@@ -84,9 +85,7 @@ class JoinedStack:
         # One graph, with the states in its metadata
         self.model = _merged(self)
         pairs = {name: self.recurrent.get(name) for name in self.inputs}
-        for file in parts.values():  # a later file wins, and the TOML
-            self.model.metadata_props.update(file.model.metadata_props)
-        self.model.metadata_props.update(content.metadata)
+        self.model.metadata_props.update(_metadata(parts) | content.metadata)
         self.model.metadata_props[RECURRENT] = json.dumps(pairs)
 
     @classmethod
@@ -273,6 +272,26 @@ def _form(port: SessionPort) -> str:
     """Describe type and shape: ``float [1, 6, 2]``."""
     element = port.type.removeprefix("tensor(").removesuffix(")")
     return f"{element} {list(port.shape)}"
+
+
+def _metadata(parts: Parts) -> dict[str, str]:
+    """Merge metadata: JSON objects that agree are joined, else a later file wins."""
+
+    def table(text: str) -> dict[str, object]:
+        try:
+            value = documents.from_json(text)
+        except documents.MalformedError:
+            return {}
+        return value if isinstance(value, dict) else {}
+
+    # Each file may speak of its own outputs under one key, as in `me2e.sets`
+    merged = dict[str, str]()
+    for file in parts.values():
+        for key, text in file.model.metadata_props.items():
+            before, now = table(merged.get(key, "")), table(text)
+            agree = before and now and before | now == now | before
+            merged[key] = json.dumps(before | now) if agree else text
+    return merged
 
 
 def _merged(stack: JoinedStack) -> ir.Model:
