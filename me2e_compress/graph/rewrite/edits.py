@@ -202,6 +202,17 @@ def lift_constants(model: ir.Model) -> int:
     before = _constants(model)
     if not before:
         return 0
+    # onnx-ir encodes the short forms of text as ASCII; a tensor holds any text
+    for node in before:
+        for name in ("value_string", "value_strings"):
+            if name in node.attributes:
+                texts = np.array(node.attributes.pop(name).value, dtype=object)
+                tensor = ir.StringTensor(
+                    [text.encode() for text in texts.flat],
+                    shape=ir.Shape(texts.shape),
+                    name=node.outputs[0].name,
+                )
+                node.attributes["value"] = ir.AttrTensor("value", tensor)
     common.LiftConstantsToInitializersPass(lift_all_constants=True, size_limit=0)(model)
     return len(before) - len(_constants(model))
 
