@@ -81,8 +81,8 @@ HOST_STAGES: Registry[HostStage] = Registry(
 
 Floats = npt.NDArray[np.float64]
 
+# Side of a cell of UniAD's occupancy, which its weight of a cell is made for
 UNIAD_CELL_M = 0.5
-"""Side of a cell of UniAD's occupancy, which its weight of a cell is made for."""
 
 
 @dataclass(frozen=True)

@@ -87,11 +87,9 @@ POLICIES: Registry[Driver] = Registry(
     },
 )
 
-MODEL = "onnx"
-"""The policy of a text that is a path."""
+MODEL = "onnx"  # the policy of a text that is a path
 
-PYTHON = "python"
-"""The policy of a text ``package.module:function``."""
+PYTHON = "python"  # the policy of a text ``package.module:function``
 
 _MEMBERS = ("needs_images", "privileged", "reset", "plan")
 _FACTORY = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_]\w*")

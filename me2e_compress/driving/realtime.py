@@ -16,8 +16,7 @@ from typing import Generic, TypeVar
 
 from me2e_compress.base.errors import EvaluationError
 
-DT_US = 50_000
-"""Step of the benchmark's simulators: 20 Hz."""
+DT_US = 50_000  # step of the benchmark's simulators: 20 Hz
 
 T = TypeVar("T")
 
@@ -25,12 +24,11 @@ T = TypeVar("T")
 class LatencyModel(StrEnum):
     """What a latency does to the controls; results under different ones are apart."""
 
+    # One decision at a time: those due meanwhile are dropped (equation 4)
     DROP = "drop"
-    """One decision at a time: those due meanwhile are dropped (equation 4)."""
+    # A decision every frame, each acting ceil(t / dt) frames later, in their order: the
+    # "delayed control execution through FIFO action buffering" of Bench2Drive-Robust
     FIFO = "fifo"
-    """A decision every frame, each acting ceil(t / dt) frames later, in their order:
-    the "delayed control execution through FIFO action buffering" of
-    Bench2Drive-Robust."""
 
 
 def skipped_decisions(latency_us: int, dt_us: int = DT_US) -> int:

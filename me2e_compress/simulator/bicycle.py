@@ -8,8 +8,7 @@ centre moves along ``heading + b``, not along the heading, where the slip angle 
 
 import math
 
-MAX_STEERING_RAD = 0.6
-"""Largest angle of the ego's front wheels."""
+MAX_STEERING_RAD = 0.6  # largest angle of the ego's front wheels
 
 
 def slip_of(steering_rad: float) -> float:

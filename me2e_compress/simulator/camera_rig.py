@@ -18,12 +18,11 @@ from me2e_compress.base.errors import EvaluationError
 
 Floats = npt.NDArray[np.float64]
 
-SUBPIXEL_BITS = 4
-"""Binary digits behind the point in what OpenCV is given to draw."""
+SUBPIXEL_BITS = 4  # binary digits behind the point in what OpenCV is given to draw
 CAMERA_HEIGHT_M = 1.6
+# Row of the horizon as a part of the image height: nuScenes-like crops show more road
+# than sky. The cameras look along the horizon (no pitch, no roll).
 HORIZON = 0.42
-"""Row of the horizon as a part of the image height: nuScenes-like crops show more
-road than sky. The cameras look along the horizon (no pitch, no roll)."""
 SIDES_PX = (16, 4096)
 CameraName = Literal[
     "FRONT", "FRONT_LEFT", "FRONT_RIGHT", "BACK", "BACK_LEFT", "BACK_RIGHT"
@@ -46,6 +45,7 @@ class Camera:
     y_m: float
 
 
+# Order, yaws and fields of view of nuScenes' six cameras (Caesar et al., 2020)
 CAMERAS = (
     Camera("FRONT", 0, 70, 1.5, 0.0),
     Camera("FRONT_LEFT", 55, 70, 1.3, 0.5),
@@ -54,7 +54,6 @@ CAMERAS = (
     Camera("BACK_LEFT", 110, 70, 0.8, 0.5),
     Camera("BACK_RIGHT", -110, 70, 0.8, -0.5),
 )
-"""Order, yaws and fields of view of nuScenes' six cameras (Caesar et al., 2020)."""
 CAMERA_NAMES = tuple(camera.name for camera in CAMERAS)
 
 
@@ -161,8 +160,8 @@ class Weather:
 CLEAR = Weather()
 
 
+# Weather of routes: a third of them have some
 DRAWN = ("clear",) * 8 + ("rain", "night", "fog", "dirt")
-"""Weather of routes: a third of them have some."""
 
 
 def drawn_weather(kind: str, strength: float, seed: int) -> Weather:

@@ -34,15 +34,13 @@ Bytes = npt.NDArray[np.uint8]
 Floats = npt.NDArray[np.float64]
 Colour = tuple[int, int, int]
 
+# As in nuScenes' figures. Rear images are not mirrored: in BACK, what is to the left of
+# the car is to the right of the image.
 MONTAGE = (("FRONT_LEFT", "FRONT", "FRONT_RIGHT"), ("BACK_LEFT", "BACK", "BACK_RIGHT"))
-"""As in nuScenes' figures. Rear images are not mirrored: in BACK, what is to the left
-of the car is to the right of the image."""
+# Pixels: width of a camera's tile, between two pictures, height of a line of text
 TILE, GAP, CAPTION = 320, 4, 30
-"""Pixels: width of a camera's tile, between two pictures, height of a line of text."""
-COLOURS = 256
-"""Colours of an animation's palette."""
-FINE = 2
-"""The view from above is drawn so much larger, then reduced: smooth edges."""
+COLOURS = 256  # colours of an animation's palette
+FINE = 2  # the view from above is drawn so much larger, then reduced: smooth edges
 AHEAD_M, BEHIND_M = 50.0, 22.0
 SCALE_BAR_M = 10.0
 # the colours of a paper figure: light, few

@@ -10,8 +10,7 @@ import numpy.typing as npt
 Floats = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
 Point = tuple[float, float]
-SPACING_M = 1.0
-"""Distance between two points of a route, as Bench2Drive's dense routes."""
+SPACING_M = 1.0  # distance between two points of a route, as Bench2Drive's dense routes
 
 
 class Command(IntEnum):
@@ -56,8 +55,8 @@ class Roadmap:
 
     lanes: tuple[Lane, ...]
     stop_lines: tuple[tuple[Point, Point], ...] = ()
+    # Four corners each, in order around the rectangle
     crosswalks: tuple[tuple[Point, Point, Point, Point], ...] = ()
-    """Four corners each, in order around the rectangle."""
 
     def outside_m(self, x: float, y: float) -> float:
         """Return the metres from a point to the nearest lane's edge, 0 inside one."""

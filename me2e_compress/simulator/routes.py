@@ -21,6 +21,7 @@ from me2e_compress.base.atomic import IN_JSON, write_bytes
 from me2e_compress.base.errors import EvaluationError
 from me2e_compress.metrics.bench2drive import TRAFFIC_SIGNS
 
+# Name, simulated seconds of the expert (mean of five routes), abilities
 _TYPES: tuple[tuple[str | int, ...], ...] = (
     ("Accident", 12, "Overtaking"),
     ("AccidentTwoWays", 18, "Overtaking"),
@@ -67,30 +68,28 @@ _TYPES: tuple[tuple[str | int, ...], ...] = (
     ("VanillaSignalizedTurnEncounterRedLight", 26, TRAFFIC_SIGNS),
     ("VanillaNonSignalizedTurnEncounterStopsign", 25, TRAFFIC_SIGNS),
 )
-"""Name, simulated seconds of the expert (mean of five routes), abilities."""
 
+# Scenario type to its one or two abilities, in Bench2Drive's order
 SCENARIO_ABILITIES: dict[str, tuple[str, ...]] = {
     str(name): tuple(map(str, abilities)) for name, _, *abilities in _TYPES
 }
-"""Scenario type to its one or two abilities, in Bench2Drive's order."""
 
+# Scenario type to how long it typically takes. Only the order in which routes begin and
+# the length of recorded scenes depend on it, never a result.
 EXPERT_S: dict[str, int] = {str(name): int(seconds) for name, seconds, *_ in _TYPES}
-"""Scenario type to how long it typically takes. Only the order in which routes begin
-and the length of recorded scenes depend on it, never a result."""
 
 Parameter = bool | int | float | str
 
+# The routes that ship: 44 scenario types, 5 variants each
 SHIPPED = Path(__file__).with_name("routes_220.json")
-"""The routes that ship: 44 scenario types, 5 variants each."""
 
 
-GENERATION = {"road": 2}
-"""What every route says in a file, and what its digest counts."""
+GENERATION = {"road": 2}  # what every route says in a file, and what its digest counts
+# Key of a set, in its first record: what its routes were when they were admitted
 DIGEST = "set_sha256"
-"""Key of a set, in its first record: what its routes were when they were admitted."""
+# What makes roads and traffic of a route, in the first record of a set and in the
+# manifest of its drives: another version makes another route of it
 VERSION, ROAD_VERSION = "road_version", 1
-"""What makes roads and traffic of a route, in the first record of a set and in the
-manifest of its drives: another version makes another route of it."""
 
 
 @dataclass(frozen=True)

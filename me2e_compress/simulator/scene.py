@@ -23,14 +23,15 @@ class ActorKind(StrEnum):
     EMERGENCY = "emergency"
     BICYCLE = "bicycle"
     PEDESTRIAN = "pedestrian"
-    PARKED = "parked"
-    """A car without a driver; never moves."""
-    DOOR = "door"
-    """The open door of a parked car."""
+    PARKED = "parked"  # a car without a driver; never moves
+    DOOR = "door"  # the open door of a parked car
     CONE = "cone"
     BARRIER = "barrier"
 
 
+# (length, width, height) in metres: nuScenes' mean boxes (the anchor sizes of
+# CenterPoint's nuScenes configuration, github.com/tianweiy/CenterPoint); van and
+# emergency vehicle after a long-wheelbase delivery van; the door is our choice
 DIMENSIONS: dict[ActorKind, tuple[float, float, float]] = {
     ActorKind.CAR: (4.6, 1.95, 1.73),
     ActorKind.VAN: (5.3, 2.0, 2.1),
@@ -43,9 +44,6 @@ DIMENSIONS: dict[ActorKind, tuple[float, float, float]] = {
     ActorKind.CONE: (0.41, 0.41, 1.07),
     ActorKind.BARRIER: (0.5, 2.53, 0.98),
 }
-"""(length, width, height) in metres: nuScenes' mean boxes (the anchor sizes of
-CenterPoint's nuScenes configuration, github.com/tianweiy/CenterPoint); van and
-emergency vehicle after a long-wheelbase delivery van; the door is our choice."""
 
 
 class SignalKind(StrEnum):
@@ -69,8 +67,7 @@ class Control:
     """What the ego's driver asks for; the actuators follow with a lag."""
 
     acceleration_mps2: float
-    steering_rad: float
-    """Front wheel angle, positive to the left."""
+    steering_rad: float  # front wheel angle, positive to the left
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,8 +84,7 @@ class Actor:
     width: float
     height: float
     braking: bool
-    indicator: int
-    """-1 right, 0 off, +1 left."""
+    indicator: int  # -1 right, 0 off, +1 left
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,11 +96,10 @@ class Ego:
     heading: float
     speed_mps: float
     acceleration_mps2: float
-    lateral_acceleration_mps2: float
-    """Positive to the left."""
+    lateral_acceleration_mps2: float  # positive to the left
     yaw_rate_radps: float
+    # Front wheel angle as the actuator holds it, positive to the left
     steering_rad: float
-    """Front wheel angle as the actuator holds it, positive to the left."""
     length: float
     width: float
 
@@ -134,10 +129,9 @@ class Signal:
     kind: SignalKind
     x: float
     y: float
+    # Direction of the traffic that must obey, not the way the lamp faces
     heading: float
-    """Direction of the traffic that must obey, not the way the lamp faces."""
-    state: SignalState | None
-    """None for signs."""
+    state: SignalState | None  # None for signs
     stop_line: tuple[tuple[float, float], tuple[float, float]]
 
 
@@ -154,14 +148,10 @@ class Scene:
 class EventKind(StrEnum):
     """Kinds of events."""
 
-    TRIGGER = "trigger"
-    """A scenario's script began to act."""
-    COLLISION = "collision"
-    """The ego with another body."""
-    ACTOR_COLLISION = "actor_collision"
-    """Two others; never in a well-written scenario."""
-    STRUCK = "struck"
-    """Another body with the standing ego; counts against nobody."""
+    TRIGGER = "trigger"  # a scenario's script began to act
+    COLLISION = "collision"  # the ego with another body
+    ACTOR_COLLISION = "actor_collision"  # two others; never in a well-written scenario
+    STRUCK = "struck"  # another body with the standing ego; counts against nobody
     OUTSIDE_LANES = "outside_lanes"
     RED_LIGHT = "red_light"
     STOP_SIGN = "stop_sign"
@@ -169,12 +159,12 @@ class EventKind(StrEnum):
     YIELD_EMERGENCY = "yield_emergency"
 
 
+# Events that count against the driver
 INFRACTIONS: frozenset[EventKind] = frozenset(EventKind) - {
     EventKind.TRIGGER,
     EventKind.ACTOR_COLLISION,
     EventKind.STRUCK,
 }
-"""Events that count against the driver."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -202,16 +192,13 @@ class PixelClass(IntEnum):
     """Values of the uint8 class rasters seen from above."""
 
     TERRAIN = 1
-    SHOULDER = 2
-    """Paved but no lane."""
+    SHOULDER = 2  # paved but no lane
     DRIVABLE = 3
     LANE_MARKING = 4
     STOP_LINE = 5
-    CROSSWALK = 6
-    """The white bars."""
+    CROSSWALK = 6  # the white bars
     VEHICLE = 7
     BICYCLE = 8
     PEDESTRIAN = 9
-    STATIC = 10
-    """Cones, barriers."""
+    STATIC = 10  # cones, barriers
     EGO = 13

@@ -19,15 +19,14 @@ from me2e_compress.simulator.traffic.bodies import Car, StaticObject, Walker
 from me2e_compress.simulator.traffic.right_of_way import RightOfWay
 from me2e_compress.simulator.traffic.traffic_road import TrafficRoad
 
-DT_US = 50_000
-"""20 Hz, as Bench2Drive."""
+DT_US = 50_000  # 20 Hz, as Bench2Drive
+# Actors decide at 10 Hz whatever the frame rate; they move at the frame rate
 DECISION_US = 100_000
-"""Actors decide at 10 Hz whatever the frame rate; they move at the frame rate."""
+# The ego's centre may be this far outside every lane (OutsideRouteLanesTest)
 TOLERANCE_M = 0.5
-"""The ego's centre may be this far outside every lane (OutsideRouteLanesTest)."""
+# Contact with an ego slower than this is no collision of the ego's, and the route goes
+# on: CollisionTest in Bench2Drive's atomic_criteria.py
 STANDING_MPS = 0.1
-"""Contact with an ego slower than this is no collision of the ego's, and the route
-goes on: CollisionTest in Bench2Drive's atomic_criteria.py."""
 
 
 class World:

@@ -58,8 +58,7 @@ class RecurrentEntry(BaseModel):
 # One input of a graph, made of input sources.
 
 
-LARGEST = 1e30
-"""The largest mean or std: within float32."""
+LARGEST = 1e30  # the largest mean or std: within float32
 Level = Annotated[float, Field(ge=-LARGEST, le=LARGEST)]
 Levels = Level | Annotated[tuple[Level, ...], Field(min_length=1)]
 

@@ -21,8 +21,7 @@ from me2e_compress.base.extras import with_install_hint
 from me2e_compress.driving.contract import DEFAULT_IMAGE_SIZE, Shape, fits
 from me2e_compress.runtime.frames import Array
 
-IMAGE = "me2e.image"
-"""Metadata key: JSON of `ImageNormalization`."""
+IMAGE = "me2e.image"  # metadata key: JSON of `ImageNormalization`
 
 Triple: TypeAlias = tuple[float, float, float]
 
@@ -85,8 +84,8 @@ class ImageNormalization(BaseModel):
 CameraName = Literal[
     "FRONT", "FRONT_LEFT", "FRONT_RIGHT", "BACK", "BACK_LEFT", "BACK_RIGHT"
 ]
+# In the order of `Observation.images`
 CAMERA_NAMES: tuple[CameraName, ...] = get_args(CameraName)
-"""In the order of `Observation.images`."""
 
 Side: TypeAlias = Annotated[int, Field(ge=1, le=8192)]
 Size: TypeAlias = tuple[Side, Side]

@@ -30,13 +30,13 @@ from me2e_compress.runtime.frames import Array
 from me2e_compress.runtime.session import DTYPES, Session, SessionPort
 
 IMAGES: Literal["img"] = "img"
+# Inputs of the contract that are no images, with the sources that feed them
 CONTRACT: Mapping[str, str] = {
     "lidar2img": "lidar2img",
     "can_bus": "can-bus",
     "command": "command",
     "timestamp": "timestamp",
 }
-"""Inputs of the contract that are no images, with the sources that feed them."""
 
 BYTES = "tensor(uint8)"
 

@@ -28,8 +28,7 @@ from me2e_compress.graph.recurrence import (
 from me2e_compress.runtime.plan_adapter import PLAN, PlanAdapter
 from me2e_compress.runtime.session import DTYPES, Session, SessionPort, zero_state
 
-COMMAND = "command"
-"""Name of the navigator's command among the inputs."""
+COMMAND = "command"  # name of the navigator's command among the inputs
 
 
 def plan_read(session: Session, adapter: Adapter) -> PlanAdapter:

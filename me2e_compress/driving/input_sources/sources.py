@@ -233,8 +233,7 @@ class TargetPoint(InputSource):
         return seen.turned(points[0 if self.which == "near" else 1])
 
 
-MICROSECONDS = 1_000_000
-"""Microseconds in a second."""
+MICROSECONDS = 1_000_000  # microseconds in a second
 
 
 @dataclass(frozen=True)
@@ -267,8 +266,7 @@ class UsePrevious(InputSource):
         return np.asarray(int(seen.track.decisions > 1), np.int64)
 
 
-LARGEST = 1e18
-"""The largest value: within int64."""
+LARGEST = 1e18  # the largest value: within int64
 
 
 @dataclass(frozen=True)

@@ -28,15 +28,13 @@ ASPHALT = (98, 98, 101)
 SHOULDER = (116, 112, 105)
 KERB = (138, 134, 124)
 WHITE = (238, 238, 238)
+# A lighter rim around all pavement: where the road ends is seen without a line
 KERB_M = 0.3
-"""A lighter rim around all pavement: where the road ends is seen without a line."""
-LINE_M = 0.2
-"""A little wider than the 0.15 m of real lines: our images are small."""
+LINE_M = 0.2  # a little wider than the 0.15 m of real lines: our images are small
+# 3 m painted, 6 m free, from the start of the lane: the pattern of highway-env
 DASH_M, DASH_PERIOD_M, DASH_STEP_M = 3.0, 9.0, 0.5
-"""3 m painted, 6 m free, from the start of the lane: the pattern of highway-env."""
 STOP_LINE_M = 0.5
-BAR_M, BAR_PERIOD_M = 0.5, 1.0
-"""Zebra bars."""
+BAR_M, BAR_PERIOD_M = 0.5, 1.0  # zebra bars
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,17 +131,17 @@ def paint_crosswalks(plan: GroundPlan, roadmap: Roadmap) -> None:
             plan.strip(bar, BAR_M, WHITE, PixelClass.CROSSWALK)
 
 
+# Metres of a texel at the finest level: a 0.15 m line is just wider than one
 RESOLUTION_M = 0.125
-"""Metres of a texel at the finest level: a 0.15 m line is just wider than one."""
 LEVELS = 6
+# How far the texture reaches beyond the route's bounding box. What lies further repeats
+# its border, which continues a straight road.
 MARGIN_M = 60.0
-"""How far the texture reaches beyond the route's bounding box. What lies further
-repeats its border, which continues a straight road."""
 GRASS = (92, 122, 70)
+# Grey levels of the mottling
 GRASS_GRAIN, ASPHALT_GRAIN = np.float32(10.0), np.float32(3.0)
-"""Grey levels of the mottling."""
+# Metres of a patch, and its share of the mottling
 GRAINS = ((16.0, 0.8), (2.0, 0.6), (0.5, 0.4))
-"""Metres of a patch, and its share of the mottling."""
 ROWS_AT_ONCE = 32
 
 
@@ -233,15 +231,13 @@ def _add_grain(plan: GroundPlan, rng: np.random.Generator) -> None:
 
 Floats32 = npt.NDArray[np.float32]
 
-FARTHEST_M = 400.0
-"""Depth of the last row before the horizon, at most."""
-SKY_M = 4000.0
-"""The sky counts as this far away."""
+FARTHEST_M = 400.0  # depth of the last row before the horizon, at most
+SKY_M = 4000.0  # the sky counts as this far away
+# From these depths (metres) on, a row is the mean of this many samples
 TAPS = ((0.0, 1), (10.0, 4))
-"""From these depths (metres) on, a row is the mean of this many samples."""
+# A mip level is chosen whose texel is this part of a sample's length on the ground:
+# less shimmers, more blurs
 BLUR = 0.5
-"""A mip level is chosen whose texel is this part of a sample's length on the ground:
-less shimmers, more blurs."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -28,8 +28,7 @@ Floats = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.intp]
 Flags = npt.NDArray[np.bool_]
 
-TOUCH_M = 0.05
-"""Footprints that sink into each other by less still count as apart."""
+TOUCH_M = 0.05  # footprints that sink into each other by less still count as apart
 
 
 def painting_order(right: Floats, forward: Floats, visible: Flags) -> tuple[Ints, Ints]:
@@ -108,12 +107,10 @@ def _sorted(behind: Flags) -> list[int]:
 
 Bytes = npt.NDArray[np.uint8]
 
-NEAR_M = 0.2
-"""Polygons are cut at this depth."""
+NEAR_M = 0.2  # polygons are cut at this depth
+# Details whose longer side is less are left out: others, lamps
 LEAST_PX = np.array([2.0, 0.7])
-"""Details whose longer side is less are left out: others, lamps."""
-LIMIT_PX = 20_000.0
-"""Far outside any image, and safe in cv2's fixed-point numbers."""
+LIMIT_PX = 20_000.0  # far outside any image, and safe in cv2's fixed-point numbers
 
 
 @dataclass(frozen=True, eq=False)

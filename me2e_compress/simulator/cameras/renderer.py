@@ -26,17 +26,15 @@ Bytes = npt.NDArray[np.uint8]
 Floats = npt.NDArray[np.float64]
 
 
+# Contrast after d metres of fog is exp(-3 d / visibility): 5 % at the visibility
+# (Koschmieder's law, CIE definition of meteorological optical range)
 KOSCHMIEDER = 3.0
-"""Contrast after d metres of fog is exp(-3 d / visibility): 5 % at the visibility
-(Koschmieder's law, CIE definition of meteorological optical range)."""
 FOG = np.array([206.0, 210.0, 214.0])
-MOONLIGHT = 0.12
-"""Share of the day's light that is left at night = 1."""
+MOONLIGHT = 0.12  # share of the day's light that is left at night = 1
+# Head lamps: light falls to 1/e at this distance and at this bearing (our choice: a
+# dipped beam lights some 40 to 60 m of road)
 BEAM_M, BEAM_RAD = 32.0, 0.45
-"""Head lamps: light falls to 1/e at this distance and at this bearing (our choice:
-a dipped beam lights some 40 to 60 m of road)."""
-DULL = 0.25
-"""Share of the light that heavy rain takes."""
+DULL = 0.25  # share of the light that heavy rain takes
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,13 +100,10 @@ class Atmosphere:
         return np.asarray(np.exp(-KOSCHMIEDER * extinction * distance))
 
 
-RAIN_NOISE = 5.0
-"""Grey levels of noise that heavy rain adds."""
-STREAKS = 60
-"""Streaks in an image in the heaviest rain."""
+RAIN_NOISE = 5.0  # grey levels of noise that heavy rain adds
+STREAKS = 60  # streaks in an image in the heaviest rain
 STREAK_LEVEL = 46
-POOL = 2
-"""The noise comes from a pool of this many sets of images, at a random offset."""
+POOL = 2  # the noise comes from a pool of this many sets of images, at a random offset
 
 
 @dataclass(frozen=True, eq=False)
@@ -161,10 +156,9 @@ class Sensor:
 
 ZENITH, HAZE = (128, 170, 224), (216, 228, 238)
 HILLS, TREES = (122, 146, 142), (66, 94, 60)
-COLUMNS, ROWS = 2880, 64
-"""Panorama: 0.125 degrees a column."""
+COLUMNS, ROWS = 2880, 64  # panorama: 0.125 degrees a column
+# Tangent of the elevation of the panorama's upper edge; above it the sky is even
 TALLEST = 0.1
-"""Tangent of the elevation of the panorama's upper edge; above it the sky is even."""
 
 
 @dataclass(frozen=True, eq=False)

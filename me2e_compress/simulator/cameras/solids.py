@@ -197,10 +197,10 @@ def door() -> Template:
 
 
 POLE_M = 0.06
+# Half width, lower and upper edge. Housing and lamps are half as large again as real
+# ones, so that the colour of a lamp is more than a pixel at 25 m, and hang low enough
+# that a car waiting at the stop line still has all three in an image.
 HOUSING_M = (0.35, 1.3, 2.95)
-"""Half width, lower and upper edge. Housing and lamps are half as large again as real
-ones, so that the colour of a lamp is more than a pixel at 25 m, and hang low enough
-that a car waiting at the stop line still has all three in an image."""
 SIGN_CENTRE_M, SIGN_RADIUS_M = 2.2, 0.5
 FOOT = (-0.2, 0.2)
 
@@ -269,11 +269,11 @@ def _octagon(x: float, radius: float, slot: Slot, *, detail: bool) -> list[Quad]
 
 
 Colour = tuple[int, int, int]
+# What is further from the ego is not drawn: a car is less than 3 px wide there
 FARTHEST_M = 120.0
-"""What is further from the ego is not drawn: a car is less than 3 px wide there."""
+# Half periods: indicators blink 1.4 times a second (60 to 120 a minute by UN Regulation
+# 48), beacons 2.5 times
 BLINK_US, BEACON_US = 350_000, 200_000
-"""Half periods: indicators blink 1.4 times a second (60 to 120 a minute by UN
-Regulation 48), beacons 2.5 times."""
 
 PAINTS: tuple[Colour, ...] = (
     (196, 44, 40),

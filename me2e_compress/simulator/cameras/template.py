@@ -48,8 +48,7 @@ class Quad(NamedTuple):
     corners: Floats
     slot: Slot
     shade: float
-    detail: bool
-    """Lies on another face: not needed from afar, nor for the class raster."""
+    detail: bool  # lies on another face: not needed from afar, nor for the class raster
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,10 +70,9 @@ class Template:
     footprint: Floats
 
 
-FULL = (-0.5, 0.5)
-"""The whole unit box."""
+FULL = (-0.5, 0.5)  # the whole unit box
+# A sun from the upper left; faces differ enough to be told apart
 SHADES = {"top": 1.08, "front": 0.90, "back": 0.78, "left": 0.96, "right": 0.70}
-"""A sun from the upper left; faces differ enough to be told apart."""
 
 
 class Box:

@@ -68,8 +68,8 @@ def parked_car(stage: Stage, street: Street) -> Script:
     yield from meet(stage, s, "parked_car")
 
 
+# Cyclists stay a row that is as short as it begins
 TOGETHER = Behaviour(headway_s=0.4, jam_gap_m=1.5)
-"""Cyclists stay a row that is as short as it begins."""
 
 
 def slow_cyclists(stage: Stage, street: Street) -> Script:
@@ -128,8 +128,7 @@ def spun_car(stage: Stage, street: Street) -> Script:
     stage.ego.grip_mps2 = dry
 
 
-ONCOMING_S = (16.0, 24.0)
-"""Mean gap of the oncoming traffic where one must overtake."""
+ONCOMING_S = (16.0, 24.0)  # mean gap of the oncoming traffic where one must overtake
 
 
 def oncoming_cars(stage: Stage, street: Street) -> Script:
@@ -143,8 +142,8 @@ def oncoming_cars(stage: Stage, street: Street) -> Script:
 
 
 AWAY_MPS = 10.0
+# How slowly, and how long, a car crawls after it has cut in
 CRAWL_MPS, CRAWL_S = 2.2, (4.0, 9.0)
-"""How slowly, and how long, a car crawls after it has cut in."""
 
 
 def hard_brake(stage: Stage, street: Street) -> Script:
@@ -309,10 +308,9 @@ def walkers_on_zebra(stage: Stage, _: Street) -> Script:
     yield from encounter(stage, walkers_at_light(stage), s, "walkers_on_zebra")
 
 
+# Mean number of people who cross at a light, each time it lets them
 WALKERS_A_CYCLE = 2.0
-"""Mean number of people who cross at a light, each time it lets them."""
-LATE = 0.2
-"""Share of them who cross at any time of their phase, even as it ends."""
+LATE = 0.2  # share of them who cross at any time of their phase, even as it ends
 
 
 def walkers_at_light(stage: Stage) -> list[Walker]:
@@ -359,8 +357,8 @@ def bicycle_stream(stage: Stage, crossing: Crossing) -> Script:
     yield from _cross_exit(stage, crossing, "bicycle_stream", *row)
 
 
+# How far from the middle of the road the first cyclist begins
 RIDE_M = LANE_WIDTH_M + 4.0
-"""How far from the middle of the road the first cyclist begins."""
 
 
 def _cross_exit(

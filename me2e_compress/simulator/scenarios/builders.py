@@ -27,21 +27,18 @@ from me2e_compress.simulator.traffic.stage import Script, Stage
 # Background of a route: traffic on every lane, people beside it.
 
 
-FAST_MPS = 13.5
-"""Roads with a higher limit carry more traffic."""
+FAST_MPS = 13.5  # roads with a higher limit carry more traffic
+# Mean time between two cars of a lane, by road class: 340 to 1030 vehicles an hour
 GAP_S, FAST_GAP_S = (6.5, 10.5), (3.5, 6.5)
-"""Mean time between two cars of a lane, by road class: 340 to 1030 vehicles an hour."""
-WALKER_EVERY_M = (11.0, 20.0)
-"""Mean distance between two people beside the road."""
-CYCLIST = 0.25
-"""Share of them who ride."""
+WALKER_EVERY_M = (11.0, 20.0)  # mean distance between two people beside the road
+CYCLIST = 0.25  # share of them who ride
 WALK_MPS, RIDE_MPS = (1.0, 1.7), (3.0, 5.0)
+# People are no farther from the route as they begin, and no more than these
 NEAR_M, MOST = 45.0, 26
-"""People are no farther from the route as they begin, and no more than these."""
+# How far from the edge of a lane people may be; the nearest place off the road
 ASIDE_M = (0.9, 1.5, 2.2, 3.0, 4.0, 5.0)
-"""How far from the edge of a lane people may be; the nearest place off the road."""
+# Metres that a line keeps from every lane, and is shorter at its ends
 OFF_M, END_M = 0.5, 10
-"""Metres that a line keeps from every lane, and is shorter at its ends."""
 
 
 def populate(stage: Stage) -> None:
@@ -165,8 +162,8 @@ Builder = Callable[[Stage], None]
 LEFT, RIGHT, AHEAD = ("left",), ("right",), ("ahead",)
 TURNS = ("left", "right")
 MOVES = ("left", "right", "ahead")
+# The ego comes out of a side road
 SIDE_ROAD = partial(junction, sign=SignalKind.GIVE_WAY, arms=("left", "back", "right"))
-"""The ego comes out of a side road."""
 
 
 def lights(
@@ -193,9 +190,10 @@ def give_way(moves: tuple[str, ...]) -> Callable[[Stage], Crossing]:
 
 
 STRAIGHT_ON = partial(junction, moves=AHEAD)
+# Traffic from the left; the background brings some from the right
 FROM_SIDE = partial(flows.FROM_LEFT, cars=False)
-"""Traffic from the left; the background brings some from the right."""
 
+# A layout, and the scripts that put actors on what it returns, in this order
 SCENARIOS: dict[str, tuple[Callable[..., Any], ...]] = {
     # something stands or crawls in the lane: go round it
     "Accident": (roads.multilane, actors.crashed_cars),
@@ -268,7 +266,6 @@ SCENARIOS: dict[str, tuple[Callable[..., Any], ...]] = {
         flows.stop_sign,
     ),
 }
-"""A layout, and the scripts that put actors on what it returns, in this order."""
 
 
 def stage_of(route: Route, builder: Builder | None = None) -> Stage:

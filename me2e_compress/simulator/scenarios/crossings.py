@@ -20,15 +20,15 @@ from me2e_compress.simulator.traffic.network import (
 from me2e_compress.simulator.traffic.right_of_way import Regulator, SignalPlan
 from me2e_compress.simulator.traffic.stage import Stage
 
+# Counter-clockwise; the ego comes from "back"
 ARMS = ("ahead", "left", "back", "right")
-"""Counter-clockwise; the ego comes from "back"."""
 _TURNS = {"left": Command.LEFT, "right": Command.RIGHT, "ahead": Command.STRAIGHT}
+# Half the side of a one-lane junction: a right turn of 10 m radius, which the ego's
+# bicycle (7.6 m at full lock) can drive
 HALF_M = 12.0
-"""Half the side of a one-lane junction: a right turn of 10 m radius, which the ego's
-bicycle (7.6 m at full lock) can drive."""
 ARM_M = 130.0
+# The stop line is this far before the junction (a crosswalk lies between)
 SETBACK_M = 3.0
-"""The stop line is this far before the junction (a crosswalk lies between)."""
 
 
 @dataclass(frozen=True)
@@ -126,10 +126,9 @@ def signal_junction(
 
 
 GREEN_S = (9.0, 15.0)
-USUAL_MPS = 9.0
-"""The speed for which a plan is said to show a driver red or green."""
+USUAL_MPS = 9.0  # the speed for which a plan is said to show a driver red or green
+# Seconds after green at which the usual driver arrives
 FOUND_S = {SignalState.GREEN: (1.0, 6.0), SignalState.RED: (-9.0, -3.0)}
-"""Seconds after green at which the usual driver arrives."""
 
 
 def crosswalk_junction(stage: Stage, moves: Sequence[str]) -> Crossing:
@@ -209,11 +208,9 @@ def _connect(
 # A roundabout with one ring lane and four arms.
 
 
-RING_M = 17.0
-"""Radius of the ring lane's centre."""
+RING_M = 17.0  # radius of the ring lane's centre
 RING_WIDTH_M = 4.5
-ENTRY_M = 14.0
-"""Radius of the arcs between arms and ring."""
+ENTRY_M = 14.0  # radius of the arcs between arms and ring
 LIMIT_MPS = 11.0
 
 

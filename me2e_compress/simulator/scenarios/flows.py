@@ -22,8 +22,7 @@ from me2e_compress.simulator.traffic.stage import Script, Stage, arrival_times, 
 # Timing of scripts: meeting points, and what waits for the ego.
 
 
-NEAR_M = 30.0
-"""A standing obstacle counts as met when the ego is this close."""
+NEAR_M = 30.0  # a standing obstacle counts as met when the ego is this close
 TOUCH_M = 1.0
 
 
@@ -89,22 +88,18 @@ def keep_clear(stage: Stage, chain: Sequence[LaneIndex], until_s: float) -> None
     stage.clear[chain[0]] = (BEFORE_M - 8.0, BEFORE_M + until_s + 30.0)
 
 
+# Shares of drivers who follow closely and take short gaps, and of slow ones: our choice
 HEEDLESS, SLOW = 0.12, 0.15
-"""Shares of drivers who follow closely and take short gaps, and of slow ones: our
-choice."""
+# Share of drivers of a conflict who obey neither lights nor signs, where some do
 LATE = 0.45
-"""Share of drivers of a conflict who obey neither lights nor signs, where some do."""
+# Share of drivers of a conflict who do not make room for an ego that comes in
 BLIND_TO_EGO = 0.4
-"""Share of drivers of a conflict who do not make room for an ego that comes in."""
-TURNING = 0.4
-"""Share of traffic that turns at a junction."""
+TURNING = 0.4  # share of traffic that turns at a junction
+# The ego and another meet if one is so far before or after the place of the conflict,
+# the other so near to it: the ego waits at a line before it
 AHEAD_M, BEHIND_M, OTHER_M = 25.0, 8.0, 10.0
-"""The ego and another meet if one is so far before or after the place of the conflict,
-the other so near to it: the ego waits at a line before it."""
-END_M = 12.0
-"""Nobody begins so near to the end of the map."""
-EGO_ROOM_M = 14.0
-"""Nobody begins nearer to the ego, bumper to bumper."""
+END_M = 12.0  # nobody begins so near to the end of the map
+EGO_ROOM_M = 14.0  # nobody begins nearer to the ego, bumper to bumper
 
 
 @dataclass(frozen=True)
@@ -252,9 +247,9 @@ def encounter(
                 return
 
 
+# Where the ego sets off what waits for it, and how long that still waits.
+# scenario_runner's actors start when the ego is within a distance; ours is drawn.
 TRIGGER_M, DELAY_S = (18.0, 36.0), (0.0, 1.0)
-"""Where the ego sets off what waits for it, and how long that still waits.
-scenario_runner's actors start when the ego is within a distance; ours is drawn."""
 
 
 def near(stage: Stage, route_s: float) -> Script:
@@ -289,12 +284,12 @@ def platoon(
     yield from across(stage, chain, name, late=late)
 
 
+# Oncoming traffic drives straight on while the ego wants to turn left
 ONCOMING = partial(platoon, name="oncoming_platoon", origin="ahead", to="back")
-"""Oncoming traffic drives straight on while the ego wants to turn left."""
+# Cars come from the left straight into the arm that the ego turns into
 FROM_LEFT = partial(platoon, name="platoon_from_left", origin="left", to="right")
-"""Cars come from the left straight into the arm that the ego turns into."""
+# Cars come from the right into the road that the ego turns left into
 TO_ENTER = partial(platoon, name="platoon_to_enter", origin="right", to="left")
-"""Cars come from the right into the road that the ego turns left into."""
 
 
 def priority_car(stage: Stage, crossing: Crossing) -> Script:
@@ -324,8 +319,7 @@ def ring_flow(stage: Stage, _: Regulator) -> Script:
     yield from across(stage, ring_way("left", to), "ring_flow")
 
 
-DENSE_S = (2.5, 4.0)
-"""Mean gap in the lane that the ego changes into."""
+DENSE_S = (2.5, 4.0)  # mean gap in the lane that the ego changes into
 
 
 def exit_lane_flow(stage: Stage, ramp: Ramp) -> Script:
@@ -364,11 +358,10 @@ def stop_sign(stage: Stage, crossing: Crossing) -> Script:
     yield from meet(stage, sign.line_s or crossing.approach_m, "stop_sign")
 
 
+# Share of the oncoming cars that drive partly in the ego's lane, and how far they reach
+# into it
 INVADING, INTO_M = 0.4, (0.9, 1.2)
-"""Share of the oncoming cars that drive partly in the ego's lane,
-and how far they reach into it."""
-ASIDE_M = 1.1
-"""How far right of its lane's centre traffic keeps there, to have room."""
+ASIDE_M = 1.1  # how far right of its lane's centre traffic keeps there, to have room
 
 
 def invader(stage: Stage, street: Street) -> Script:
@@ -386,11 +379,11 @@ def invader(stage: Stage, street: Street) -> Script:
     yield from encounter(stage, invaders, None, "invader")
 
 
+# Mean gap in the ego's lane where an emergency vehicle comes: others make room
 SPARSE_S = 20.0
-"""Mean gap in the ego's lane where an emergency vehicle comes: others make room."""
+# The ego has not yielded if the vehicle was this close behind for this long, and still
+# is behind at the end: it may come too late to be let by
 HELD_UP_M, HELD_UP_S = 20.0, 4.0
-"""The ego has not yielded if the vehicle was this close behind for this long, and still
-is behind at the end: it may come too late to be let by."""
 
 
 def emergency_behind(stage: Stage, street: Street) -> Script:

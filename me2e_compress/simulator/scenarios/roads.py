@@ -19,8 +19,7 @@ from me2e_compress.simulator.traffic.network import (
 from me2e_compress.simulator.traffic.right_of_way import Regulator, SignalPlan
 from me2e_compress.simulator.traffic.stage import GOAL_M, Stage
 
-BEFORE_M = 60.0
-"""Road behind the ego's start, from where others catch up."""
+BEFORE_M = 60.0  # road behind the ego's start, from where others catch up
 Edge = tuple[str, str]
 
 
@@ -140,11 +139,9 @@ def _lay(
 # Roads without junctions: several lanes one way, one lane each way, with parking.
 
 
-BEYOND_M = 120.0
-"""Road beyond the goal."""
+BEYOND_M = 120.0  # road beyond the goal
 TOTAL_M = BEFORE_M + GOAL_M + BEYOND_M
-PARKING_M = 2.5
-"""Width of a parking lane."""
+PARKING_M = 2.5  # width of a parking lane
 
 
 def straight(stage: Stage) -> tuple[Piece, ...]:
@@ -190,23 +187,23 @@ def street(
     return with_light(stage, road, shoulder_m) if light else road
 
 
+# A straight one-way road of two or three lanes and a narrow shoulder
 multilane = partial(street, limit_mps=14.0, shoulder_m=1.0, several=True)
-"""A straight one-way road of two or three lanes and a narrow shoulder."""
+# A straight one-way road of one lane, without room to overtake
 single_lane = partial(street, limit_mps=14.0, shoulder_m=0.5, light=True)
-"""A straight one-way road of one lane, without room to overtake."""
+# A one-way road of two or three lanes through a bend
 bend = partial(multilane, radius_m=(60.0, 100.0))
-"""A one-way road of two or three lanes through a bend."""
 one_each_way = partial(street, limit_mps=13.0, shoulder_m=0.6, oncoming=1)
+# A straight road, one lane each way; overtaking uses the oncoming lane
 two_way = partial(one_each_way, light=True)
-"""A straight road, one lane each way; overtaking uses the oncoming lane."""
+# A winding road with one lane each way and a paved shoulder
 two_way_bend = partial(
     street, limit_mps=12.0, shoulder_m=1.8, oncoming=1, radius_m=(50.0, 90.0)
 )
-"""A winding road with one lane each way and a paved shoulder."""
+# A street with one lane each way and a parking lane on either side
 parking_street = partial(
     street, limit_mps=12.0, shoulder_m=PARKING_M, oncoming=1, light=True
 )
-"""A street with one lane each way and a parking lane on either side."""
 
 
 def parking_bay(stage: Stage) -> Street:
@@ -232,10 +229,10 @@ def zebra_street(stage: Stage) -> Street:
     return with_light(stage, street, 0.6, s)
 
 
+# Green for the traffic, and for people on foot: they walk 8 m at 1.2 m/s in 6.7 s
 GREEN_S, WALK_S = (14.0, 24.0), 8.0
-"""Green for the traffic, and for people on foot: they walk 8 m at 1.2 m/s in 6.7 s."""
+# A light stands at least so far behind the place of a conflict's beginning
 LIGHT_M = 125.0
-"""A light stands at least so far behind the place of a conflict's beginning."""
 
 
 def with_light(
@@ -285,14 +282,13 @@ def _curve(stage: Stage, tightest: float, widest: float) -> tuple[Piece, ...]:
 
 LIMIT_MPS = 14.0
 RAMP_RADIUS_M = 80.0
+# Sideways distance between the ramp's straight and the lane it becomes
 RAMP_APART_M = 7.0
-"""Sideways distance between the ramp's straight and the lane it becomes."""
+# How far each of its two arcs turns
 RAMP_RAD = math.acos(1 - RAMP_APART_M / (2 * RAMP_RADIUS_M))
-"""How far each of its two arcs turns."""
 RAMP = Section(limit_mps=LIMIT_MPS)
 BESIDE = replace(RAMP, left=LaneMarking.DASHED)
-CHANGE_M = 25.0
-"""Length of a lane change."""
+CHANGE_M = 25.0  # length of a lane change
 
 
 @dataclass(frozen=True)

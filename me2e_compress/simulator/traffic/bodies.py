@@ -16,14 +16,13 @@ from me2e_compress.simulator.scene import DIMENSIONS, ActorKind, Control, Ego
 from me2e_compress.simulator.traffic.network import LaneIndex, Network, Pose, flip
 
 GRAVITY_MPS2 = 9.81
+# Largest acceleration that the tyres transmit: friction 0.8, dry asphalt
 DRY_GRIP_MPS2 = 0.8 * GRAVITY_MPS2
-"""Largest acceleration that the tyres transmit: friction 0.8, dry asphalt."""
-ACCELERATION_RANGE_MPS2 = (-8.0, 4.0)
-"""Limits of the ego's brakes and engine."""
+ACCELERATION_RANGE_MPS2 = (-8.0, 4.0)  # limits of the ego's brakes and engine
 ACCELERATION_LAG_S = 0.2
+# Time constants of the ego's first-order actuators: our choice. highway-env acts at
+# once, which makes jerk, and so every comfort score, meaningless.
 STEERING_LAG_S = 0.1
-"""Time constants of the ego's first-order actuators: our choice. highway-env acts at
-once, which makes jerk, and so every comfort score, meaningless."""
 
 
 class _Body:
@@ -201,9 +200,9 @@ class StaticObject(_Body, Obstacle):  # type: ignore[misc]  # highway-env is unt
 # is around the corner.
 
 
+# Lateral acceleration at which actors take a curve: our choice, half the comfort bound
+# of nuPlan (4.89)
 LATERAL_COMFORT_MPS2 = 2.5
-"""Lateral acceleration at which actors take a curve: our choice, half the comfort
-bound of nuPlan (4.89)."""
 LOOK_AHEAD_M = 70.0
 
 
@@ -220,18 +219,14 @@ class Behaviour:
     hardest_mps2: float = 8.0
     jam_gap_m: float = 2.5
     headway_s: float = 1.2
-    sees_ego: bool = True
-    """False for actors that ignore the ego."""
-    obeys_limits: bool = True
-    """False for emergency vehicles."""
-    obeys_rules: bool = True
-    """False for those who pass red lights and priority traffic."""
-    gap_s: float = 1.2
-    """Time to spare before priority traffic."""
+    sees_ego: bool = True  # False for actors that ignore the ego
+    obeys_limits: bool = True  # False for emergency vehicles
+    obeys_rules: bool = True  # False for those who pass red lights and priority traffic
+    gap_s: float = 1.2  # time to spare before priority traffic
+    # Whether MOBIL decides, every second, if a lane beside is better
     changes_lanes: bool = False
-    """Whether MOBIL decides, every second, if a lane beside is better."""
+    # MOBIL's weight of what a lane change costs others; highway-env has 0
     politeness: float = 0.0
-    """MOBIL's weight of what a lane change costs others; highway-env has 0."""
 
 
 class Car(_Body, IDMVehicle):  # type: ignore[misc]  # highway-env is untyped
@@ -268,14 +263,12 @@ class Car(_Body, IDMVehicle):  # type: ignore[misc]  # highway-env is untyped
         self.lanes, self.leg = list(lanes), 0
         self.target_lane_index = self.lane_index = self.lanes[0]
         self.action = {"acceleration": 0.0, "steering": 0.0}
+        # An acceleration that a script imposes instead of IDM's
         self.forced_mps2: float | None = None
-        """An acceleration that a script imposes instead of IDM's."""
-        self.offset_m = 0.0
-        """How far left of the lane's centre it drives."""
-        self.until_change = id % 10
-        """Decisions until it looks for a better lane."""
+        self.offset_m = 0.0  # how far left of the lane's centre it drives
+        self.until_change = id % 10  # decisions until it looks for a better lane
+        # The chain that it joins where its own ends
         self.joins: list[LaneIndex] | None = None
-        """The chain that it joins where its own ends."""
 
     @property
     def lane_s(self) -> float:

@@ -28,10 +28,9 @@ from me2e_compress.simulator.plane_geometry import (
 )
 
 LaneIndex = tuple[str, str, int]
+# Width of an urban lane in CARLA's towns and of most lanes in nuScenes
 LANE_WIDTH_M = 3.5
-"""Width of an urban lane in CARLA's towns and of most lanes in nuScenes."""
-CHORD_M = 1.0
-"""Spacing of the points of a lane's centre line."""
+CHORD_M = 1.0  # spacing of the points of a lane's centre line
 _LINE = {
     LaneMarking.NONE: LineType.NONE,
     LaneMarking.DASHED: LineType.STRIPED,
@@ -85,8 +84,8 @@ class Section:
     shoulder: bool = False
 
 
+# An unpainted lane, as inside a junction
 PLAIN = Section(left=LaneMarking.NONE, right=LaneMarking.NONE)
-"""An unpainted lane, as inside a junction."""
 
 
 class Network:
@@ -95,10 +94,10 @@ class Network:
     def __init__(self) -> None:
         self.graph = RoadNetwork()
         self.shoulders: list[LaneIndex] = []
+        # Lanes inside junctions; those of a lower rank have priority
         self.ranks: dict[LaneIndex, int] = {}
-        """Lanes inside junctions; those of a lower rank have priority."""
+        # Lanes that end, or begin, in the middle of a road
         self.closed: list[LaneIndex] = []
-        """Lanes that end, or begin, in the middle of a road."""
         self._sampled: dict[LaneIndex, tuple[Floats, Floats]] = {}
 
     def straight(
@@ -267,14 +266,11 @@ class LaneTable:
         return angles
 
 
-ANNOUNCED_M = 20.0
-"""How long before a junction or a lane change the command says so."""
+ANNOUNCED_M = 20.0  # how long before a junction or a lane change the command says so
 FINE_M = 0.1
-WIDEST_M = 9.0
-"""How far to the side we look for road."""
+WIDEST_M = 9.0  # how far to the side we look for road
 PROBE_M = 0.25
-TOUCHING_M = 0.01
-"""Lanes side by side leave no hole, whatever the last digit says."""
+TOUCHING_M = 0.01  # lanes side by side leave no hole, whatever the last digit says
 _CHANGES = (Command.CHANGE_LEFT, Command.CHANGE_RIGHT)
 
 

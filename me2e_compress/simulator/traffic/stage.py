@@ -35,13 +35,11 @@ from me2e_compress.simulator.traffic.network import (
 from me2e_compress.simulator.traffic.right_of_way import Regulator, SignalPlan
 
 Body = Car | Walker | StaticObject | EgoVehicle
+# Arrivals are drawn for as long as a route may last (the leaderboard's 4000 ticks)
 HORIZON_S = 200.0
-"""Arrivals are drawn for as long as a route may last (the leaderboard's 4000 ticks)."""
-SHORTEST_S = 1.6
-"""Two cars of one lane do not arrive closer to each other."""
+SHORTEST_S = 1.6  # two cars of one lane do not arrive closer to each other
 PLATOON_S = (1.6, 2.6)
-PLATOON = 4
-"""Most followers in a platoon."""
+PLATOON = 4  # most followers in a platoon
 
 
 @dataclass
@@ -117,14 +115,12 @@ def arrival_times(
     return times
 
 
+# One actor script: resumed at every decision, it yields until the next one
 Script = Iterator[None]
-"""One actor script: resumed at every decision, it yields until the next one."""
-GOAL_M = 150.0
-"""Length of a route without what is drawn before and after."""
+GOAL_M = 150.0  # length of a route without what is drawn before and after
+# Metres before the places of a scenario, and after them
 LEAD_M, AFTER_M = (25.0, 60.0), (25.0, 190.0)
-"""Metres before the places of a scenario, and after them."""
-TRAFFIC = "traffic"
-"""The parameter that, with the seed, decides all arrivals."""
+TRAFFIC = "traffic"  # the parameter that, with the seed, decides all arrivals
 
 
 class Stage:
@@ -158,11 +154,11 @@ class Stage:
         self._next_id = 1
         # traffic and weather
         self.ego_lanes: list[tuple[LaneIndex, float]] = []
+        # Lanes into the map on which nobody begins between two stations
         self.clear: dict[LaneIndex, tuple[float, float]] = {}
-        """Lanes into the map on which nobody begins between two stations."""
         self.schedule = Schedule()
+        # Where people who cross at a light begin and end, metres left of the route
         self.light_across_m = (0.0, 0.0)
-        """Where people who cross at a light begin and end, metres left of the route."""
         self.lead_m: float = self.uniform("lead_m", *LEAD_M)
         low, high = AFTER_M
         spread = self.uniform("after_share", 0.0, 1.0)

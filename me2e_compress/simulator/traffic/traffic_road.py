@@ -18,17 +18,14 @@ from me2e_compress.simulator.traffic.bodies import LOOK_AHEAD_M, Car, Walker
 from me2e_compress.simulator.traffic.network import LaneIndex, LaneTable, Network
 from me2e_compress.simulator.traffic.right_of_way import RightOfWay
 
-EVERY = 10
-"""Decisions between two looks: highway-env's LANE_CHANGE_DELAY is 1 s."""
+EVERY = 10  # decisions between two looks: highway-env's LANE_CHANGE_DELAY is 1 s
+# highway-env's LANE_CHANGE_MIN_ACC_GAIN and LANE_CHANGE_MAX_BRAKING_IMPOSED
 MIN_GAIN_MPS2, MOST_IMPOSED_MPS2 = 0.2, 2.0
-"""highway-env's LANE_CHANGE_MIN_ACC_GAIN and LANE_CHANGE_MAX_BRAKING_IMPOSED."""
-JOIN_IMPOSED_MPS2 = 3.5
-"""What somebody whose lane ends imposes on others: our choice."""
-NEAREST_M = 2.0
-"""Gap between bumpers below which nobody changes."""
+JOIN_IMPOSED_MPS2 = 3.5  # what somebody whose lane ends imposes on others: our choice
+NEAREST_M = 2.0  # gap between bumpers below which nobody changes
+# Nobody changes nearer than this to the beginning of a lane, or in a junction: who
+# comes up behind is on another lane yet
 SETTLED_M = 30.0
-"""Nobody changes nearer than this to the beginning of a lane, or in a junction: who
-comes up behind is on another lane yet."""
 SLOWEST_MPS = 1.0
 
 
@@ -87,12 +84,10 @@ def _imposed(car: Car, chain: list[LaneIndex]) -> float:
     return float(closing**2 / (2 * gap))
 
 
-FORESEEN_S = (1.0, 2.0, 3.0)
-"""When drivers foresee people who cross, seconds from now."""
+FORESEEN_S = (1.0, 2.0, 3.0)  # when drivers foresee people who cross, seconds from now
+# The ego is wholly in a lane if it is so near to its centre and direction
 INSIDE_M, ALONG_RAD = 0.6, 0.3
-"""The ego is wholly in a lane if it is so near to its centre and direction."""
-BESIDE_M = 0.25
-"""Two bodies closer than this sideways are in each other's way."""
+BESIDE_M = 0.25  # two bodies closer than this sideways are in each other's way
 
 
 class TrafficRoad(Road):  # type: ignore[misc]  # highway-env is untyped
