@@ -22,13 +22,18 @@ from me2e_compress.simulator.camera_rig import (
 )
 from me2e_compress.simulator.cameras.solids import Solid
 from me2e_compress.simulator.cameras.template import FIRST_LAMP
+from me2e_compress.simulator.plane_geometry import Floats
 from me2e_compress.simulator.scene import Ego
 
-Floats = npt.NDArray[np.float64]
+Bytes = npt.NDArray[np.uint8]
 Ints = npt.NDArray[np.intp]
 Flags = npt.NDArray[np.bool_]
 
 TOUCH_M = 0.05  # footprints that sink into each other by less still count as apart
+NEAR_M = 0.2  # polygons are cut at this depth
+# Details whose longer side is less are left out: others, lamps
+LEAST_PX = np.array([2.0, 0.7])
+LIMIT_PX = 20_000.0  # far outside any image, and safe in cv2's fixed-point numbers
 
 
 def painting_order(right: Floats, forward: Floats, visible: Flags) -> tuple[Ints, Ints]:
@@ -105,14 +110,6 @@ def _sorted(behind: Flags) -> list[int]:
     return result
 
 
-Bytes = npt.NDArray[np.uint8]
-
-NEAR_M = 0.2  # polygons are cut at this depth
-# Details whose longer side is less are left out: others, lamps
-LEAST_PX = np.array([2.0, 0.7])
-LIMIT_PX = 20_000.0  # far outside any image, and safe in cv2's fixed-point numbers
-
-
 @dataclass(frozen=True, eq=False)
 class Faces:
     """Visible polygons of all cameras, in painting order.
@@ -141,10 +138,7 @@ class Painter:
         """Cull, order, cut at the near plane and project one solid or more."""
         # which solids each camera may see, in painting order
         x, y, heading = np.array([s.pose for s in solids]).T
-        cos, sin = np.cos(ego.heading), np.sin(ego.heading)
-        dx, dy = x - ego.x, y - ego.y
-        ahead, left = cos * dx + sin * dy, cos * dy - sin * dx
-        poses = np.stack([ahead, left, heading - ego.heading], axis=1)
+        poses = np.column_stack([ego.seen(x, y), heading - ego.heading])  # (solids, 3)
         corners, footprints = _place(solids, poses)
         camera, solid = painting_order(*self._views(footprints))
         # their faces that look at the camera, inside its frustum
@@ -173,12 +167,8 @@ class Painter:
 
     def _views(self, footprints: Floats) -> tuple[Floats, Floats, Flags]:
         """Return footprints [6, 4, S] in each camera's frame, and which it may see."""
-        positions, rotations = self.rig.positions, self.rig.rotations
-        dx = footprints[0] - positions[:, 0, None, None]
-        dy = footprints[1] - positions[:, 1, None, None]
-        axes = rotations[:, :, :2, None, None]
-        right = axes[:, 0, 0] * dx + axes[:, 0, 1] * dy
-        forward = axes[:, 2, 0] * dx + axes[:, 2, 1] * dy
+        every = np.arange(len(self.rig.positions))[:, None, None]
+        right, forward = self._right_and_forward(footprints, every)
         edge = forward * (self.rig.centre_px[0] / self.rig.focals_px)[:, None, None]
         hidden = (forward < NEAR_M).all(axis=1)
         hidden |= (right > edge).all(axis=1) | (right < -edge).all(axis=1)
@@ -186,11 +176,16 @@ class Painter:
 
     def _to_camera(self, points: Floats, camera: Ints) -> Floats:
         """Convert [3, 4, M] of the ego frame to [3, 4, M] right, down, forward."""
-        dx, dy = (points[i] - self.rig.positions[camera, i] for i in (0, 1))
-        axes = self.rig.rotations[camera]
-        right = axes[:, 0, 0] * dx + axes[:, 0, 1] * dy
-        forward = axes[:, 2, 0] * dx + axes[:, 2, 1] * dy
+        right, forward = self._right_and_forward(points, camera)
         return np.stack([right, CAMERA_HEIGHT_M - points[2], forward])
+
+    def _right_and_forward(self, points: Floats, camera: Ints) -> tuple[Floats, Floats]:
+        """Convert x and y (points[0], points[1]) of the ego frame to cameras' axes."""
+        dx, dy = (points[i] - self.rig.positions[camera, i] for i in (0, 1))
+        axes = self.rig.rotations[camera]  # rows: right, down, forward
+        right = axes[..., 0, 0] * dx + axes[..., 0, 1] * dy
+        forward = axes[..., 2, 0] * dx + axes[..., 2, 1] * dy
+        return right, forward
 
     def _seen(self, points: Floats, camera: Ints) -> Ints:
         """Return the indices of the faces [3, 4, M] that a camera sees."""

@@ -13,9 +13,10 @@ from me2e_compress.simulator.cameras.template import (
     Quad,
     Slot,
     Template,
-    facing,
+    octagon,
     plate,
     shadow,
+    sign_face,
     template,
 )
 from me2e_compress.simulator.scene import (
@@ -223,7 +224,7 @@ def stop_sign() -> Template:
     quads += _octagon(-0.09, SIGN_RADIUS_M * 0.86, Slot.BODY, detail=True)
     half, low, high = SIGN_RADIUS_M * 0.62, SIGN_CENTRE_M - 0.09, SIGN_CENTRE_M + 0.09
     word = [(half, low), (-half, low), (-half, high), (half, high)]
-    quads.append(facing(word, -0.1, Slot.STRIPE, detail=True))
+    quads += sign_face(word, -0.1, Slot.STRIPE, detail=True)
     return template(quads, FOOT, (-SIGN_RADIUS_M, SIGN_RADIUS_M))
 
 
@@ -237,10 +238,7 @@ def give_way_sign() -> Template:
         half, low = SIGN_RADIUS_M * 1.15 * scale, SIGN_CENTRE_M - 0.66 * scale
         high = SIGN_CENTRE_M + 0.33 * scale
         corners = [(0.0, low), (0.0, low), (-half, high), (half, high)]
-        quads.append(facing(corners, x, slot, detail=detail))
-        if not detail:
-            back = quads[-1].corners[::-1]
-            quads.append(Quad(back, Slot.TRIM, 1.0, False))
+        quads += sign_face(corners, x, slot, detail=detail)
     return template(quads, FOOT, (-SIGN_RADIUS_M, SIGN_RADIUS_M))
 
 
@@ -251,20 +249,10 @@ def _pole(top_m: float) -> list[Quad]:
 
 def _octagon(x: float, radius: float, slot: Slot, *, detail: bool) -> list[Quad]:
     """Return three quadrilaterals, seen from behind too if they are no detail."""
-    part = radius * 0.4142
-    rows = (
-        (-radius, part, -part, radius),
-        (-part, radius, part, radius),
-        (part, radius, radius, part),
-    )
-    quads = []
-    for low, low_half, high, high_half in rows:
-        z_low, z_high = SIGN_CENTRE_M + low, SIGN_CENTRE_M + high
-        corners = [(low_half, z_low), (-low_half, z_low)]
-        corners += [(-high_half, z_high), (high_half, z_high)]
-        quads.append(facing(corners, x, slot, detail=detail))
-        if not detail:
-            quads.append(Quad(quads[-1].corners[::-1], Slot.TRIM, 1.0, False))
+    quads = list[Quad]()
+    for band in octagon(radius, radius):
+        corners = [(-y, SIGN_CENTRE_M + z) for y, z in band]
+        quads += sign_face(corners, x, slot, detail=detail)
     return quads
 
 

@@ -5,7 +5,7 @@ A template lives in a unit box that is scaled to the solid: x from -0.5 (rear) t
 wind counter-clockwise seen from outside, so that back faces are not drawn.
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from enum import IntEnum
 from typing import NamedTuple
@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-Floats = npt.NDArray[np.float64]
+from me2e_compress.simulator.plane_geometry import Floats
 
 
 class Slot(IntEnum):
@@ -91,15 +91,9 @@ class Box:
         top_x: tuple[float, float] | None = None,
         top_y: tuple[float, float] | None = None,
     ) -> None:
-        # corners of the foot and of the top
-        (rear, front), (right, left) = x, y
-        (rear_t, front_t), (right_t, left_t) = top_x or x, top_y or y
-        low, high = z
-        foot = [(rear, right), (front, right), (front, left), (rear, left)]
-        roof = [(rear_t, right_t), (front_t, right_t), (front_t, left_t)]
-        roof.append((rear_t, left_t))
-        a, b, c, d = (np.array([*p, low]) for p in foot)
-        e, f, g, h = (np.array([*p, high]) for p in roof)
+        # corners of the foot and of the top: right and left of the rear and the front
+        a, b, c, d = _rectangle(x, y, z[0])
+        e, f, g, h = _rectangle(top_x or x, top_y or y, z[1])
         # faces counter-clockwise, seen from outside
         self.slot = slot
         self.faces: dict[str, Floats] = {
@@ -126,7 +120,7 @@ class Box:
         ``u`` runs along the face's lower edge, counter-clockwise seen from above, and
         ``v`` upwards, both from 0 to 1.
         """
-        corners = ((u[0], v[0]), (u[1], v[0]), (u[1], v[1]), (u[0], v[1]))
+        corners = [(u[0], v[0]), (u[1], v[0]), (u[1], v[1]), (u[0], v[1])]
         return self._patch(face, corners, slot)
 
     def disc(
@@ -137,27 +131,17 @@ class Box:
         slot: Slot,
     ) -> list[Quad]:
         """Return an octagon on a face, as three quadrilaterals; see `on` for (u, v)."""
-        (u, v), (wide, high) = centre, radii
-        narrow, low = 0.4142 * wide, 0.4142 * high
-        bands = (
-            (-high, narrow, -low, wide),
-            (-low, wide, low, wide),
-            (low, wide, high, narrow),
-        )
+        u, v = centre
         return [
-            self._patch(
-                face,
-                ((u - a, v + p), (u + a, v + p), (u + b, v + q), (u - b, v + q)),
-                slot,
-            )
-            for p, a, q, b in bands
+            self._patch(face, [(u + x, v + y) for x, y in band], slot)
+            for band in octagon(*radii)
         ]
 
     def _patch(
-        self, face: str, corners: tuple[tuple[float, float], ...], slot: Slot
+        self, face: str, corners: Sequence[tuple[float, float]], slot: Slot
     ) -> Quad:
         a, b, c, d = self.faces[face]
-        points = [
+        points = [  # bilinear between the corners of the face
             (1 - s) * ((1 - t) * a + t * d) + s * ((1 - t) * b + t * c)
             for s, t in corners
         ]
@@ -165,11 +149,27 @@ class Box:
         return Quad(np.array(points), slot, shade, True)
 
 
+def octagon(half_width: float, half_height: float) -> list[list[tuple[float, float]]]:
+    """Return three quadrilaterals that make an octagon around the origin."""
+    narrow, low = 0.4142 * half_width, 0.4142 * half_height  # tan 22.5 degrees
+    bands = (  # lower edge, half its width; upper edge, half its width
+        (-half_height, narrow, -low, half_width),
+        (-low, half_width, low, half_width),
+        (low, half_width, half_height, narrow),
+    )
+    return [[(-a, p), (a, p), (b, q), (-b, q)] for p, a, q, b in bands]
+
+
 def shadow(x: tuple[float, float], y: tuple[float, float]) -> Quad:
     """Return the contact shadow on the ground."""
-    corners = [(x[0], y[0]), (x[1], y[0]), (x[1], y[1]), (x[0], y[1])]
-    ground = np.array([(*corner, 0.0) for corner in corners])
-    return Quad(ground, Slot.SHADOW, 1.0, True)
+    return Quad(_rectangle(x, y, 0.0), Slot.SHADOW, 1.0, True)
+
+
+def _rectangle(x: tuple[float, float], y: tuple[float, float], z: float) -> Floats:
+    """Return [4, 3] corners at one height, counter-clockwise from above."""
+    return np.array(
+        [(x[0], y[0], z), (x[1], y[0], z), (x[1], y[1], z), (x[0], y[1], z)]
+    )
 
 
 def plate(corners: Iterable[tuple[float, float, float]], slot: Slot) -> list[Quad]:
@@ -178,17 +178,22 @@ def plate(corners: Iterable[tuple[float, float, float]], slot: Slot) -> list[Qua
     return [Quad(face, slot, 0.95, False), Quad(face[::-1], slot, 0.85, False)]
 
 
-def facing(
+def sign_face(
     corners: Iterable[tuple[float, float]], x: float, slot: Slot, *, detail: bool
-) -> Quad:
-    """Return a flat face at x that looks backwards, from four (y, z) corners."""
-    return Quad(np.array([(x, y, z) for y, z in corners]), slot, 1.0, detail)
+) -> list[Quad]:
+    """Return a face at x that looks backwards, from four (y, z) corners.
+
+    One that is no detail of another face has a grey back.
+    """
+    front = Quad(np.array([(x, y, z) for y, z in corners]), slot, 1.0, detail)
+    back = Quad(front.corners[::-1], Slot.TRIM, 1.0, False)
+    return [front] if detail else [front, back]
 
 
 def template(
     quads: Iterable[Quad],
-    x: tuple[float, float] = (-0.5, 0.5),
-    y: tuple[float, float] = (-0.5, 0.5),
+    x: tuple[float, float] = FULL,
+    y: tuple[float, float] = FULL,
 ) -> Template:
     """Join quadrilaterals; x and y are the extent of the footprint."""
     faces = list(quads)
@@ -197,5 +202,5 @@ def template(
         slots=np.array([quad.slot for quad in faces], np.intp),
         shades=np.array([quad.shade for quad in faces]),
         details=np.array([quad.detail for quad in faces]),
-        footprint=np.array([(x[0], x[1], x[1], x[0]), (y[0], y[0], y[1], y[1])], float),
+        footprint=_rectangle(x, y, 0.0).T[:2],
     )
