@@ -15,7 +15,7 @@ from me2e_compress.base.atomic import write_bytes
 from me2e_compress.base.errors import EvaluationError
 from me2e_compress.simulator.camera_rig import CAMERA_NAMES
 from me2e_compress.simulator.cameras.ground import RESOLUTION_M, GroundTexture
-from me2e_compress.simulator.plane_geometry import corners
+from me2e_compress.simulator.plane_geometry import Floats, corners
 from me2e_compress.simulator.scene import (
     INFRACTIONS,
     Actor,
@@ -31,7 +31,6 @@ from me2e_compress.simulator.scene import (
 )
 
 Bytes = npt.NDArray[np.uint8]
-Floats = npt.NDArray[np.float64]
 Colour = tuple[int, int, int]
 
 # As in nuScenes' figures. Rear images are not mirrored: in BACK, what is to the left of
@@ -42,7 +41,6 @@ TILE, GAP, CAPTION = 320, 4, 30
 COLOURS = 256  # colours of an animation's palette
 FINE = 2  # the view from above is drawn so much larger, then reduced: smooth edges
 AHEAD_M, BEHIND_M = 50.0, 22.0
-SCALE_BAR_M = 10.0
 # the colours of a paper figure: light, few
 GROUND: dict[PixelClass, Colour] = {
     PixelClass.TERRAIN: (237, 240, 231),
@@ -79,38 +77,24 @@ STATES: dict[SignalState, Colour] = {
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Moment:
-    """The record of one frame.
-
-    Attributes:
-        scene: The whole scene.
-        images: The six cameras, uint8 [6, H, W, 3] RGB.
-        plan: [n, 2] metres in the ego frame: the plan in force; None before the first,
-            and for a policy that answers controls.
-        events: Events, at least since the moment before; a repeated event is drawn
-            once.
-    """
+    """The record of one frame."""
 
     scene: Scene
-    images: Bytes
+    images: Bytes  # (6, rows, columns, 3) RGB
+    # Waypoints in force, (n, 2) metres in the ego frame; None before the first plan and
+    # for a policy that answers controls
     plan: Floats | None = None
-    events: tuple[Event, ...] = ()
+    events: tuple[Event, ...] = ()  # since the moment before, or since earlier
 
 
 @dataclass(frozen=True, eq=False)
 class RoutePicture:
-    """Draws a route from its recorded moments.
+    """Draws a route from its recorded moments."""
 
-    Args:
-        title: First words of the caption: the scenario, the route, the driver.
-        texture: The ground the route was driven on.
-        route: [N, 2] world points of the route.
-        moments: In order of time, at least one.
-    """
-
-    title: str
+    title: str  # first words of the caption: the scenario, the route, the driver
     texture: GroundTexture
-    route: Floats
-    moments: Sequence[Moment]
+    route: Floats  # (n, 2) world points
+    moments: Sequence[Moment]  # at least one, in order of time
 
     def __post_init__(self) -> None:
         if not self.moments:
@@ -129,8 +113,9 @@ class RoutePicture:
         # title, time and speed, and the infractions so far in red
         caption = f"{self.title}   {_state(self.moments[index])}"
         left = write(picture, (6, 2 * tall + 7), caption, INK, 15)
-        names = dict.fromkeys(map(_name, self.infractions(index)))
-        write(picture, (left + 16, 2 * tall + 7), ", ".join(names), INFRACTION, 15)
+        kinds = dict.fromkeys(event.kind for event in self.infractions(index))
+        names = ", ".join(kinds).replace("_", " ")
+        write(picture, (left + 16, 2 * tall + 7), names, INFRACTION, 15)
         return picture
 
     def frames(self) -> Iterable[Image.Image]:
@@ -193,25 +178,7 @@ class RoutePicture:
                 view.disc(point, PLAN, 3.0)
         for event in self.infractions(index):
             view.cross(event)
-        reduced = view.picture.reduce(FINE)
-        self._label(reduced, index, view)
-        return reduced
-
-    def _label(self, picture: Image.Image, index: int, view: "View") -> None:
-        """Name the infractions beside their places, each once; and draw a scale."""
-        named = dict[tuple[int, str], None]()
-        for event in self.infractions(index):
-            column, row = (view.to_pixels((event.x, event.y)) / FINE).tolist()
-            inside = 0 <= column < picture.width and 0 <= row < picture.height
-            if inside and (key := (round(row / 40), _name(event))) not in named:
-                below = 16 * sum(place == key[0] for place, _ in named)
-                left = min(column + 12, picture.width - 4 - text_width(key[1], 14))
-                write(picture, (left, row - 7 + below), key[1], INFRACTION, 14, PAPER)
-                named[key] = None
-        bottom, length = picture.height - 12, round(SCALE_BAR_M * view.scale / FINE)
-        ends = (10, bottom, 10 + length, bottom)
-        ImageDraw.Draw(picture).line(ends, INK, 2)
-        write(picture, (12, bottom - 18), f"{SCALE_BAR_M:g} m", INK, 13, PAPER)
+        return view.picture.reduce(FINE)
 
 
 class View:
@@ -323,24 +290,11 @@ def write(
     halo: Colour | None = None,
 ) -> float:
     """Draw a text, its upper left corner at (column, row); return where it ends."""
+    font, stroke = ImageFont.load_default(size_px), 0 if halo is None else 2
     ImageDraw.Draw(picture).text(
-        place,
-        text,
-        colour,
-        ImageFont.load_default(size_px),
-        stroke_width=0 if halo is None else 2,
-        stroke_fill=halo,
+        place, text, colour, font, stroke_width=stroke, stroke_fill=halo
     )
-    return place[0] + text_width(text, size_px)
-
-
-def text_width(text: str, size_px: int) -> float:
-    """Return the width of a text in pixels."""
-    return float(ImageFont.load_default(size_px).getlength(text))
-
-
-def _name(event: Event) -> str:
-    return event.kind.replace("_", " ")
+    return place[0] + float(font.getlength(text))
 
 
 def _state(moment: Moment) -> str:

@@ -86,31 +86,19 @@ class Roadmap:
 class RoutePath:
     """The route's centre line, one point every metre, from start past the goal.
 
-    It runs on beyond `goal_m` (about 60 m) so that planners can look ahead.
-
-    Args:
-        points: [N, 2] metres, 1 m apart.
-        headings: [N] radians, unwrapped.
-        lane_widths: [N] metres, width of the lane that the route uses.
-        speed_limits_mps: [N].
-        commands: [N] values of `Command`.
-        goal_m: Route length: reaching this arc length ends the route.
-        left_m: [N] drivable metres left of the point, up to the edge of the last
-            lane that runs the same way.
-        right_m: [N] the same to the right, shoulders included.
-        oncoming_m: [N] drivable metres to the left with oncoming lanes and
-            shoulders included (>= left_m).
+    It runs on beyond `goal_m` (about 60 m) so that planners can look ahead. Arrays have
+    a value, or a row, for each of n points.
     """
 
-    points: Floats
-    headings: Floats
-    lane_widths: Floats
+    points: Floats  # (n, 2) metres
+    headings: Floats  # radians, unwrapped
+    lane_widths: Floats  # metres, of the lane that the route uses
     speed_limits_mps: Floats
-    commands: Ints
-    goal_m: float
-    left_m: Floats
-    right_m: Floats
-    oncoming_m: Floats
+    commands: Ints  # values of `Command`
+    goal_m: float  # reaching this arc length ends the route
+    left_m: Floats  # drivable metres to the left, on lanes that run the same way
+    right_m: Floats  # the same to the right, shoulders included
+    oncoming_m: Floats  # to the left with oncoming lanes and shoulders (>= left_m)
 
     @cached_property
     def _direction(self) -> Floats:

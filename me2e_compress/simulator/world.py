@@ -41,18 +41,6 @@ class World:
             actors still decide every 0.1 s.
         builder: Sets the stage, traffic included, instead of the registered scenario
             type: for new types.
-
-    Attributes:
-        stage: What the scenario set, bodies and signals included.
-        path: The ego's route, right-handed as scenes are.
-        roadmap: All lanes, stop lines and crosswalks.
-        parameters: Every parameter of the scenario with its value.
-        outside_m: Metres between the ego's centre and the nearest lane, 0 inside.
-        outside_distance_m: Metres driven while that exceeded `TOLERANCE_M`.
-        reason: Why the world has ended by itself, at the goal or by a collision; None
-            before that. A runner may stop earlier for other reasons.
-        collided: Scenes of the ego's collisions, by time in microseconds.
-        weather: What the route says.
     """
 
     def __init__(
@@ -67,28 +55,30 @@ class World:
                 f"frame of {dt_us} us: it must be between 1 and {DECISION_US}"
             )
         self.route, self.dt_us = route, dt_us
-        # the scenario sets the stage
+        # The scenario sets the stage: bodies, signals and the route, right-handed
         self.stage = stage = stage_of(route, builder)
         self.path: RoutePath = stage.path
-        self.parameters = dict(stage.parameters)
+        self.parameters, self.weather = dict(stage.parameters), stage.weather
         self.roadmap: Roadmap = stage.network.roadmap(
             tuple(signal.snapshot().stop_line for signal in stage.regulators),
             tuple(stage.crosswalks),
         )
-        # traffic, and the state of the checks
+        # Traffic
         rules = RightOfWay(stage.network, stage.schedule.lines, stage.ego_lanes)
         self._road = TrafficRoad(stage.network, rules)
         self._road.vehicles = [stage.ego]
-        self.outside_m, self.outside_distance_m = 0.0, 0.0
+        self._next_decision_us = 0
+        # State of the checks
+        self.outside_m = 0.0  # from the ego's centre to the nearest lane, 0 inside
+        self.outside_distance_m = 0.0  # driven while that exceeded `TOLERANCE_M`
         self.lateral_m, self._furthest_m = 0.0, 0.0
         self._was_outside = False
         self._met = set[tuple[int, int]]()
-        self._next_decision_us = 0
+        # Why the world has ended by itself, at the goal or by a collision. A runner may
+        # stop earlier for other reasons.
         self.reason: Ending | None = None
-        # collisions
-        self.collided: dict[int, Scene] = {}
-        self.weather = stage.weather
-        # right of way decides at the ego's signs
+        self.collided: dict[int, Scene] = {}  # at the ego's collisions, by time_us
+        # Right of way decides at the ego's signs
         meets = min((begin for begin, _ in rules.priority_over_ego()), default=math.inf)
         for sign in stage.regulators:
             if sign.kind is SignalKind.GIVE_WAY and sign.line_s is not None:

@@ -140,12 +140,3 @@ def test_a_place_that_cannot_be_written_is_named(tmp_path: Path, name: str) -> N
     assert not list(tmp_path.iterdir())
 
 
-def test_two_infractions_at_one_place_are_both_named() -> None:
-    red = event(EventKind.RED_LIGHT, 0)
-    crash = event(EventKind.COLLISION, 0)
-    mark = (208, 16, 32)
-    one = count(above(picture(moment(0, red)).frame(0)), mark)
-    two = count(above(picture(moment(0, red, crash)).frame(0)), mark)
-    again = picture(moment(0, red, replace(red, time_us=50_000)))
-    assert two > one + 20
-    assert count(above(again.frame(0)), mark) == one

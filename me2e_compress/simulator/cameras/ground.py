@@ -17,11 +17,16 @@ from me2e_compress.simulator.camera_rig import (
     CameraRig,
     fixed_point,
 )
-from me2e_compress.simulator.plane_geometry import LaneMarking, Roadmap, resample
+from me2e_compress.simulator.plane_geometry import (
+    Floats,
+    LaneMarking,
+    Roadmap,
+    resample,
+)
 from me2e_compress.simulator.scene import Ego, PixelClass
 
 Bytes = npt.NDArray[np.uint8]
-Floats = npt.NDArray[np.float64]
+Floats32 = npt.NDArray[np.float32]
 Colour = tuple[int, int, int]
 
 ASPHALT = (98, 98, 101)
@@ -147,28 +152,22 @@ ROWS_AT_ONCE = 32
 
 @dataclass(frozen=True, eq=False)
 class GroundTexture:
-    """The painted ground around a route.
+    """The painted ground around a route."""
 
-    Attributes:
-        west_m: World x of the left edge of the raster.
-        north_m: World y of its upper edge.
-        levels: Mip levels, finest first, uint8 [H, W, 4]: RGB and an unused fourth
-            channel, which makes sampling twice as fast.
-        classes: uint8 [H, W] of `PixelClass`, on the finest grid.
-    """
-
-    west_m: float
-    north_m: float
+    west_m: float  # world x of the raster's left edge
+    north_m: float  # world y of its upper edge
+    # Mip levels, finest first, (rows, columns, 4): RGB and an unused channel, which
+    # makes sampling twice as fast
     levels: tuple[Bytes, ...]
-    classes: Bytes
+    classes: Bytes  # (rows, columns) of `PixelClass`, on the finest grid
 
     def __post_init__(self) -> None:
-        """Make the rasters read-only: many frames are sampled from them."""
+        # Many frames are sampled from the rasters: nobody may change them
         for raster in (*self.levels, self.classes):
             raster.flags.writeable = False
 
 
-def paint_texture(roadmap: Roadmap, route: npt.NDArray[np.float64]) -> GroundTexture:
+def paint_texture(roadmap: Roadmap, route: Floats) -> GroundTexture:
     """Paint lanes, markings, stop lines, crosswalks and the verge.
 
     The texture covers the bounding box of ``route``, [N, 2] metres, and 60 m around.
@@ -229,8 +228,6 @@ def _add_grain(plan: GroundPlan, rng: np.random.Generator) -> None:
 # several times, which keeps distant lines from flickering.
 
 
-Floats32 = npt.NDArray[np.float32]
-
 FARTHEST_M = 400.0  # depth of the last row before the horizon, at most
 SKY_M = 4000.0  # the sky counts as this far away
 # From these depths (metres) on, a row is the mean of this many samples
@@ -242,25 +239,16 @@ BLUR = 0.5
 
 @dataclass(frozen=True, eq=False)
 class RowGroup:
-    """Rows of the six images that are sampled alike, sorted by mip level.
+    """Rows of the six images that are sampled alike, sorted by mip level."""
 
-    Attributes:
-        rows: [R] index into the rows of the stacked images [6 * H].
-        origins: [T, R, 2] ground point left of the first column, metres in the ego
-            frame, one for each of T samples of a row.
-        steps: [T, R, 2] metres from one column to the next.
-        levels: [R] mip level; ``blocks`` are (level, first, last) slices of the rows.
-        coordinates: Two [R, T, W], working memory, overwritten in every frame, as are
-            the ``samples`` [R, T, W, 4].
-    """
-
-    rows: npt.NDArray[np.intp]
-    origins: Floats
-    steps: Floats
-    levels: npt.NDArray[np.intp]
-    blocks: tuple[tuple[int, int, int], ...]
-    coordinates: tuple[Floats32, Floats32]
-    samples: Bytes
+    rows: npt.NDArray[np.intp]  # (rows,) index into the stacked images, (6 * height,)
+    origins: Floats  # (taps, rows, 2) ground point left of column 0 (m, ego frame)
+    steps: Floats  # (taps, rows, 2) metres from one column to the next
+    levels: npt.NDArray[np.intp]  # (rows,) mip level
+    blocks: tuple[tuple[int, int, int], ...]  # (level, first, last): slices of rows
+    # Working memory, overwritten in every frame
+    coordinates: tuple[Floats32, Floats32]  # (rows, taps, width) each
+    samples: Bytes  # (rows, taps, width, 4)
 
 
 @dataclass(frozen=True, eq=False)

@@ -112,20 +112,15 @@ def _sorted(behind: Flags) -> list[int]:
 
 @dataclass(frozen=True, eq=False)
 class Faces:
-    """Visible polygons of all cameras, in painting order.
+    """Visible polygons of all cameras, in painting order."""
 
-    ``polygons`` are int32 [N, 1 or 4.., 2], fixed-point pixels for cv2; ``colours`` [M,
-    3] RGB; ``lamps`` emit light, ``details`` lie on another face; ``places`` [M, 2] is
-    where its solid is, metres in the ego frame, ``distances`` metres from the camera.
-    """
-
-    cameras: Ints
-    polygons: list[npt.NDArray[np.int32]]
-    colours: Floats
-    lamps: Flags
-    details: Flags
-    places: Floats
-    distances: Floats
+    cameras: Ints  # (faces,) index of the camera
+    polygons: list[npt.NDArray[np.int32]]  # (corners, 2) each, fixed-point pixels
+    colours: Floats  # (faces, 3) RGB
+    lamps: Flags  # (faces,) whether it emits light
+    details: Flags  # (faces,) whether it lies on another face
+    places: Floats  # (faces, 2) position of its solid in the ego frame (m)
+    distances: Floats  # (faces,) metres from its solid to the camera
 
 
 @dataclass(frozen=True, eq=False)

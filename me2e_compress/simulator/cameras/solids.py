@@ -338,18 +338,12 @@ STATE_LAMPS = {
 
 @dataclass(frozen=True, slots=True)
 class Solid:
-    """A template, painted and placed in the world.
-
-    Attributes:
-        colours: float64 [Q, 3] RGB of its faces, shading applied.
-        pose: x, y, heading in the world; metres and radians.
-        size: Length, width, height in metres.
-    """
+    """A template, painted and placed in the world."""
 
     template: Template
-    colours: npt.NDArray[np.float64]
-    pose: tuple[float, float, float]
-    size: tuple[float, float, float]
+    colours: npt.NDArray[np.float64]  # (faces, 3) RGB, shading applied
+    pose: tuple[float, float, float]  # x, y (m) and heading (rad) in the world
+    size: tuple[float, float, float]  # length, width and height (m)
 
 
 def solids_of(scene: Scene) -> list[Solid]:

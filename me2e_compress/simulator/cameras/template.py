@@ -53,21 +53,13 @@ class Quad(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Template:
-    """A convex solid, or a stack of convex solids, lowest first.
+    """A convex solid, or a stack of convex solids, lowest first, in the unit box."""
 
-    Attributes:
-        corners: [3, 4, Q] x, y, z of the four corners of each face, in the unit box.
-        slots: [Q] values of `Slot`.
-        shades: [Q] brightness of the colour, by the direction of the face.
-        details: [Q] whether it lies on another face.
-        footprint: [2, 4] x, y of its rectangle on the ground, counter-clockwise.
-    """
-
-    corners: Floats
-    slots: npt.NDArray[np.intp]
-    shades: Floats
-    details: npt.NDArray[np.bool_]
-    footprint: Floats
+    corners: Floats  # (3, 4, faces): x, y, z of the four corners of each face
+    slots: npt.NDArray[np.intp]  # (faces,) values of `Slot`
+    shades: Floats  # (faces,) brightness of the colour, by the direction of the face
+    details: npt.NDArray[np.bool_]  # (faces,) whether it lies on another face
+    footprint: Floats  # (2, 4): its rectangle on the ground, counter-clockwise
 
 
 FULL = (-0.5, 0.5)  # the whole unit box

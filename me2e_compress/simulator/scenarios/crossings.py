@@ -33,22 +33,14 @@ SETBACK_M = 3.0
 
 @dataclass(frozen=True)
 class Crossing:
-    """A finished junction.
+    """A finished junction."""
 
-    Attributes:
-        centre: Its middle, with the ego's heading as it approaches; ``half_m`` is half
-            its side, and there are ``lanes`` of each arm in each direction.
-        move: The ego's move: ahead, left or right.
-        approach_m: Route from the ego's start to the junction's edge.
-        signals: The regulator of each arm that has one.
-    """
-
-    centre: Pose
-    half_m: float
-    lanes: int
-    move: str
-    approach_m: float
-    signals: dict[str, Regulator]
+    centre: Pose  # its middle, with the ego's heading as it approaches
+    half_m: float  # half its side
+    lanes: int  # of each arm, in each direction
+    move: str  # the ego's: ahead, left or right
+    approach_m: float  # route from the ego's start to the junction's edge
+    signals: dict[str, Regulator]  # by arm
     arm_m: float = ARM_M
 
     def way(self, origin: str, to: str, lane: int = 0) -> list[LaneIndex]:

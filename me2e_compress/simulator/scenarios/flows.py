@@ -104,23 +104,15 @@ EGO_ROOM_M = 14.0  # nobody begins nearer to the ego, bumper to bumper
 
 @dataclass(frozen=True)
 class Traffic:
-    """Who drives on a lane.
+    """Who drives on a lane."""
 
-    Attributes:
-        gap_s: Mean time between two cars.
-        speed: Lowest and highest wanted speed; None for about the limit.
-        platoons: Share of arrivals that lead a platoon.
-        reckless: Share of drivers who obey neither lights nor signs.
-        joins: The chain that they join where their lane ends.
-        blind_to_ego: Share of drivers who do not mind the ego.
-    """
-
-    gap_s: float
+    gap_s: float  # mean time between two cars
+    # Lowest and highest wanted speed; None for about the limit
     speed: tuple[float, float] | None = None
-    platoons: float = 0.25
-    reckless: float = 0.0
-    joins: tuple[LaneIndex, ...] = ()
-    blind_to_ego: float = 0.0
+    platoons: float = 0.25  # share of arrivals that lead a platoon
+    reckless: float = 0.0  # share of drivers who obey neither lights nor signs
+    joins: tuple[LaneIndex, ...] = ()  # the chain that they join where their lane ends
+    blind_to_ego: float = 0.0  # share of drivers who do not mind the ego
 
 
 def stream(

@@ -41,19 +41,12 @@ class Piece(NamedTuple):
 
 @dataclass(frozen=True)
 class Street:
-    """A road; the ego's route begins `BEFORE_M` after the road does.
+    """A road; the ego's route begins `BEFORE_M` after the road does."""
 
-    Attributes:
-        forward: Edges in driving direction.
-        backward: Edges of the oncoming lanes, in their driving direction.
-        verge: Edges of the shoulder on the right, in driving direction.
-        lane: The lane that the ego follows or enters; 0 is the leftmost.
-    """
-
-    forward: Sequence[Edge]
-    backward: Sequence[Edge] = ()
-    verge: Sequence[Edge] = ()
-    lane: int = 0
+    forward: Sequence[Edge]  # in driving direction
+    backward: Sequence[Edge] = ()  # oncoming lanes, in their driving direction
+    verge: Sequence[Edge] = ()  # the shoulder on the right, in driving direction
+    lane: int = 0  # that the ego follows or enters; 0 is the leftmost
 
     def ahead(self, lane: int | None = None) -> list[LaneIndex]:
         """Return the chain of a forward lane, by default of the ego's."""

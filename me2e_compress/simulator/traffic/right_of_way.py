@@ -25,23 +25,16 @@ YIELD_GAP_S = 1.5
 
 @dataclass
 class Regulator:
-    """A light or sign at one stop line.
-
-    Attributes:
-        line: Centre of the stop line, heading of the traffic that must obey.
-        line_s: Arc length (m) at which the ego's route crosses the line, if it does.
-        state: Phase of a light.
-        nearest_s: For a give-way sign: seconds until the next vehicle with priority
-            reaches the conflict, infinity if there is none.
-        conflict_s: For a give-way sign: arc length of the conflict on the route.
-    """
+    """A light or sign at one stop line."""
 
     id: int
     kind: SignalKind
-    line: Pose
-    line_s: float | None
-    state: SignalState | None = None
+    line: Pose  # centre of the stop line, heading of the traffic that must obey
+    line_s: float | None  # arc length (m) at which the ego's route crosses it, if so
+    state: SignalState | None = None  # phase of a light
     width_m: float = LANE_WIDTH_M
+    # Of a give-way sign: seconds until the next vehicle with priority reaches the
+    # conflict, and the conflict's arc length (m) on the ego's route
     nearest_s: Callable[[], float] = field(default=lambda: math.inf, repr=False)
     conflict_s: float = math.inf
     _conflict_passed: bool = False
@@ -165,18 +158,14 @@ class Conflict:
 
 @dataclass(frozen=True)
 class User:
-    """A body that is on a lane inside a junction or will be.
-
-    ``at_m`` is where its centre is on that lane; negative before it. ``bound`` tells
-    that a red light holds it back.
-    """
+    """A body that is on a lane inside a junction or will be."""
 
     id: int
-    at_m: float
+    at_m: float  # arc length of its centre on that lane; negative before it
     speed_mps: float
     length_m: float
     rank: int
-    bound: bool
+    bound: bool  # whether a red light holds it back
 
     @property
     def ends_m(self) -> tuple[float, float]:
