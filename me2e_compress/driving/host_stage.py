@@ -21,15 +21,11 @@ from me2e_compress.driving.contract import Positive
 
 @dataclass(frozen=True, eq=False, slots=True)
 class HostWork:
-    """The plan [6, 2] that a host stage made, and the work it took.
+    """The plan that a host stage made, and the work it took."""
 
-    ``iterations`` of its solver are 0 if there was nothing to do; ``cells`` are the
-    occupied cells taken into account.
-    """
-
-    plan: npt.NDArray[np.float64]
-    iterations: int = 0
-    cells: int = 0
+    plan: npt.NDArray[np.float64]  # (6, 2) metres in the ego frame
+    iterations: int = 0  # of its solver; 0 if there was nothing to do
+    cells: int = 0  # occupied cells taken into account
 
 
 @dataclass(frozen=True)

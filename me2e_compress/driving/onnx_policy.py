@@ -9,7 +9,7 @@ import numpy as np
 
 from me2e_compress.base.errors import EvaluationError, FramesError, GraphError
 from me2e_compress.driving.adapter import Adapter
-from me2e_compress.driving.adapter.adapter import ZEROS, RecurrentEntry
+from me2e_compress.driving.adapter.adapter import ZEROS
 from me2e_compress.driving.adapter.inputs import ModelInputs, contract_names
 from me2e_compress.driving.adapter.outputs import COMMAND, plan_read
 from me2e_compress.driving.contract import (
@@ -20,57 +20,42 @@ from me2e_compress.driving.contract import (
     fits,
     six_waypoints,
 )
-from me2e_compress.driving.host_stage import HostStage, HostWork
+from me2e_compress.driving.host_stage import HostStage
 from me2e_compress.runtime.frames import Array
 from me2e_compress.runtime.plan_adapter import PlanAdapter
 from me2e_compress.runtime.providers import CPU, Provider
 from me2e_compress.runtime.session import Session, zero_state
 
-Entries = Mapping[str, RecurrentEntry] | None
 
+def first_sources(
+    session: Session, adapter: Adapter, recurrent: Mapping[str, str]
+) -> dict[str, str]:
+    """Map recurrent inputs to the inputs whose value they take where a route begins.
 
-@dataclass(frozen=True)
-class FirstValues:
-    """What recurrent inputs hold at the first decision of a route.
+    All others begin with zeros.
 
-    ``given`` maps a recurrent input to the input whose value it takes; ``zeros`` are
-    for inputs that only the adapter calls recurrent.
+    Raises:
+        EvaluationError: An input does not exist, is recurrent itself, or does not fit.
     """
-
-    given: Mapping[str, str]
-    zeros: Mapping[str, Array]
-
-    @classmethod
-    def of(
-        cls, session: Session, entries: Entries, recurrent: Mapping[str, str]
-    ) -> Self:
-        """Check every value against its input."""
-        given: dict[str, str] = {}
-        ports = session.inputs
-        for name, entry in (entries or {}).items():
-            if (source := entry.first) == ZEROS:
-                continue
-            where = f"first value of {name}: {source}"
-            if source not in ports or source in recurrent:
-                others = ", ".join(port for port in ports if port not in recurrent)
-                raise EvaluationError(
-                    f"{where} is neither {ZEROS} nor an input that is not recurrent;"
-                    f" those are {others or 'none'}"
-                )
-            port, other = ports[name], ports[source]
-            if other.type != port.type or not fits(other.shape, port.shape):
-                raise EvaluationError(
-                    f"{where} is {other.type} {list(other.shape)}, the input takes"
-                    f" {port.type} {list(port.shape)}"
-                )
-            given[name] = source
-        # All others start from zeros
-        unset = [name for name in recurrent if name not in {*given, *session.recurrent}]
-        return cls(given, {name: zero_state(name, ports[name]) for name in unset})
-
-    def at(self, feeds: Mapping[str, Array]) -> dict[str, Array]:
-        """Return those that are not zeros, given the feeds of the first decision."""
-        return {to: feeds[name] for to, name in self.given.items()}
+    values, ports = dict[str, str](), session.inputs
+    for name, entry in (adapter.recurrent or {}).items():
+        if (source := entry.first) == ZEROS:
+            continue
+        where = f"first value of {name}: {source}"
+        if source not in ports or source in recurrent:
+            others = ", ".join(port for port in ports if port not in recurrent)
+            raise EvaluationError(
+                f"{where} is neither {ZEROS} nor an input that is not recurrent;"
+                f" those are {others or 'none'}"
+            )
+        port, other = ports[name], ports[source]
+        if other.type != port.type or not fits(other.shape, port.shape):
+            raise EvaluationError(
+                f"{where} is {other.type} {list(other.shape)}, the input takes"
+                f" {port.type} {list(port.shape)}"
+            )
+        values[name] = source
+    return values
 
 
 @dataclass
@@ -89,8 +74,8 @@ class OnnxPolicy:
     adapter: Adapter
     inputs: ModelInputs
     reads: PlanAdapter
-    recurrent: dict[str, str]
-    first: FirstValues
+    recurrent: dict[str, str]  # input to the output that answers it
+    first: Mapping[str, str]  # recurrent input to the input whose value it begins with
     stage: HostStage | None = None
     host_iterations: int = field(default=0, init=False)
     host_cells: int = field(default=0, init=False)
@@ -131,7 +116,7 @@ class OnnxPolicy:
         recurrent = recurrent_of(session, adapter)
         inputs = ModelInputs.of(session, adapter, recurrent)
         reads = plan_read(session, adapter)
-        first = FirstValues.of(session, adapter.recurrent, recurrent)
+        first = first_sources(session, adapter, recurrent)
         policy = cls(session, adapter, inputs, reads, recurrent, first, stage)
         # Find a misfit that only a run shows
         policy.reset(None)
@@ -158,43 +143,33 @@ class OnnxPolicy:
     def reset(self, route: RouteInfo | None) -> None:
         """Begin a route: recurrent inputs return to their first values."""
         self._begins = True
-        known = self.session.first_state({})
         self.inputs.reset()
-        own = {name: known[name] for name in known if name in self.recurrent}
-        self._state = {**self.first.zeros, **own}
+        ports, begin = self.session.inputs, self.recurrent.keys() - self.first.keys()
+        self._state = {name: zero_state(name, ports[name]) for name in sorted(begin)}
+
+    def first_values(self, feeds: Mapping[str, Array]) -> dict[str, Array]:
+        """Return the recurrent inputs that begin with an input's value, and that."""
+        return {name: feeds[source] for name, source in self.first.items()}
 
     def plan(self, observation: Observation) -> Trajectory:
         """Run the model once."""
         # Run the model, with first values where a route begins
         feeds = self.inputs.feeds(observation)
         if self._begins:
-            self._state |= self.first.at(feeds)
+            self._state |= self.first_values(feeds)
         outputs = self.session.run({**self._state, **feeds})
         self._begins = False
         self._state = {name: outputs[to] for name, to in self.recurrent.items()}
-        # Convert the plan to the ego frame; the host stage may change it
-        plan = self.trajectory(outputs, feeds, observation)
-        if self.stage is not None:  # it changes six waypoints every 0.5 s
+        # Read the plan, and convert it to the ego frame
+        command = np.array([observation.command])
+        points = self.reads.plan(outputs, {**feeds, COMMAND: command})
+        plan = self.reads.trajectory(self.adapter.to_ego(points))
+        # The host stage changes six waypoints every 0.5 s
+        if self.stage is not None:
             work = self.stage.work(six_waypoints(plan), outputs)
-            if not isinstance(work, HostWork):
-                raise EvaluationError(
-                    f"{self.stage.name}: work returned {type(work).__name__}: it must"
-                    " be a HostWork"
-                )
             self.host_iterations, self.host_cells = work.iterations, work.cells
             plan = Trajectory(work.plan, PLAN_TIMES_S)
         return plan
-
-    def trajectory(
-        self,
-        outputs: Mapping[str, Array],
-        feeds: Mapping[str, Array],
-        observation: Observation,
-    ) -> Trajectory:
-        """Return the plan in the ego frame."""
-        command = np.array([observation.command])
-        points = self.reads.plan(outputs, {**feeds, COMMAND: command})
-        return self.reads.trajectory(self.adapter.to_ego(points))
 
 
 def recurrent_of(session: Session, adapter: Adapter) -> dict[str, str]:

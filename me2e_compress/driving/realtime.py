@@ -72,15 +72,10 @@ class ControlClock(Generic[T]):
     fast decision does not overtake a slow one before it. As many decisions run side by
     side as the delay has frames, so that says what a delay does, not what one computer
     that takes t can do.
-
-    Args:
-        in_force: The control before any decision acts.
-        dt_us: Step of the simulated world, microseconds.
-        model: Whether decisions are dropped, or all controls delayed.
     """
 
-    in_force: T
-    dt_us: int = DT_US
+    in_force: T  # at first the control before any decision acts
+    dt_us: int = DT_US  # step of the simulated world, microseconds
     model: LatencyModel = LatencyModel.DROP
     _frame: int = field(default=0, init=False)
     _due: int = field(default=0, init=False)

@@ -100,17 +100,12 @@ def test_a_stage_that_does_not_fit_is_refused_before_anything_drives(
         driver_named(policy)
 
 
-def test_a_model_without_the_output_or_no_host_work_is_named_when_it_is_opened(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_model_without_the_output_is_named_when_it_is_opened(tmp_path: Path) -> None:
     driver = OnnxDriver(
         straight_on(tmp_path / "m.onnx"), host_stage=CollisionOptimizer()
     )
 
     with pytest.raises(EvaluationError, match=r"m.onnx: .* no output occupancy; there"):
-        driver.open()
-    monkeypatch.setattr(CollisionOptimizer, "work", lambda self, plan, outputs: plan)
-    with pytest.raises(EvaluationError, match="work returned ndarray: it must be a Ho"):
         driver.open()
 
 

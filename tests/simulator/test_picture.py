@@ -138,5 +138,3 @@ def test_a_place_that_cannot_be_written_is_named(tmp_path: Path, name: str) -> N
     with pytest.raises(EvaluationError, match=f"{name}: the picture cannot be"):
         write_picture(path, [picture(moment(0)).frame(0)])
     assert not list(tmp_path.iterdir())
-
-

@@ -54,7 +54,7 @@ class AdaptedInputs:
         seen = self._observation(log, scene, at, before)
         try:
             feeds = self.policy.inputs.feeds(seen)
-            first = self.policy.first.at(feeds) if before is None else {}
+            first = self.policy.first_values(feeds) if before is None else {}
         except EvaluationError as error:
             raise FramesError(f"{log.name}: {error}") from error
         return {**feeds, **first}

@@ -35,18 +35,13 @@ ZEROS = "zeros"
 
 
 class RecurrentEntry(BaseModel):
-    """One entry of ``[recurrent]``; a text alone is the output.
-
-    Attributes:
-        answer: The output that is fed back; in the file ``from``. None leaves it to the
-            model's metadata and the naming rules.
-        first: The value where a route begins: ``zeros``, or an input of the graph,
-            whose value at that moment it takes.
-    """
+    """One entry of ``[recurrent]``; a text alone is the output."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
+    # The output that is fed back; None leaves it to metadata and naming rules
     answer: str | None = Field(default=None, alias="from")
+    # The value where a route begins: zeros, or that of this input of the graph
     first: str = ZEROS
 
     @model_validator(mode="before")
@@ -154,31 +149,18 @@ Contract: TypeAlias = Literal["img", "lidar2img", "can_bus", "command", "timesta
 
 
 class Adapter(BaseModel):
-    """The contents of a TOML adapter; what is left out follows from the model.
-
-    Attributes:
-        inputs: The contract's name (img, lidar2img, can_bus, command, timestamp) to the
-            graph's.
-        feeds: The sources of each other input of the graph, by its name.
-        images: The settings of each image input, by its name.
-        recurrent: Recurrent input to the output that answers it, and to its first
-            value; inputs that the adapter feeds in another way are not recurrent.
-        plan: Which output is the plan, the times of its waypoints, whether it holds
-            steps, which mode is taken; ``command_input = "command"`` lets the
-            navigator's command pick it.
-        image: Normalisation of image inputs that have none of their own.
-        axes: Ground frame of the model.
-    """
+    """The contents of a TOML adapter; what is left out follows from the model."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    inputs: dict[Contract, str] = {}
-    feeds: dict[str, Feed] = {}
-    images: dict[str, ImageInput] = {}
+    inputs: dict[Contract, str] = {}  # the contract's name to the graph's
+    feeds: dict[str, Feed] = {}  # by input of the graph
+    images: dict[str, ImageInput] = {}  # by input of the graph
+    # By recurrent input; inputs that the adapter feeds in another way are not recurrent
     recurrent: dict[str, RecurrentEntry] | None = None
-    plan: PlanAdapter | None = None
-    image: ImageNormalization | None = None
-    axes: Axes = Axes.FORWARD_LEFT
+    plan: PlanAdapter | None = None  # which output is the plan, and how it is read
+    image: ImageNormalization | None = None  # of image inputs without one of their own
+    axes: Axes = Axes.FORWARD_LEFT  # ground frame of the model
 
     @classmethod
     def load(cls, path: Path) -> Self:

@@ -23,7 +23,17 @@ from me2e_compress.runtime.frames import Array
 
 IMAGE = "me2e.image"  # metadata key: JSON of `ImageNormalization`
 
+CameraName = Literal[
+    "FRONT", "FRONT_LEFT", "FRONT_RIGHT", "BACK", "BACK_LEFT", "BACK_RIGHT"
+]
+# In the order of `Observation.images`
+CAMERA_NAMES: tuple[CameraName, ...] = get_args(CameraName)
+
+Side: TypeAlias = Annotated[int, Field(ge=1, le=8192)]
+Size: TypeAlias = tuple[Side, Side]
+Crop: TypeAlias = tuple[int, int, int, int]
 Triple: TypeAlias = tuple[float, float, float]
+Bytes = npt.NDArray[np.uint8]
 
 
 def _divides(std: Triple) -> Triple:
@@ -36,23 +46,15 @@ Divisors: TypeAlias = Annotated[Triple, AfterValidator(_divides)]
 
 
 class ImageNormalization(BaseModel):
-    """How pixels become an image input: (scale * pixel - mean) / std, by channel.
-
-    Attributes:
-        input: Name of the image input.
-        mean: In grey levels 0 to 255 (times `scale`), in the order of `order`.
-        std: Like mean.
-        order: Channels of the model: red first or blue first.
-        scale: Factor on pixels before mean and std.
-    """
+    """How pixels become an image input: (scale * pixel - mean) / std, by channel."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
-    input: str = "img"
-    mean: Triple
+    input: str = "img"  # name of the image input
+    mean: Triple  # in grey levels 0 to 255 (times scale), channels as in order
     std: Divisors
-    order: Literal["rgb", "bgr"]
-    scale: float = Field(default=1.0, gt=0.0)
+    order: Literal["rgb", "bgr"]  # channels of the model
+    scale: float = Field(default=1.0, gt=0.0)  # factor on pixels before mean and std
 
     @classmethod
     def of(cls, metadata: Mapping[str, str]) -> Self:
@@ -81,49 +83,29 @@ class ImageNormalization(BaseModel):
         return ready[None]
 
 
-CameraName = Literal[
-    "FRONT", "FRONT_LEFT", "FRONT_RIGHT", "BACK", "BACK_LEFT", "BACK_RIGHT"
-]
-# In the order of `Observation.images`
-CAMERA_NAMES: tuple[CameraName, ...] = get_args(CameraName)
-
-Side: TypeAlias = Annotated[int, Field(ge=1, le=8192)]
-Size: TypeAlias = tuple[Side, Side]
-Crop: TypeAlias = tuple[int, int, int, int]
-
-
 class ImageInput(BaseModel):
     """What an image input shows; what is left out follows from the graph.
 
-    Attributes:
-        cameras: Names of the cameras, in the model's order.
-        camera_size: Rows and columns of a camera's picture, to which `crop` refers.
-        rendered: Rows and columns that cameras are rendered in, if not `camera_size`;
-            whole pictures are scaled to it.
-        crop: Left, top, right and bottom, pixels of `camera_size`, of each camera, or
-            of one for all; None takes whole pictures.
-        stitch: Join the cameras from left to right into one picture.
-        size: Rows and columns to which the result is resized, bilinearly; if the input
-            is larger, the rest below and to the right is zero.
-        layout: Letters of the dimensions: b batch, n cameras, c channels, h rows, w
-            columns.
-        mean: See `ImageNormalization`; the default is that of the adapter's [image] or
-            of the model's metadata. An input of uint8 takes no normalisation.
-        std: Like mean.
-        scale: Factor on grey levels before mean and std: 0.00392156862745098 (1 / 255)
-            where these are of 0 to 1.
-        order: Red first or blue first.
+    Sizes are rows and columns.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
+    # Names of the cameras, in the model's order
     cameras: tuple[CameraName, ...] = Field(default=CAMERA_NAMES, min_length=1)
-    camera_size: Size | None = None
-    rendered: Size | None = None
+    camera_size: Size | None = None  # of a camera's picture, in which `crop` counts
+    rendered: Size | None = None  # of the pictures as they are rendered, if not that
+    # Left, top, right and bottom of each camera, or of one for all; None takes whole
+    # pictures
     crop: tuple[Crop, ...] | None = None
-    stitch: bool = False
+    stitch: bool = False  # join the cameras, from left to right, into one picture
+    # To which the result is resized, bilinearly; in a larger input the rest, below and
+    # to the right, is zero
     size: Size | None = None
+    # Letters of the dimensions: batch, n cameras, channels, h rows, w columns
     layout: str | None = None
+    # Normalisation; by default that of the adapter's [image] or the model's metadata.
+    # An input of uint8 takes none.
     mean: Triple | None = None
     std: Divisors | None = None
     scale: float = Field(default=1.0, gt=0.0)
@@ -178,13 +160,10 @@ class ImageInput(BaseModel):
 
 @dataclass(frozen=True)
 class ImagePort:
-    """The layout of an image input of a graph, and its size.
-
-    ``size`` is rows and columns, from the graph if it fixes them, else the usual ones.
-    """
+    """The layout of an image input of a graph, and its size."""
 
     layout: str
-    size: tuple[int, int]
+    size: tuple[int, int]  # rows and columns, by default the usual ones
 
     @classmethod
     def of(cls, name: str, shape: Shape, table: ImageInput) -> Self:
@@ -239,21 +218,14 @@ def rendered_size(name: str, table: ImageInput, port: ImagePort) -> tuple[int, i
 # Convert camera pictures to the images that a graph takes.
 
 
-Bytes = npt.NDArray[np.uint8]
-Floats = npt.NDArray[np.float32]
-
-
 @dataclass(frozen=True, eq=False)
 class InputImages:
-    """Makes one image input from the cameras' pictures.
-
-    ``rendered`` holds their rows and columns; ``normalization`` None leaves bytes.
-    """
+    """Makes one image input from the cameras' pictures."""
 
     table: ImageInput
     port: ImagePort
-    rendered: tuple[int, int]
-    normalization: ImageNormalization | None
+    rendered: tuple[int, int]  # rows and columns of the cameras' pictures
+    normalization: ImageNormalization | None  # None leaves bytes
 
     @property
     def indices(self) -> tuple[int, ...]:
@@ -324,11 +296,11 @@ class InputImages:
         chosen = lidar2img[list(self.indices)]
         # From rendered pixels of a camera to those of this input: move, then scale
         widths = [right - left for left, _, right, _ in self.windows]
-        moves = np.tile(np.eye(4), (len(widths), 1, 1))
+        moves = np.tile(np.eye(4), (len(widths), 1, 1))  # (cameras, 4, 4)
         for at, (left, top, _, bottom) in enumerate(self.windows):
-            stitched = self.table.stitch
-            before = sum(widths[:at]) if stitched else 0
-            across = self.size[1] / (sum(widths) if stitched else widths[at])
+            # Stitched cameras follow each other in one picture
+            before = sum(widths[:at]) if self.table.stitch else 0
+            across = self.size[1] / (sum(widths) if self.table.stitch else widths[at])
             down = self.size[0] / (bottom - top)
             moves[at, 0, 0], moves[at, 1, 1] = across, down
             moves[at, 0, 2], moves[at, 1, 2] = across * (before - left), -down * top
@@ -338,17 +310,9 @@ class InputImages:
 
     def _pictures(self, images: Bytes) -> Bytes:
         """Crop, stitch and resize: return uint8 RGB [pictures, h, w, 3]."""
-        rows, columns = self.rendered
-        # Whole pictures of the right size need no copy
-        whole = set(self.windows) == {(0, 0, columns, rows)}
-        if whole and self.size == self.rendered and not self.table.stitch:
-            every = self.indices == tuple(range(len(images)))
-            return images if every else images[list(self.indices)]
         # Crop and stitch
-        parts = list[Bytes]()
-        for index, window in zip(self.indices, self.windows, strict=True):
-            left, top, right, bottom = window
-            parts.append(images[index, top:bottom, left:right])
+        cameras = zip(self.indices, self.windows, strict=True)
+        parts = [images[i, top:bottom, a:b] for i, (a, top, b, bottom) in cameras]
         if self.table.stitch:
             parts = [np.concatenate(parts, axis=1)]
         if all(part.shape[:2] == self.size for part in parts):

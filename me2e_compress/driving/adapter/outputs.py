@@ -217,22 +217,13 @@ def _check_fit(
 
 @dataclass(frozen=True)
 class PortUse:
-    """One input or output of a graph, and its part in driving.
-
-    ``use`` is an input's feed or how an output is read, None for nothing; ``problem``
-    says why the model cannot drive so, and is empty where it can.
-    """
+    """One input or output of a graph, and its part in driving."""
 
     name: str
     shape: Shape
-    type: str
-    use: str | None
-    problem: str = ""
-
-
-def element_type(of_port: str) -> str:
-    """Return ``int64`` of ``tensor(int64)``."""
-    return of_port.removeprefix("tensor(").removesuffix(")")
+    type: str  # of its elements, like int64
+    use: str | None  # an input's feed or how an output is read; None for nothing
+    problem: str = ""  # why the model cannot drive so; empty where it can
 
 
 def input_uses(
@@ -269,8 +260,9 @@ def _uses(
 ) -> tuple[PortUse, ...]:
     uses = list[PortUse]()
     for name, port in ports.items():
-        what = element_type(port.type), words.get(name), problems.get(name, "")
-        uses.append(PortUse(name, port.shape, *what))
+        element = port.type.removeprefix("tensor(").removesuffix(")")
+        use, problem = words.get(name), problems.get(name, "")
+        uses.append(PortUse(name, port.shape, element, use, problem))
     return tuple(uses)
 
 

@@ -233,9 +233,6 @@ class TargetPoint(InputSource):
         return seen.turned(points[0 if self.which == "near" else 1])
 
 
-MICROSECONDS = 1_000_000  # microseconds in a second
-
-
 @dataclass(frozen=True)
 class Timestamp(InputSource):
     """Time since the route began: [].
@@ -252,7 +249,7 @@ class Timestamp(InputSource):
         time_us = seen.observation.time_us
         if self.unit == "us":
             return np.asarray(time_us, np.int64)
-        return np.asarray(time_us / MICROSECONDS)
+        return np.asarray(time_us / 1e6)
 
 
 @dataclass(frozen=True)

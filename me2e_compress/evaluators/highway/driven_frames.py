@@ -109,7 +109,7 @@ def _feeds_of_scene(
         if since_us >= 0 and since_us % STEP_US == 0:
             observation = replace(watching.observe(scene), time_us=since_us)
             feeds = policy.inputs.feeds(observation)
-            yield {**feeds, **(policy.first.at(feeds) if missing == length else {})}
+            yield {**feeds, **(policy.first_values(feeds) if missing == length else {})}
             missing -= 1
         plan = driver.plan(driving.observe(scene))
         anchored = AnchoredPlan.of(plan, scene.ego, scene.time_us)

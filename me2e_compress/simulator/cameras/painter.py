@@ -165,7 +165,7 @@ class Painter:
         every = np.arange(len(self.rig.positions))[:, None, None]
         right, forward = self._right_and_forward(footprints, every)
         edge = forward * (self.rig.centre_px[0] / self.rig.focals_px)[:, None, None]
-        hidden = (forward < NEAR_M).all(axis=1)
+        hidden = np.asarray((forward < NEAR_M).all(axis=1))
         hidden |= (right > edge).all(axis=1) | (right < -edge).all(axis=1)
         return right, forward, ~hidden
 

@@ -46,10 +46,8 @@ class Regulator:
         left = self.line.moved(0.0, self.width_m / 2)
         right = self.line.moved(0.0, -self.width_m / 2)
         post = self.line.moved(0.5, -self.width_m / 2 - 0.8)
-        pose, ends = (
-            (post.x, post.y, post.heading),
-            ((left.x, left.y), (right.x, right.y)),
-        )
+        ends = (left.x, left.y), (right.x, right.y)
+        pose = post.x, post.y, post.heading
         return Signal(self.id, self.kind, *pose, self.state, ends)
 
     def check(self, front_s: float, tail_s: float, speed: float) -> EventKind | None:
