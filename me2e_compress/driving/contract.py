@@ -55,8 +55,7 @@ __all__ = [
 
 Shape = tuple[int | str | None, ...]
 
-DEFAULT_IMAGE_SIZE = (96, 160)
-"""Rows and columns for a model that takes any size."""
+DEFAULT_IMAGE_SIZE = (96, 160)  # rows and columns for a model that takes any size
 
 
 def shaped(array: Array, port: SessionPort) -> Array:
@@ -75,8 +74,8 @@ def fits(shape: Shape, wanted: Shape) -> bool:
 
 
 Triple = tuple[float, float, float]
+# An option that is a finite number above 0
 Positive: TypeAlias = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
-"""An option that is a finite number above 0."""
 Count: TypeAlias = Annotated[int, Field(ge=0)]
 
 
@@ -95,13 +94,12 @@ class EgoKinematics:
     angular_velocity_radps: Triple
 
 
+# Six waypoints [6, 2], one every 0.5 s: metres in the ego frame of the observation, x
+# forward, y left; the first is where the ego is to be 0.5 s later
 Plan = npt.NDArray[np.floating]
-"""Six waypoints [6, 2], one every 0.5 s: metres in the ego frame of the observation, x
-forward, y left; the first is where the ego is to be 0.5 s later."""
 
 PLAN_SHAPE = (6, 2)
-PLAN_STEP_US = 500_000
-"""Microseconds between two waypoints."""
+PLAN_STEP_US = 500_000  # microseconds between two waypoints
 CAN_BUS_SIZE = 18
 
 
@@ -113,8 +111,8 @@ class PedalsAndWheel(NamedTuple):
     brake: float
 
 
+# A policy's decision: waypoints, or controls
 Answer: TypeAlias = Plan | Trajectory | PedalsAndWheel
-"""A policy's decision: waypoints, or controls."""
 
 
 class RouteInfo(Protocol):
@@ -126,12 +124,10 @@ class RouteInfo(Protocol):
     @property
     def id(self) -> str:
         """Return the route's name, unique in its set."""
-        ...
 
     @property
     def seed(self) -> int:
         """Return the seed of all randomness on the route, the policy's included."""
-        ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -190,12 +186,10 @@ class Policy(Protocol):
     @property
     def needs_images(self) -> bool:
         """Whether the cameras must be rendered."""
-        ...
 
     @property
     def privileged(self) -> bool:
         """Whether it gets ground truth: `Observation.scene` and `Observation.world`."""
-        ...
 
     def reset(self, route: RouteInfo) -> None:
         """Prepare for a route: reset recurrent state to its initial value.
@@ -210,7 +204,6 @@ class Policy(Protocol):
         `Trajectory` of waypoints with their times. Numbers are floating point and
         finite. The run time counts only where latency is measured.
         """
-        ...
 
 
 @runtime_checkable
@@ -220,22 +213,20 @@ class HostedPolicy(Policy, Protocol):
     @property
     def host_iterations(self) -> int:
         """Return the solver's iterations; 0 if there was nothing to do."""
-        ...
 
     @property
     def host_cells(self) -> int:
         """Return the number of occupied cells taken into account."""
-        ...
 
 
 # Check a policy's answer, and bring it into one form.
 
 
+# Times of the waypoints of a `Plan`, seconds
 PLAN_TIMES_S = (1 + np.arange(PLAN_SHAPE[0])) * (PLAN_STEP_US / 1e6)
-"""Times of the waypoints of a `Plan`, seconds."""
 
+# Ranges of the controls in `PedalsAndWheel`
 RANGES = {"throttle": (0.0, 1.0), "steer": (-1.0, 1.0), "brake": (0.0, 1.0)}
-"""Ranges of the controls in `PedalsAndWheel`."""
 
 
 def checked(answer: object) -> Trajectory | PedalsAndWheel:

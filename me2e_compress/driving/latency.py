@@ -56,8 +56,8 @@ class DecisionFacts:
     host_cells: int = 0
 
 
+# Maps the facts of a decision to the microseconds it takes on the vehicle
 Charge = Callable[[DecisionFacts], int]
-"""Maps the facts of a decision to the microseconds it takes on the vehicle."""
 
 
 @dataclass(frozen=True)

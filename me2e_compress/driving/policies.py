@@ -36,7 +36,6 @@ class SizedPolicy(Policy, Protocol):
     @property
     def image_size(self) -> tuple[int, int]:
         """Rows and columns of each camera."""
-        ...
 
 
 @dataclass(frozen=True)

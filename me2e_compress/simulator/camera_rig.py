@@ -27,6 +27,9 @@ SIDES_PX = (16, 4096)
 CameraName = Literal[
     "FRONT", "FRONT_LEFT", "FRONT_RIGHT", "BACK", "BACK_LEFT", "BACK_RIGHT"
 ]
+Share = Annotated[float, Field(ge=0.0, le=1.0)]
+# Weather of routes: a third of them have some
+DRAWN = ("clear",) * 8 + ("rain", "night", "fog", "dirt")
 
 
 @dataclass(frozen=True, slots=True)
@@ -130,9 +133,6 @@ def fixed_point(pixels: Floats) -> npt.NDArray[np.int32]:
 # Weather and sensor faults that a route can be driven in.
 
 
-Share = Annotated[float, Field(ge=0.0, le=1.0)]
-
-
 @with_config(ConfigDict(extra="forbid"))
 @dataclass(frozen=True, slots=True)
 class Weather:
@@ -158,10 +158,6 @@ class Weather:
 
 
 CLEAR = Weather()
-
-
-# Weather of routes: a third of them have some
-DRAWN = ("clear",) * 8 + ("rain", "night", "fog", "dirt")
 
 
 def drawn_weather(kind: str, strength: float, seed: int) -> Weather:

@@ -135,7 +135,7 @@ PICTURE = "float[1, 3, 8, 8] v"
         ("float[1] v", "[feeds.w]\nsource = 'speed'", "names input w; there are v"),
         ("float[1] v", "[images.w]", "the adapter names input w; there are v"),
         ("float[1, 2] v", "[feeds.v]\nsource = 'speed'", r"input v has shape \[1, 2\]"),
-        ("float[1, 8] state", STATE, r"must be \[1, 9\]: it is speed 1, target-point"),
+        ("float[1, 8] state", STATE, r"state has shape \[1, 8\], it must be \[1, 9\]"),
         ("float[1, 4] v", f"{COMMAND}\none_hot = 6", r"\[1, 4\], it must be \[1, 6\]"),
         ("int64[1] v", SPEED, r"input v is tensor\(int64\), a"),
         ("float[1] v", f"{SPEED}\nmean = [1, 2]", "input v: speed: mean and std make"),

@@ -126,23 +126,12 @@ class Feed(BaseModel):
             return {**table, "joined": True}
         return {"parts": (table,)}
 
-    @classmethod
-    def by(cls, source: InputSource) -> Self:
-        """Return the feed of one source without normalisation."""
-        part = FeedPart.model_construct(source=source)
-        return cls.model_construct(parts=(part,))
-
     def value(self, seen: Observed) -> Array:
         """Return the input's value, without a batch dimension."""
         arrays = [part.value(seen) for part in self.parts]
         if not self.joined:
             return arrays[0]
         return np.concatenate([array.reshape(-1) for array in arrays])
-
-    def sizes(self, seen: Observed) -> str:
-        """Name the sources with their element counts, for messages."""
-        parts = ((p.source.name, p.source.value(seen).size) for p in self.parts)
-        return ", ".join(f"{name} {size}" for name, size in parts)
 
 
 Contract: TypeAlias = Literal["img", "lidar2img", "can_bus", "command", "timestamp"]

@@ -80,7 +80,7 @@ class ModelInputs:
         if names[IMAGES] in ports and names[IMAGES] not in named:
             tables = {names[IMAGES]: ImageInput(), **tables}
         given = {
-            names[ours]: Feed.by(INPUT_SOURCES.build(source, {}))
+            names[ours]: Feed.model_validate({"source": source})
             for ours, source in CONTRACT.items()
             if names[ours] in ports and names[ours] not in named
         } | {k: v for k, v in adapter.feeds.items() if k in ports}
@@ -145,12 +145,10 @@ class ModelInputs:
         seen, faults = self._seen(nothing), dict[str, str]()
         for name, feed in self.given.items():
             try:
-                array, sizes = feed.value(seen), feed.sizes(seen)
+                fault = _fault(name, self.ports[name], feed.value(seen))
             except EvaluationError as error:
-                faults[name] = f"input {name}: {error}"
-                continue
-            sizes = sizes if feed.joined else ""
-            if fault := _fault(name, self.ports[name], array, sizes):
+                fault = f"input {name}: {error}"
+            if fault:
                 faults[name] = fault
         self._track.clear()
         return faults
@@ -219,13 +217,12 @@ def _exists(name: str, ports: Mapping[str, SessionPort], kind: str) -> None:
         )
 
 
-def _fault(name: str, port: SessionPort, array: Array, sizes: str) -> str:
+def _fault(name: str, port: SessionPort, array: Array) -> str:
     """Say how an array does not fit a port, which may have a batch of one before it."""
     shape: Shape = port.shape
     batch = (1,) * (len(shape) - array.ndim)
     if not fits(shape, (*batch, *array.shape)):
-        fault = f"input {name} has shape {list(shape)}, it must be {[1, *array.shape]}"
-        return f"{fault}: it is {sizes}" if sizes else fault
+        return f"input {name} has shape {list(shape)}, it must be {[1, *array.shape]}"
     # The types must agree
     if not np.can_cast(array.dtype, DTYPES[port.type], "same_kind"):
         return f"input {name} is {port.type}, and what feeds it {array.dtype}"

@@ -7,7 +7,7 @@ import abc
 import math
 from bisect import bisect_right
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from enum import StrEnum
 from typing import ClassVar
 
@@ -25,14 +25,13 @@ __all__ = ["INPUT_SOURCES", "InputSource", "Observed"]
 class Axes(StrEnum):
     """Ground frame of a model's waypoints and of its lidar2img."""
 
-    FORWARD_LEFT = "forward-left"
-    """x forward, y left: ours."""
+    FORWARD_LEFT = "forward-left"  # x forward, y left: ours
+    # x right, y forward: the lidar of nuScenes, of UniAD and of VAD
     RIGHT_FORWARD = "right-forward"
-    """x right, y forward: the lidar of nuScenes, of UniAD and of VAD."""
+    # x forward, y right, left-handed: CARLA's, and Bench2DriveZoo's TCP's
     FORWARD_RIGHT = "forward-right"
-    """x forward, y right, left-handed: CARLA's, and Bench2DriveZoo's TCP's."""
+    # x right, y backward, left-handed: OpenDriveLab's TCP's
     RIGHT_BACKWARD = "right-backward"
-    """x right, y backward, left-handed: OpenDriveLab's TCP's."""
 
     @property
     def to_ego(self) -> npt.NDArray[np.float64]:
@@ -87,15 +86,13 @@ def can_bus_between(
 Floats = npt.NDArray[np.float64]
 
 
-@dataclass
 class EgoTrack:
     """Poses and speeds by time, since the route began."""
 
-    decisions: int = field(default=0, init=False)
-    _times_us: list[int] = field(default_factory=list, init=False)
-    _states: list[tuple[float, float, float, float]] = field(
-        default_factory=list, init=False
-    )
+    def __init__(self) -> None:
+        self.decisions = 0
+        self._times_us = list[int]()
+        self._states = list[tuple[float, float, float, float]]()
 
     def note(self, time_us: int, motion: EgoKinematics | None) -> None:
         """Count a decision, and keep the ego's pose if it is known."""

@@ -40,6 +40,25 @@ LINE_M = 0.2  # a little wider than the 0.15 m of real lines: our images are sma
 DASH_M, DASH_PERIOD_M, DASH_STEP_M = 3.0, 9.0, 0.5
 STOP_LINE_M = 0.5
 BAR_M, BAR_PERIOD_M = 0.5, 1.0  # zebra bars
+# Metres of a texel at the finest level: a 0.15 m line is just wider than one
+RESOLUTION_M = 0.125
+LEVELS = 6
+# How far the texture reaches beyond the route's bounding box. What lies further repeats
+# its border, which continues a straight road.
+MARGIN_M = 60.0
+GRASS = (92, 122, 70)
+# Grey levels of the mottling
+GRASS_GRAIN, ASPHALT_GRAIN = np.float32(10.0), np.float32(3.0)
+# Metres of a patch, and its share of the mottling
+GRAINS = ((16.0, 0.8), (2.0, 0.6), (0.5, 0.4))
+ROWS_AT_ONCE = 32
+FARTHEST_M = 400.0  # depth of the last row before the horizon, at most
+SKY_M = 4000.0  # the sky counts as this far away
+# From these depths (metres) on, a row is the mean of this many samples
+TAPS = ((0.0, 1), (10.0, 4))
+# A mip level is chosen whose texel is this part of a sample's length on the ground:
+# less shimmers, more blurs
+BLUR = 0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,20 +155,6 @@ def paint_crosswalks(plan: GroundPlan, roadmap: Roadmap) -> None:
             plan.strip(bar, BAR_M, WHITE, PixelClass.CROSSWALK)
 
 
-# Metres of a texel at the finest level: a 0.15 m line is just wider than one
-RESOLUTION_M = 0.125
-LEVELS = 6
-# How far the texture reaches beyond the route's bounding box. What lies further repeats
-# its border, which continues a straight road.
-MARGIN_M = 60.0
-GRASS = (92, 122, 70)
-# Grey levels of the mottling
-GRASS_GRAIN, ASPHALT_GRAIN = np.float32(10.0), np.float32(3.0)
-# Metres of a patch, and its share of the mottling
-GRAINS = ((16.0, 0.8), (2.0, 0.6), (0.5, 0.4))
-ROWS_AT_ONCE = 32
-
-
 @dataclass(frozen=True, eq=False)
 class GroundTexture:
     """The painted ground around a route."""
@@ -226,15 +231,6 @@ def _add_grain(plan: GroundPlan, rng: np.random.Generator) -> None:
 # turn and move with the ego, and the pixels of all rows of all cameras are one outer
 # product. Rows far away are short in the image and long on the ground: they are sampled
 # several times, which keeps distant lines from flickering.
-
-
-FARTHEST_M = 400.0  # depth of the last row before the horizon, at most
-SKY_M = 4000.0  # the sky counts as this far away
-# From these depths (metres) on, a row is the mean of this many samples
-TAPS = ((0.0, 1), (10.0, 4))
-# A mip level is chosen whose texel is this part of a sample's length on the ground:
-# less shimmers, more blurs
-BLUR = 0.5
 
 
 @dataclass(frozen=True, eq=False)

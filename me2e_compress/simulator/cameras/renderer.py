@@ -35,6 +35,15 @@ MOONLIGHT = 0.12  # share of the day's light that is left at night = 1
 # dipped beam lights some 40 to 60 m of road)
 BEAM_M, BEAM_RAD = 32.0, 0.45
 DULL = 0.25  # share of the light that heavy rain takes
+RAIN_NOISE = 5.0  # grey levels of noise that heavy rain adds
+STREAKS = 60  # streaks in an image in the heaviest rain
+STREAK_LEVEL = 46
+POOL = 2  # the noise comes from a pool of this many sets of images, at a random offset
+ZENITH, HAZE = (128, 170, 224), (216, 228, 238)
+HILLS, TREES = (122, 146, 142), (66, 94, 60)
+COLUMNS, ROWS = 2880, 64  # panorama: 0.125 degrees a column
+# Tangent of the elevation of the panorama's upper edge; above it the sky is even
+TALLEST = 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,12 +109,6 @@ class Atmosphere:
         return np.asarray(np.exp(-KOSCHMIEDER * extinction * distance))
 
 
-RAIN_NOISE = 5.0  # grey levels of noise that heavy rain adds
-STREAKS = 60  # streaks in an image in the heaviest rain
-STREAK_LEVEL = 46
-POOL = 2  # the noise comes from a pool of this many sets of images, at a random offset
-
-
 @dataclass(frozen=True, eq=False)
 class Sensor:
     """Adds sensor faults; the same weather, seed and time give the same bytes."""
@@ -152,13 +155,6 @@ class Sensor:
         rng = np.random.default_rng(self.weather.seed)
         noise = rng.normal(0.0, self._deviation, (rows, self.rig.width, 3))
         return np.rint(noise).astype(np.int16)
-
-
-ZENITH, HAZE = (128, 170, 224), (216, 228, 238)
-HILLS, TREES = (122, 146, 142), (66, 94, 60)
-COLUMNS, ROWS = 2880, 64  # panorama: 0.125 degrees a column
-# Tangent of the elevation of the panorama's upper edge; above it the sky is even
-TALLEST = 0.1
 
 
 @dataclass(frozen=True, eq=False)

@@ -31,6 +31,13 @@ from me2e_compress.simulator.scene import (
 
 
 VEHICLE_SHADOW = shadow((-0.53, 0.53), (-0.56, 0.56))
+POLE_M = 0.06
+# Half width, lower and upper edge. Housing and lamps are half as large again as real
+# ones, so that the colour of a lamp is more than a pixel at 25 m, and hang low enough
+# that a car waiting at the stop line still has all three in an image.
+HOUSING_M = (0.35, 1.3, 2.95)
+SIGN_CENTRE_M, SIGN_RADIUS_M = 2.2, 0.5
+FOOT = (-0.2, 0.2)
 
 
 def _wheels(box: Box, u: tuple[float, ...], radius: float, top: float) -> list[Quad]:
@@ -195,15 +202,6 @@ def door() -> Template:
         for face in ("front", "back")
     ]
     return template([shadow(FULL, FULL), *panel.quads(panes)])
-
-
-POLE_M = 0.06
-# Half width, lower and upper edge. Housing and lamps are half as large again as real
-# ones, so that the colour of a lamp is more than a pixel at 25 m, and hang low enough
-# that a car waiting at the stop line still has all three in an image.
-HOUSING_M = (0.35, 1.3, 2.95)
-SIGN_CENTRE_M, SIGN_RADIUS_M = 2.2, 0.5
-FOOT = (-0.2, 0.2)
 
 
 def traffic_light() -> Template:

@@ -15,6 +15,10 @@ import numpy.typing as npt
 
 from me2e_compress.simulator.plane_geometry import Floats
 
+FULL = (-0.5, 0.5)  # the whole unit box
+# A sun from the upper left; faces differ enough to be told apart
+SHADES = {"top": 1.08, "front": 0.90, "back": 0.78, "left": 0.96, "right": 0.70}
+
 
 class Slot(IntEnum):
     """Which of a solid's colours a quadrilateral has."""
@@ -60,11 +64,6 @@ class Template:
     shades: Floats  # (faces,) brightness of the colour, by the direction of the face
     details: npt.NDArray[np.bool_]  # (faces,) whether it lies on another face
     footprint: Floats  # (2, 4): its rectangle on the ground, counter-clockwise
-
-
-FULL = (-0.5, 0.5)  # the whole unit box
-# A sun from the upper left; faces differ enough to be told apart
-SHADES = {"top": 1.08, "front": 0.90, "back": 0.78, "left": 0.96, "right": 0.70}
 
 
 class Box:

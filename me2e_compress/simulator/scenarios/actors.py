@@ -22,6 +22,19 @@ from me2e_compress.simulator.traffic.bodies import Behaviour, Car, Walker
 from me2e_compress.simulator.traffic.network import LANE_WIDTH_M, LaneIndex
 from me2e_compress.simulator.traffic.stage import HORIZON_S, Script, Stage
 
+# Cyclists stay a row that is as short as it begins
+TOGETHER = Behaviour(headway_s=0.4, jam_gap_m=1.5)
+ONCOMING_S = (16.0, 24.0)  # mean gap of the oncoming traffic where one must overtake
+AWAY_MPS = 10.0
+# How slowly, and how long, a car crawls after it has cut in
+CRAWL_MPS, CRAWL_S = 2.2, (4.0, 9.0)
+HALF_LANE_M = LANE_WIDTH_M / 2
+# Mean number of people who cross at a light, each time it lets them
+WALKERS_A_CYCLE = 2.0
+LATE = 0.2  # share of them who cross at any time of their phase, even as it ends
+# How far from the middle of the road the first cyclist begins
+RIDE_M = LANE_WIDTH_M + 4.0
+
 
 def free_side(stage: Stage) -> float:
     """Return +1 if the lane to pass by is left of the route, -1 if right."""
@@ -66,10 +79,6 @@ def parked_car(stage: Stage, street: Street) -> Script:
     aside = stage.uniform("aside_m", 0.0, 0.6) * -free_side(stage)
     stage.static_object(kind, stage.route_pose(s, aside))
     yield from meet(stage, s, "parked_car")
-
-
-# Cyclists stay a row that is as short as it begins
-TOGETHER = Behaviour(headway_s=0.4, jam_gap_m=1.5)
 
 
 def slow_cyclists(stage: Stage, street: Street) -> Script:
@@ -128,9 +137,6 @@ def spun_car(stage: Stage, street: Street) -> Script:
     stage.ego.grip_mps2 = dry
 
 
-ONCOMING_S = (16.0, 24.0)  # mean gap of the oncoming traffic where one must overtake
-
-
 def oncoming_cars(stage: Stage, street: Street) -> Script:
     """Drive oncoming traffic, with gaps in which one can overtake."""
     traffic = Traffic(stage.uniform("oncoming_gap_s", *ONCOMING_S), platoons=0.6)
@@ -139,11 +145,6 @@ def oncoming_cars(stage: Stage, street: Street) -> Script:
 
 
 # Cars before the ego: braking, pulling out, cutting in, crawling.
-
-
-AWAY_MPS = 10.0
-# How slowly, and how long, a car crawls after it has cut in
-CRAWL_MPS, CRAWL_S = 2.2, (4.0, 9.0)
 
 
 def hard_brake(stage: Stage, street: Street) -> Script:
@@ -278,9 +279,6 @@ def _cut_in(
 # Pedestrians and cyclists who cross the ego's way.
 
 
-HALF_LANE_M = LANE_WIDTH_M / 2
-
-
 def walker_behind_van(stage: Stage, _: Street) -> Script:
     """Send a pedestrian out from behind a van that stands at the kerb."""
     s = stage.place("crossing_m", 60.0, 85.0)
@@ -306,11 +304,6 @@ def walkers_on_zebra(stage: Stage, _: Street) -> Script:
     """Let people cross at the light, from both sides."""
     s = float(stage.parameters["crosswalk_m"])
     yield from encounter(stage, walkers_at_light(stage), s, "walkers_on_zebra")
-
-
-# Mean number of people who cross at a light, each time it lets them
-WALKERS_A_CYCLE = 2.0
-LATE = 0.2  # share of them who cross at any time of their phase, even as it ends
 
 
 def walkers_at_light(stage: Stage) -> list[Walker]:
@@ -355,10 +348,6 @@ def bicycle_stream(stage: Stage, crossing: Crossing) -> Script:
     spacing = stage.uniform("spacing_m", 2.6, 3.6)
     row = (ActorKind.BICYCLE, speed, RIDE_M, count, spacing)
     yield from _cross_exit(stage, crossing, "bicycle_stream", *row)
-
-
-# How far from the middle of the road the first cyclist begins
-RIDE_M = LANE_WIDTH_M + 4.0
 
 
 def _cross_exit(

@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from me2e_compress.base.errors import EvaluationError
 from me2e_compress.simulator.plane_geometry import Floats
 from me2e_compress.simulator.routes import Route
 from me2e_compress.simulator.scenarios import actors, flows, roads
@@ -286,7 +285,5 @@ def stage_of(route: Route, builder: Builder | None = None) -> Stage:
         populate(stage)
     else:
         builder(stage)
-    if not hasattr(stage, "ego"):
-        raise EvaluationError(f"{route.scenario}: its layout set no route")
     stage.schedule.arrivals.sort(key=lambda arrival: (arrival[0], arrival[1].id))
     return stage

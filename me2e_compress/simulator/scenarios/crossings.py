@@ -29,6 +29,14 @@ HALF_M = 12.0
 ARM_M = 130.0
 # The stop line is this far before the junction (a crosswalk lies between)
 SETBACK_M = 3.0
+GREEN_S = (9.0, 15.0)  # of either group of lights
+USUAL_MPS = 9.0  # the speed for which a plan is said to show a driver red or green
+# Seconds after green at which the usual driver arrives
+FOUND_S = {SignalState.GREEN: (1.0, 6.0), SignalState.RED: (-9.0, -3.0)}
+RING_M = 17.0  # radius of the ring lane's centre
+RING_WIDTH_M = 4.5
+ENTRY_M = 14.0  # radius of the arcs between arms and ring
+LIMIT_MPS = 11.0  # on the ring
 
 
 @dataclass(frozen=True)
@@ -117,12 +125,6 @@ def signal_junction(
     return crossing
 
 
-GREEN_S = (9.0, 15.0)
-USUAL_MPS = 9.0  # the speed for which a plan is said to show a driver red or green
-# Seconds after green at which the usual driver arrives
-FOUND_S = {SignalState.GREEN: (1.0, 6.0), SignalState.RED: (-9.0, -3.0)}
-
-
 def crosswalk_junction(stage: Stage, moves: Sequence[str]) -> Crossing:
     """Lay a junction with a crosswalk on the arm that the ego turns into."""
     crossing = signal_junction(stage, moves, None)
@@ -198,12 +200,6 @@ def _connect(
 
 
 # A roundabout with one ring lane and four arms.
-
-
-RING_M = 17.0  # radius of the ring lane's centre
-RING_WIDTH_M = 4.5
-ENTRY_M = 14.0  # radius of the arcs between arms and ring
-LIMIT_MPS = 11.0
 
 
 def ring_way(start: str, end: str) -> list[LaneIndex]:

@@ -24,6 +24,31 @@ from me2e_compress.simulator.traffic.stage import Script, Stage, arrival_times, 
 
 NEAR_M = 30.0  # a standing obstacle counts as met when the ego is this close
 TOUCH_M = 1.0
+# Shares of drivers who follow closely and take short gaps, and of slow ones: our choice
+HEEDLESS, SLOW = 0.12, 0.15
+# Share of drivers of a conflict who obey neither lights nor signs, where some do
+LATE = 0.45
+# Share of drivers of a conflict who do not make room for an ego that comes in
+BLIND_TO_EGO = 0.4
+TURNING = 0.4  # share of traffic that turns at a junction
+# The ego and another meet if one is so far before or after the place of the conflict,
+# the other so near to it: the ego waits at a line before it
+AHEAD_M, BEHIND_M, OTHER_M = 25.0, 8.0, 10.0
+END_M = 12.0  # nobody begins so near to the end of the map
+EGO_ROOM_M = 14.0  # nobody begins nearer to the ego, bumper to bumper
+# Where the ego sets off what waits for it, and how long that still waits.
+# scenario_runner's actors start when the ego is within a distance; ours is drawn.
+TRIGGER_M, DELAY_S = (18.0, 36.0), (0.0, 1.0)
+DENSE_S = (2.5, 4.0)  # mean gap in the lane that the ego changes into
+# Share of the oncoming cars that drive partly in the ego's lane, and how far they reach
+# into it
+INVADING, INTO_M = 0.4, (0.9, 1.2)
+ASIDE_M = 1.1  # how far right of its lane's centre traffic keeps there, to have room
+# Mean gap in the ego's lane where an emergency vehicle comes: others make room
+SPARSE_S = 20.0
+# The ego has not yielded if the vehicle was this close behind for this long, and still
+# is behind at the end: it may come too late to be let by
+HELD_UP_M, HELD_UP_S = 20.0, 4.0
 
 
 def meeting(stage: Stage, chain: Sequence[LaneIndex]) -> float:
@@ -86,20 +111,6 @@ def release(car: Car, target_mps: float) -> None:
 def keep_clear(stage: Stage, chain: Sequence[LaneIndex], until_s: float) -> None:
     """Let no traffic begin on a lane between the ego and a place of its route."""
     stage.clear[chain[0]] = (BEFORE_M - 8.0, BEFORE_M + until_s + 30.0)
-
-
-# Shares of drivers who follow closely and take short gaps, and of slow ones: our choice
-HEEDLESS, SLOW = 0.12, 0.15
-# Share of drivers of a conflict who obey neither lights nor signs, where some do
-LATE = 0.45
-# Share of drivers of a conflict who do not make room for an ego that comes in
-BLIND_TO_EGO = 0.4
-TURNING = 0.4  # share of traffic that turns at a junction
-# The ego and another meet if one is so far before or after the place of the conflict,
-# the other so near to it: the ego waits at a line before it
-AHEAD_M, BEHIND_M, OTHER_M = 25.0, 8.0, 10.0
-END_M = 12.0  # nobody begins so near to the end of the map
-EGO_ROOM_M = 14.0  # nobody begins nearer to the ego, bumper to bumper
 
 
 @dataclass(frozen=True)
@@ -239,11 +250,6 @@ def encounter(
                 return
 
 
-# Where the ego sets off what waits for it, and how long that still waits.
-# scenario_runner's actors start when the ego is within a distance; ours is drawn.
-TRIGGER_M, DELAY_S = (18.0, 36.0), (0.0, 1.0)
-
-
 def near(stage: Stage, route_s: float) -> Script:
     """Wait until the ego's front is near a place, and a little longer."""
     metres = stage.uniform("trigger_m", *TRIGGER_M)
@@ -267,9 +273,9 @@ def platoon(
 ) -> Script:
     """Drive traffic from one arm of a junction to another, in the far lane.
 
-    ``cars`` draws a parameter that decides nothing: the routes that ship name it. See
-    `across` for ``late``.
+    See `across` for ``late``.
     """
+    # Decides nothing, but the routes that ship were admitted with it
     if cars:
         stage.integer("cars", 2, 4)
     chain = crossing.way(origin, to, crossing.lanes - 1)
@@ -311,9 +317,6 @@ def ring_flow(stage: Stage, _: Regulator) -> Script:
     yield from across(stage, ring_way("left", to), "ring_flow")
 
 
-DENSE_S = (2.5, 4.0)  # mean gap in the lane that the ego changes into
-
-
 def exit_lane_flow(stage: Stage, ramp: Ramp) -> Script:
     """Drive dense traffic in the lane that the ego must cross to reach the exit."""
     lane, place = ramp.main.ahead(), ramp.merge_s
@@ -350,12 +353,6 @@ def stop_sign(stage: Stage, crossing: Crossing) -> Script:
     yield from meet(stage, sign.line_s or crossing.approach_m, "stop_sign")
 
 
-# Share of the oncoming cars that drive partly in the ego's lane, and how far they reach
-# into it
-INVADING, INTO_M = 0.4, (0.9, 1.2)
-ASIDE_M = 1.1  # how far right of its lane's centre traffic keeps there, to have room
-
-
 def invader(stage: Stage, street: Street) -> Script:
     """Drive oncoming traffic, a share of it partly in the ego's lane."""
     gap, random = stage.uniform("oncoming_gap_s", 4.0, 7.0), stage.random("invaders")
@@ -369,13 +366,6 @@ def invader(stage: Stage, street: Street) -> Script:
         car.offset_m = (LANE_WIDTH_M - car.WIDTH) / 2 + into
         car.behaviour = replace(car.behaviour, sees_ego=False)
     yield from encounter(stage, invaders, None, "invader")
-
-
-# Mean gap in the ego's lane where an emergency vehicle comes: others make room
-SPARSE_S = 20.0
-# The ego has not yielded if the vehicle was this close behind for this long, and still
-# is behind at the end: it may come too late to be let by
-HELD_UP_M, HELD_UP_S = 20.0, 4.0
 
 
 def emergency_behind(stage: Stage, street: Street) -> Script:

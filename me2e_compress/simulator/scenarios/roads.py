@@ -21,6 +21,22 @@ from me2e_compress.simulator.traffic.stage import GOAL_M, Stage
 
 BEFORE_M = 60.0  # road behind the ego's start, from where others catch up
 Edge = tuple[str, str]
+BEYOND_M = 120.0  # road beyond the goal
+TOTAL_M = BEFORE_M + GOAL_M + BEYOND_M
+PARKING_M = 2.5  # width of a parking lane
+# Green for the traffic, and for people on foot: they walk 8 m at 1.2 m/s in 6.7 s
+GREEN_S, WALK_S = (14.0, 24.0), 8.0
+# A light stands at least so far behind the place of a conflict's beginning
+LIGHT_M = 125.0
+LIMIT_MPS = 14.0  # of fast roads
+RAMP_RADIUS_M = 80.0
+# Sideways distance between a ramp's straight and the lane it becomes
+RAMP_APART_M = 7.0
+# How far each of a ramp's two arcs turns
+RAMP_RAD = math.acos(1 - RAMP_APART_M / (2 * RAMP_RADIUS_M))
+RAMP = Section(limit_mps=LIMIT_MPS)
+BESIDE = replace(RAMP, left=LaneMarking.DASHED)
+CHANGE_M = 25.0  # length of a lane change
 
 
 class Piece(NamedTuple):
@@ -132,11 +148,6 @@ def _lay(
 # Roads without junctions: several lanes one way, one lane each way, with parking.
 
 
-BEYOND_M = 120.0  # road beyond the goal
-TOTAL_M = BEFORE_M + GOAL_M + BEYOND_M
-PARKING_M = 2.5  # width of a parking lane
-
-
 def straight(stage: Stage) -> tuple[Piece, ...]:
     """Return the one piece of a straight road, with road behind and beyond."""
     return (Piece(TOTAL_M + stage.more_m),)
@@ -222,12 +233,6 @@ def zebra_street(stage: Stage) -> Street:
     return with_light(stage, street, 0.6, s)
 
 
-# Green for the traffic, and for people on foot: they walk 8 m at 1.2 m/s in 6.7 s
-GREEN_S, WALK_S = (14.0, 24.0), 8.0
-# A light stands at least so far behind the place of a conflict's beginning
-LIGHT_M = 125.0
-
-
 def with_light(
     stage: Stage, street: Street, shoulder_m: float, s_m: float | None = None
 ) -> Street:
@@ -271,17 +276,6 @@ def _curve(stage: Stage, tightest: float, widest: float) -> tuple[Piece, ...]:
 
 
 # Fast roads: an on-ramp, an off-ramp, a lane that ends.
-
-
-LIMIT_MPS = 14.0
-RAMP_RADIUS_M = 80.0
-# Sideways distance between the ramp's straight and the lane it becomes
-RAMP_APART_M = 7.0
-# How far each of its two arcs turns
-RAMP_RAD = math.acos(1 - RAMP_APART_M / (2 * RAMP_RADIUS_M))
-RAMP = Section(limit_mps=LIMIT_MPS)
-BESIDE = replace(RAMP, left=LaneMarking.DASHED)
-CHANGE_M = 25.0  # length of a lane change
 
 
 @dataclass(frozen=True)

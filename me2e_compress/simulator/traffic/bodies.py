@@ -23,6 +23,10 @@ ACCELERATION_LAG_S = 0.2
 # Time constants of the ego's first-order actuators: our choice. highway-env acts at
 # once, which makes jerk, and so every comfort score, meaningless.
 STEERING_LAG_S = 0.1
+# Lateral acceleration at which actors take a curve: our choice, half the comfort bound
+# of nuPlan (4.89)
+LATERAL_COMFORT_MPS2 = 2.5
+LOOK_AHEAD_M = 70.0
 
 
 class _Body:
@@ -198,12 +202,6 @@ class StaticObject(_Body, Obstacle):  # type: ignore[misc]  # highway-env is unt
 # it draws random numbers where no route is given; it shares one route list between
 # cars; and it measures the gap in the coordinates of its own lane even where the leader
 # is around the corner.
-
-
-# Lateral acceleration at which actors take a curve: our choice, half the comfort bound
-# of nuPlan (4.89)
-LATERAL_COMFORT_MPS2 = 2.5
-LOOK_AHEAD_M = 70.0
 
 
 @dataclass(frozen=True, slots=True)

@@ -37,6 +37,12 @@ _LINE = {
     LaneMarking.SOLID: LineType.CONTINUOUS_LINE,
 }
 _MARKING = {line: marking for marking, line in _LINE.items()}
+ANNOUNCED_M = 20.0  # how long before a junction or a lane change the command says so
+FINE_M = 0.1
+WIDEST_M = 9.0  # how far to the side we look for road
+PROBE_M = 0.25
+TOUCHING_M = 0.01  # lanes side by side leave no hole, whatever the last digit says
+_CHANGES = (Command.CHANGE_LEFT, Command.CHANGE_RIGHT)
 
 
 def flip(x: float, y: float) -> Floats:
@@ -209,9 +215,6 @@ class Network:
             self.shoulders.append((start, end, len(self.graph.graph[start][end]) - 1))
 
 
-# The centre line of a route, from the lanes that it uses.
-
-
 class LaneTable:
     """All lanes of a network as arrays (highway-env's y-down plane).
 
@@ -225,15 +228,12 @@ class LaneTable:
         self.column: dict[LaneIndex, int] = {key: i for i, key in enumerate(lanes)}
         self.length: Floats = np.array([lane.length for lane in lanes.values()])
         # Straight and circular lanes apart, each as arrays
-        is_line = np.array([isinstance(e, StraightLane) for e in lanes.values()], bool)
-        self._straight, self._circular = (
-            np.flatnonzero(is_line),
-            np.flatnonzero(~is_line),
-        )
         lines = [lane for lane in lanes.values() if isinstance(lane, StraightLane)]
         self._start = np.array([lane.start for lane in lines]).reshape(-1, 2)
         self._along = np.array([lane.direction for lane in lines]).reshape(-1, 2)
         arcs = [lane for lane in lanes.values() if isinstance(lane, CircularLane)]
+        is_line = np.array([isinstance(e, StraightLane) for e in lanes.values()], bool)
+        self._straight, self._circular = is_line, ~is_line  # (lanes,) masks
         self._centre = np.array([lane.center for lane in arcs]).reshape(-1, 2)
         self._radius = np.array([lane.radius for lane in arcs])
         self._phase = np.array([lane.start_phase for lane in arcs])
@@ -266,12 +266,7 @@ class LaneTable:
         return angles
 
 
-ANNOUNCED_M = 20.0  # how long before a junction or a lane change the command says so
-FINE_M = 0.1
-WIDEST_M = 9.0  # how far to the side we look for road
-PROBE_M = 0.25
-TOUCHING_M = 0.01  # lanes side by side leave no hole, whatever the last digit says
-_CHANGES = (Command.CHANGE_LEFT, Command.CHANGE_RIGHT)
+# The centre line of a route, from the lanes that it uses.
 
 
 @dataclass(frozen=True, slots=True)

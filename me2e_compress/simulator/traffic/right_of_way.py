@@ -21,6 +21,19 @@ STOPPED_MPS = 0.1  # slower than this is stopped, as in CARLA's RunningStopTest
 STOP_ZONE_M = (-1.0, 5.0)
 # With a priority vehicle nearer than this to the conflict, the ego did not yield
 YIELD_GAP_S = 1.5
+# Yellow is 3 s in CARLA (its traffic lights' default) and at 50 km/h in most countries;
+# two seconds in which all have red clear a junction of 24 m at 12 m/s
+YELLOW_S, ALL_RED_S = 3.0, 2.0
+# Lanes whose centres come closer than this are in conflict: a car and a margin
+TOUCH_M = 2.6
+REACH_M = 70.0  # how far from a junction others are looked for; 5 s at 14 m/s
+DECIDE_M = 30.0  # how far from a junction a driver decides whether to enter
+START_MPS2 = 2.0  # acceleration with which a driver expects anybody to enter
+YELLOW_MPS2 = 3.0  # a yellow light stops who can brake no harder than this
+HARDEST_MPS2 = 6.0  # a red light stops who can brake no harder than this
+LINE_M = 4.0  # where who waits without a line stops, metres before a junction
+ENTRY_M = 4.0  # the ego enters all conflicts at once that begin this close to the first
+RECKLESS = -1  # rank of those who obey nothing: everybody else lets them pass
 
 
 @dataclass
@@ -81,11 +94,6 @@ class Regulator:
         return None
 
 
-# Yellow is 3 s in CARLA (its traffic lights' default) and at 50 km/h in most countries;
-# two seconds in which all have red clear a junction of 24 m at 12 m/s
-YELLOW_S, ALL_RED_S = 3.0, 2.0
-
-
 @dataclass(frozen=True)
 class SignalPlan:
     """Phases of two groups of lights in turn, from the clock alone.
@@ -131,18 +139,6 @@ class SignalPlan:
 # road to look ahead, and knows no lights. Here conflicts of lanes are found once, from
 # their centre lines, and drivers accept a gap if the times at which both would be in
 # the conflict do not overlap.
-
-
-# Lanes whose centres come closer than this are in conflict: a car and a margin
-TOUCH_M = 2.6
-REACH_M = 70.0  # how far from a junction others are looked for; 5 s at 14 m/s
-DECIDE_M = 30.0  # how far from a junction a driver decides whether to enter
-START_MPS2 = 2.0  # acceleration with which a driver expects anybody to enter
-YELLOW_MPS2 = 3.0  # a yellow light stops who can brake no harder than this
-HARDEST_MPS2 = 6.0  # a red light stops who can brake no harder than this
-LINE_M = 4.0  # where who waits without a line stops, metres before a junction
-ENTRY_M = 4.0  # the ego enters all conflicts at once that begin this close to the first
-RECKLESS = -1  # rank of those who obey nothing: everybody else lets them pass
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,6 @@ from dataclasses import dataclass, field
 import numpy as np
 from highway_env.vehicle.objects import RoadObject
 
-from me2e_compress.base.errors import EvaluationError
 from me2e_compress.simulator.camera_rig import DRAWN, drawn_weather
 from me2e_compress.simulator.plane_geometry import Floats, Point, RoutePath
 from me2e_compress.simulator.routes import Parameter, Route
@@ -40,6 +39,12 @@ HORIZON_S = 200.0
 SHORTEST_S = 1.6  # two cars of one lane do not arrive closer to each other
 PLATOON_S = (1.6, 2.6)
 PLATOON = 4  # most followers in a platoon
+# One actor script: resumed at every decision, it yields until the next one
+Script = Iterator[None]
+GOAL_M = 150.0  # length of a route without what is drawn before and after
+# Metres before the places of a scenario, and after them
+LEAD_M, AFTER_M = (25.0, 60.0), (25.0, 190.0)
+TRAFFIC = "traffic"  # the parameter that, with the seed, decides all arrivals
 
 
 @dataclass
@@ -113,14 +118,6 @@ def arrival_times(
         rest = mean_s * (1 + followers) - followers * sum(PLATOON_S) / 2 - SHORTEST_S
         at += SHORTEST_S + float(random.exponential(max(rest, 0.5)))
     return times
-
-
-# One actor script: resumed at every decision, it yields until the next one
-Script = Iterator[None]
-GOAL_M = 150.0  # length of a route without what is drawn before and after
-# Metres before the places of a scenario, and after them
-LEAD_M, AFTER_M = (25.0, 60.0), (25.0, 190.0)
-TRAFFIC = "traffic"  # the parameter that, with the seed, decides all arrivals
 
 
 class Stage:
@@ -223,11 +220,6 @@ class Stage:
     def drive(self, legs: Sequence[Leg], speed_mps: float) -> None:
         """Set the ego's route and put the ego at its beginning."""
         self.path = build_path(self.network, legs, self.goal_m)
-        if self.path.length_m < self.goal_m:
-            raise EvaluationError(
-                f"{self.route.scenario}: the route is {self.path.length_m:.0f} m "
-                f"long, its goal {self.goal_m:.0f} m away"
-            )
         for leg in legs:
             if leg.lane in self.network.ranks:
                 x, y = self.network.centre(leg.lane)[0]

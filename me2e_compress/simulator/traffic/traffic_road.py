@@ -27,6 +27,10 @@ NEAREST_M = 2.0  # gap between bumpers below which nobody changes
 # comes up behind is on another lane yet
 SETTLED_M = 30.0
 SLOWEST_MPS = 1.0
+FORESEEN_S = (1.0, 2.0, 3.0)  # when drivers foresee people who cross, seconds from now
+# The ego is wholly in a lane if it is so near to its centre and direction
+INSIDE_M, ALONG_RAD = 0.6, 0.3
+BESIDE_M = 0.25  # two bodies closer than this sideways are in each other's way
 
 
 def _change(car: Car, wanted_mps2: float) -> None:
@@ -82,12 +86,6 @@ def _imposed(car: Car, chain: list[LaneIndex]) -> float:
     # the ego, or who follows no lane: what braking avoids a contact
     closing: float = max(body.speed - car.speed, 0.0)
     return float(closing**2 / (2 * gap))
-
-
-FORESEEN_S = (1.0, 2.0, 3.0)  # when drivers foresee people who cross, seconds from now
-# The ego is wholly in a lane if it is so near to its centre and direction
-INSIDE_M, ALONG_RAD = 0.6, 0.3
-BESIDE_M = 0.25  # two bodies closer than this sideways are in each other's way
 
 
 class TrafficRoad(Road):  # type: ignore[misc]  # highway-env is untyped
