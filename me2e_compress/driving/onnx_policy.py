@@ -9,8 +9,7 @@ import numpy as np
 
 from me2e_compress.base.errors import EvaluationError, FramesError, GraphError
 from me2e_compress.driving.adapter import Adapter
-from me2e_compress.driving.adapter.adapter import ZEROS
-from me2e_compress.driving.adapter.inputs import ModelInputs, contract_names
+from me2e_compress.driving.adapter.adapter import ZEROS, ModelInputs, contract_names
 from me2e_compress.driving.adapter.outputs import COMMAND, plan_read
 from me2e_compress.driving.contract import (
     PLAN_TIMES_S,

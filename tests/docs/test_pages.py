@@ -17,7 +17,7 @@ import pytest
 import me2e_compress as me2e
 from me2e_compress.commands.inspect import inspect
 from me2e_compress.driving.adapter import Adapter
-from me2e_compress.driving.adapter.inputs import ModelInputs
+from me2e_compress.driving.adapter.adapter import ModelInputs
 from me2e_compress.driving.onnx_policy import FirstValues, OnnxPolicy, recurrent_of
 from me2e_compress.driving.shipped_adapters import adapter_file
 from me2e_compress.runtime.frames import Array

@@ -11,7 +11,7 @@ from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.commands.frames import record_frames
 from me2e_compress.commands.options import FramesOptions
 from me2e_compress.driving.adapter import Adapter
-from me2e_compress.driving.adapter.inputs import ModelInputs
+from me2e_compress.driving.adapter.adapter import ModelInputs
 from me2e_compress.driving.onnx_policy import OnnxPolicy
 from me2e_compress.runtime.session import Session
 from tests.driving.observed import RIG, motion, observation

@@ -7,7 +7,7 @@ import pytest
 
 from me2e_compress.base.errors import EvaluationError
 from me2e_compress.driving.adapter import Adapter
-from me2e_compress.driving.adapter.inputs import ModelInputs
+from me2e_compress.driving.adapter.adapter import ModelInputs
 from me2e_compress.driving.contract import Trajectory, checked
 from me2e_compress.driving.onnx_policy import OnnxPolicy
 from me2e_compress.driving.shipped_adapters import adapter_file, shipped_adapters

@@ -11,8 +11,7 @@ import numpy as np
 import onnx_ir as ir
 
 from me2e_compress.base.errors import EvaluationError, GraphError
-from me2e_compress.driving.adapter.adapter import ZEROS, Adapter
-from me2e_compress.driving.adapter.inputs import ModelInputs
+from me2e_compress.driving.adapter.adapter import ZEROS, Adapter, ModelInputs
 from me2e_compress.driving.contract import Shape
 from me2e_compress.driving.input_sources import INPUT_SOURCES
 from me2e_compress.driving.shipped_adapters import adapter_file

@@ -2,20 +2,8 @@
 
 import numpy as np
 
+from me2e_compress.simulator.scenarios import flows
 from me2e_compress.simulator.scenarios.crossings import Crossing
-from me2e_compress.simulator.scenarios.flows import (
-    NEAR_M,
-    Traffic,
-    encounter,
-    hold,
-    keep_clear,
-    meet,
-    near,
-    release,
-    stand,
-    step_out,
-    stream,
-)
 from me2e_compress.simulator.scenarios.roads import BEFORE_M, Ramp, Street
 from me2e_compress.simulator.scene import ActorKind
 from me2e_compress.simulator.traffic.bodies import Behaviour, Car, Walker
@@ -46,20 +34,20 @@ def free_side(stage: Stage) -> float:
 def crashed_cars(stage: Stage, street: Street) -> Script:
     """Place two crashed cars askew in the lane, and a police van before them."""
     s = stage.place("obstacle_m", 62.0, 80.0)
-    keep_clear(stage, street.ahead(), s)
+    flows.keep_clear(stage, street.ahead(), s)
     for k, name in enumerate(("first", "second")):
         askew = stage.uniform(f"{name}_askew_rad", -0.35, 0.35)
         aside = -0.4 * free_side(stage)
         place = stage.route_pose(s + 8.0 + 7.0 * k, aside)
         stage.static_object(ActorKind.PARKED, place.turned(askew))
     stage.static_object(ActorKind.EMERGENCY, stage.route_pose(s))
-    yield from meet(stage, s, "crashed_cars")
+    yield from flows.meet(stage, s, "crashed_cars")
 
 
 def construction(stage: Stage, street: Street) -> Script:
     """Close the lane for a few metres with cones and barriers."""
     s = stage.place("obstacle_m", 62.0, 80.0)
-    keep_clear(stage, street.ahead(), s)
+    flows.keep_clear(stage, street.ahead(), s)
     length = stage.uniform("works_m", 8.0, 14.0)
     for k in range(4):
         place = stage.route_pose(s + 2.0 * k, -1.4 + 0.8 * k)
@@ -68,17 +56,17 @@ def construction(stage: Stage, street: Street) -> Script:
         stage.static_object(ActorKind.BARRIER, stage.route_pose(s + along))
     for k in range(int(length // 3)):
         stage.static_object(ActorKind.CONE, stage.route_pose(s + 10.5 + 3.0 * k, 1.3))
-    yield from meet(stage, s, "construction")
+    yield from flows.meet(stage, s, "construction")
 
 
 def parked_car(stage: Stage, street: Street) -> Script:
     """Stop a car or van in the lane, its hazard lights on."""
     s = stage.place("obstacle_m", 62.0, 85.0)
-    keep_clear(stage, street.ahead(), s)
+    flows.keep_clear(stage, street.ahead(), s)
     kind = ActorKind(stage.choice("obstacle", ("parked", "van", "truck")))
     aside = stage.uniform("aside_m", 0.0, 0.6) * -free_side(stage)
     stage.static_object(kind, stage.route_pose(s, aside))
-    yield from meet(stage, s, "parked_car")
+    yield from flows.meet(stage, s, "parked_car")
 
 
 def slow_cyclists(stage: Stage, street: Street) -> Script:
@@ -87,7 +75,7 @@ def slow_cyclists(stage: Stage, street: Street) -> Script:
     speed = stage.uniform("cyclist_mps", 1.8, 2.4)
     first = stage.uniform("cyclist_gap_m", 26.0, 34.0)
     last: Car | None = None
-    keep_clear(stage, street.ahead(), first + 60.0)
+    flows.keep_clear(stage, street.ahead(), first + 60.0)
     for k in range(count):
         s, kind = BEFORE_M + first + 4.5 * k, ActorKind.BICYCLE
         rider = stage.car(street.ahead(), s, speed, speed, kind, TOGETHER)
@@ -95,7 +83,7 @@ def slow_cyclists(stage: Stage, street: Street) -> Script:
         right = rider.pose.moved(0.0, -0.8)
         rider.position[:] = (right.x, -right.y)
         last = last or rider
-    while last and stage.gap_m(last) > NEAR_M - 10.0:
+    while last and stage.gap_m(last) > flows.NEAR_M - 10.0:
         yield
     stage.fire("slow_cyclists", last)
 
@@ -103,11 +91,11 @@ def slow_cyclists(stage: Stage, street: Street) -> Script:
 def opening_door(stage: Stage, street: Street) -> Script:
     """Open the door of one of a row of parked cars into the lane."""
     s = stage.place("door_m", 60.0, 80.0)
-    keep_clear(stage, street.ahead(), s)
+    flows.keep_clear(stage, street.ahead(), s)
     side = -(LANE_WIDTH_M / 2 + 1.05)
     for k in range(-2, 3):
         stage.static_object(ActorKind.PARKED, stage.route_pose(s + 6.5 * k, side))
-    yield from near(stage, s)
+    yield from flows.near(stage, s)
     hinge = side + 1.95 / 2
     pose = stage.route_pose(s + 0.6, hinge + 0.6)
     door = stage.static_object(ActorKind.DOOR, pose, (0.2, 1.2, 1.2))
@@ -121,7 +109,7 @@ def spun_car(stage: Stage, street: Street) -> Script:
     would penalise the driver for the noise.
     """
     s = stage.place("spun_m", 80.0, 92.0)
-    keep_clear(stage, street.ahead(), s)
+    flows.keep_clear(stage, street.ahead(), s)
     grip = stage.uniform("grip_mps2", 3.0, 4.0)
     begin = s - stage.uniform("slick_m", 35.0, 45.0)
     askew = stage.uniform("askew_rad", 0.4, 0.7)
@@ -139,8 +127,8 @@ def spun_car(stage: Stage, street: Street) -> Script:
 
 def oncoming_cars(stage: Stage, street: Street) -> Script:
     """Drive oncoming traffic, with gaps in which one can overtake."""
-    traffic = Traffic(stage.uniform("oncoming_gap_s", *ONCOMING_S), platoons=0.6)
-    stream(stage, "oncoming", [street.oncoming()], traffic)
+    traffic = flows.Traffic(stage.uniform("oncoming_gap_s", *ONCOMING_S), platoons=0.6)
+    flows.stream(stage, "oncoming", [street.oncoming()], traffic)
     return iter(())
 
 
@@ -154,15 +142,15 @@ def hard_brake(stage: Stage, street: Street) -> Script:
     hardest = stage.uniform("brake_mps2", 5.0, 7.0)
     speed = float(stage.ego.speed)
     car = stage.car(street.ahead(), BEFORE_M + gap + 5.0, speed)
-    keep_clear(stage, street.ahead(), where + 30.0)
+    flows.keep_clear(stage, street.ahead(), where + 30.0)
     # it drives by IDM until the ego passes a place
     stands = stage.uniform("stands_s", 2.0, 6.0)
     car.target_speed = stage.uniform("lead_mps", 8.0, 10.0)
-    yield from near(stage, where)
+    yield from flows.near(stage, where)
     stage.fire("hard_brake", car)
     car.forced_mps2 = -hardest
-    yield from hold(stage, car.speed / hardest + stands)
-    release(car, AWAY_MPS)
+    yield from flows.hold(stage, car.speed / hardest + stands)
+    flows.release(car, AWAY_MPS)
 
 
 def pull_out(stage: Stage, street: Street) -> Script:
@@ -173,8 +161,8 @@ def pull_out(stage: Stage, street: Street) -> Script:
     for along in (-13.0, -6.5, 14.0, 20.5):
         stage.static_object(ActorKind.PARKED, stage.route_pose(s + along, side))
     car = stage.car(street.shoulder(), BEFORE_M + s, 0.0)
-    stand(car)
-    yield from near(stage, s - 2.0)
+    flows.stand(car)
+    yield from flows.near(stage, s - 2.0)
     yield from _cut_in(stage, car, street.ahead(), 1, "pull_out", crawl_s)
 
 
@@ -186,13 +174,13 @@ def queue_cut_in(stage: Stage, street: Street) -> Script:
     chain = street.ahead(lane)
     # a standing queue with room ahead of the car that leaves it
     for index in (lane, street.lane):
-        keep_clear(stage, street.ahead(index), s)
+        flows.keep_clear(stage, street.ahead(index), s)
     places = (-14.0, -7.0, 0.0, 11.0, 18.0)
     queue = [stage.car(chain, BEFORE_M + s + aside, 0.0) for aside in places]
     for car in queue:
-        stand(car)
+        flows.stand(car)
     # leave when the ego is near
-    yield from near(stage, s - 2.0)
+    yield from flows.near(stage, s - 2.0)
     side = 1 if street.lane < lane else -1
     yield from _cut_in(stage, queue[2], street.ahead(), side, "queue_cut_in", crawl_s)
 
@@ -202,11 +190,11 @@ def ramp_cut_in(stage: Stage, ramp: Ramp) -> Script:
     gap = stage.uniform("ramp_gap_s", 3.0, 5.5)
     slow = stage.uniform("ramp_mps", 5, 8)
     joins = tuple(ramp.main.ahead())
-    traffic = Traffic(gap, (slow, slow + 1.0), joins=joins, blind_to_ego=0.5)
-    cars = stream(stage, "ramp_cut_in", [ramp.ramp], traffic)
+    traffic = flows.Traffic(gap, (slow, slow + 1.0), joins=joins, blind_to_ego=0.5)
+    cars = flows.stream(stage, "ramp_cut_in", [ramp.ramp], traffic)
     joint = stage.network.pose(ramp.ramp[-1], 30.0)
     s, _ = stage.path.project(joint.x, joint.y)
-    yield from encounter(stage, cars, s, "ramp_cut_in")
+    yield from flows.encounter(stage, cars, s, "ramp_cut_in")
 
 
 def slow_queue(stage: Stage, ramp: Ramp) -> Script:
@@ -214,16 +202,16 @@ def slow_queue(stage: Stage, ramp: Ramp) -> Script:
     slow = stage.uniform("slow_mps", 3.0, 4.5)
     gap = stage.uniform("slow_gap_s", 3.4, 4.6)
     until = stage.uniform("slow_until_s", 25.0, 50.0)
-    traffic = Traffic(gap, (slow, slow + 0.5), platoons=0.1)
-    cars = stream(stage, "slow_queue", [ramp.main.ahead()], traffic)
+    traffic = flows.Traffic(gap, (slow, slow + 0.5), platoons=0.1)
+    cars = flows.stream(stage, "slow_queue", [ramp.main.ahead()], traffic)
 
     def speed_up() -> Script:
-        yield from hold(stage, until)
+        yield from flows.hold(stage, until)
         for car in cars:
             car.target_speed += 5.0
 
     stage.play(speed_up())
-    yield from encounter(stage, cars, ramp.merge_s, "slow_queue")
+    yield from flows.encounter(stage, cars, ramp.merge_s, "slow_queue")
 
 
 def queue_at_light(stage: Stage, crossing: Crossing) -> Script:
@@ -237,7 +225,7 @@ def queue_at_light(stage: Stage, crossing: Crossing) -> Script:
         for k in range(count)
     ]
     tail = line - 3.5 - 7.0 * (count - 1) - 2.5
-    yield from meet(stage, tail, "queue_at_light", queue[-1], 35.0)
+    yield from flows.meet(stage, tail, "queue_at_light", queue[-1], 35.0)
 
 
 def blocked_exit(stage: Stage, crossing: Crossing) -> Script:
@@ -245,17 +233,17 @@ def blocked_exit(stage: Stage, crossing: Crossing) -> Script:
     chain = crossing.way("back", crossing.move)
     into = stage.uniform("into_m", 1.0, 5.0)
     truck = stage.car(chain[2:], into + 2.0, 0.0, kind=ActorKind.TRUCK)
-    stand(truck)
+    flows.stand(truck)
     leaves_s = stage.uniform("leaves_s", 18.0, 40.0)
 
     def leave() -> Script:
-        yield from hold(stage, leaves_s)
-        release(truck, AWAY_MPS)
+        yield from flows.hold(stage, leaves_s)
+        flows.release(truck, AWAY_MPS)
 
     stage.play(leave())
     pose = truck.pose
     s, _ = stage.path.project(pose.x, pose.y)
-    yield from meet(stage, s, "blocked_exit", truck, 40.0)
+    yield from flows.meet(stage, s, "blocked_exit", truck, 40.0)
 
 
 def _cut_in(
@@ -267,13 +255,13 @@ def _cut_in(
     here, _ = stage.network.lane(lanes[0]).local_coordinates(car.position)
     target, _ = stage.network.rest(lanes, float(here))
     car.change_lane(target, side)
-    release(car, CRAWL_MPS)
+    flows.release(car, CRAWL_MPS)
     until = stage.time_s + crawl_s
     while stage.time_s < until:
         yield
         car.forced_mps2 = -5.0 if car.speed > CRAWL_MPS + 1.0 else None
     car.indicator = 0
-    release(car, AWAY_MPS)
+    flows.release(car, AWAY_MPS)
 
 
 # Pedestrians and cyclists who cross the ego's way.
@@ -286,7 +274,7 @@ def walker_behind_van(stage: Stage, _: Street) -> Script:
     van = stage.route_pose(s - 5.0, -(HALF_LANE_M + 1.1))
     stage.static_object(ActorKind.VAN, van)
     walker = _across_route(stage, s, speed, -(HALF_LANE_M + 2.2), 6.5)
-    yield from step_out(stage, walker, s, "walker_behind_van")
+    yield from flows.step_out(stage, walker, s, "walker_behind_van")
 
 
 def walker_between_cars(stage: Stage, _: Street) -> Script:
@@ -297,13 +285,13 @@ def walker_between_cars(stage: Stage, _: Street) -> Script:
         pose = stage.route_pose(s + aside, -(HALF_LANE_M + 1.3))
         stage.static_object(ActorKind.PARKED, pose)
     walker = _across_route(stage, s, speed, -(HALF_LANE_M + 2.4), 7.0)
-    yield from step_out(stage, walker, s, "walker_between_cars")
+    yield from flows.step_out(stage, walker, s, "walker_between_cars")
 
 
 def walkers_on_zebra(stage: Stage, _: Street) -> Script:
     """Let people cross at the light, from both sides."""
     s = float(stage.parameters["crosswalk_m"])
-    yield from encounter(stage, walkers_at_light(stage), s, "walkers_on_zebra")
+    yield from flows.encounter(stage, walkers_at_light(stage), s, "walkers_on_zebra")
 
 
 def walkers_at_light(stage: Stage) -> list[Walker]:
@@ -373,7 +361,7 @@ def _cross_exit(
         stop = crossing.arm(crossing.move, out_m, -side * end)
         line = np.array([[begin.x, begin.y], [stop.x, stop.y]])
         people.append(stage.walker(kind, line, speed))
-    yield from step_out(stage, people[1], route_s, name)
+    yield from flows.step_out(stage, people[1], route_s, name)
     for walker in people:
         walker.going = True
 
