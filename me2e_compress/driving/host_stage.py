@@ -156,11 +156,9 @@ class CollisionOptimizer(HostStage):
     def near(
         self, plan: Floats, occupancy: Floats
     ) -> tuple[Floats, npt.NDArray[np.intp]]:
-        """Return the occupied cells [N, 2] near their waypoint, and its index [N].
-
-        The plan is [6, 2] in the ego frame, the occupancy [T, rows, columns]; a cell of
-        time t is compared with waypoint t.
-        """
+        """Return the occupied cells [N, 2] near their waypoint, and its index [N]."""
+        # plan is (6, 2) in the ego frame, occupancy (T, rows, columns); a cell of time
+        # t is compared with waypoint t
         # occupied cells at the time of each waypoint, the last one repeated
         times = np.minimum(np.arange(len(plan)), len(occupancy) - 1)
         step, row, column = np.nonzero(occupancy[times] > self.threshold)

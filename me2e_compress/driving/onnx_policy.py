@@ -172,11 +172,8 @@ class OnnxPolicy:
 
 
 def recurrent_of(session: Session, adapter: Adapter) -> dict[str, str]:
-    """Return each recurrent input with the output that answers it.
-
-    The pairs of the model's own metadata are added to the adapter's entries, except for
-    inputs that the adapter feeds.
-    """
+    """Map recurrent inputs to the outputs that answer them, by adapter and metadata."""
+    # The adapter feeds some inputs in another way: metadata do not make them recurrent
     fed_otherwise, entries = {*adapter.feeds, *adapter.images}, adapter.recurrent
     if entries is not None:
         fed_otherwise |= set(contract_names(adapter).values())

@@ -62,10 +62,9 @@ class Driver(abc.ABC):
         return POLICIES.text(self)
 
     def fingerprint(self) -> str:
-        """Return what identifies the policy in results.
+        """Return what identifies the policy in results: its text, digests of its files.
 
-        Override it if more than its text and the files in its options decide what it
-        does.
+        Override it if anything else decides what the policy does.
         """
         values = (getattr(self, field.name) for field in fields(self))
         files = [value for value in values if isinstance(value, Path)]

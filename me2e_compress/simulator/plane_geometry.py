@@ -34,17 +34,14 @@ class LaneMarking(StrEnum):
 
 @dataclass(frozen=True, eq=False)
 class Lane:
-    """One lane: its centre line [N, 2] in driving direction, points at most 2 m apart.
+    """One lane of a road map."""
 
-    The name ``from>to:index`` is unique; the markings are those of its edges, seen in
-    driving direction. No route uses a shoulder, which is paved but not meant for
-    driving, yet a car on it is not off-road.
-    """
-
-    name: str
-    centre: Floats
+    # No route uses a shoulder, which is paved but not meant for driving, yet a car on
+    # it is not off-road
+    name: str  # unique: from>to:index
+    centre: Floats  # (n, 2) in driving direction, points at most 2 m apart
     width: float
-    left: LaneMarking
+    left: LaneMarking  # of its left edge, seen in driving direction
     right: LaneMarking
     shoulder: bool = False
 
@@ -84,12 +81,10 @@ class Roadmap:
 
 @dataclass(frozen=True, eq=False)
 class RoutePath:
-    """The route's centre line, one point every metre, from start past the goal.
+    """The route's centre line, one point every metre, from start past the goal."""
 
-    It runs on beyond `goal_m` (about 60 m) so that planners can look ahead. Arrays have
-    a value, or a row, for each of n points.
-    """
-
+    # It runs on beyond goal_m (about 60 m) so that planners can look ahead. Arrays have
+    # a value, or a row, for each of n points.
     points: Floats  # (n, 2) metres
     headings: Floats  # radians, unwrapped
     lane_widths: Floats  # metres, of the lane that the route uses
@@ -195,10 +190,8 @@ def overlaps(one: Floats, other: Floats) -> npt.NDArray[np.bool_]:
 
 
 def gaps(one: Floats, other: Floats) -> Floats:
-    """Return [...] metres between the outlines of two boxes, 0 where they overlap.
-
-    Between disjoint convex outlines, a corner of one is the nearest point.
-    """
+    """Return [...] metres between the outlines of two boxes, 0 where they overlap."""
+    # Between disjoint convex outlines, a corner of one is the nearest point
     nearest = np.minimum(_from_corners(one, other), _from_corners(other, one))
     return np.where(overlaps(one, other), 0.0, nearest)
 

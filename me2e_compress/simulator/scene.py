@@ -169,16 +169,12 @@ INFRACTIONS: frozenset[EventKind] = frozenset(EventKind) - {
 
 @dataclass(frozen=True, slots=True)
 class Event:
-    """One event.
-
-    ``detail`` names the script, or says in words what happened; x and y (metres) are
-    the ego's position. The actor is the other party, if any.
-    """
+    """One event; the actor is the other party, if any."""
 
     time_us: int
     kind: EventKind
-    detail: str
-    x: float
+    detail: str  # the script's name, or what happened in words
+    x: float  # the ego's position, metres
     y: float
     ego_speed_mps: float
     actor_id: int | None = None

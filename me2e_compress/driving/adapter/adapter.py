@@ -182,11 +182,7 @@ class Adapter(BaseModel):
             raise EvaluationError(f"{origin} {where}: {words}") from error
 
     def metadata(self, own: Mapping[str, str]) -> dict[str, str]:
-        """Return the adapter's recurrent pairs and plan in the form of graph metadata.
-
-        ``own`` is the graph's own metadata, which holds for what the adapter does not
-        name.
-        """
+        """Return recurrent pairs and plan as metadata; ``own`` is what a graph has."""
         pairs = {**(declared_pairs(own) or {})}
         pairs |= dict.fromkeys((*self.feeds, *self.images))
         for name, entry in (self.recurrent or {}).items():
@@ -211,10 +207,7 @@ class Adapter(BaseModel):
 
 @dataclass(frozen=True)
 class ModelInputs:
-    """How a graph is fed at each decision, without recurrent inputs.
-
-    Mappings are by the graph's inputs.
-    """
+    """How the inputs of a graph that are not recurrent are fed at each decision."""
 
     ports: Mapping[str, SessionPort]
     adapter: Adapter

@@ -84,11 +84,9 @@ class ImageNormalization(BaseModel):
 
 
 class ImageInput(BaseModel):
-    """What an image input shows; what is left out follows from the graph.
+    """What an image input shows; what is left out follows from the graph."""
 
-    Sizes are rows and columns.
-    """
-
+    # Sizes are rows and columns
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     # Names of the cameras, in the model's order

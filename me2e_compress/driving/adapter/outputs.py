@@ -268,10 +268,7 @@ def _uses(
 def output_uses(
     session: Session, adapter: Adapter, recurrent: Mapping[str, str]
 ) -> tuple[tuple[PortUse, ...], str]:
-    """List the outputs of a graph, in its order; say why none is the plan, or nothing.
-
-    The reason is one line, empty where the plan can be read.
-    """
+    """List a graph's outputs, and a line on why none is the plan, empty if one is."""
     uses = {answer: f"fed back to {name}" for name, answer in recurrent.items()}
     problem = ""
     try:

@@ -64,10 +64,7 @@ _TO_EGO = {
 def can_bus_between(
     now: EgoKinematics, last: EgoKinematics | None
 ) -> npt.NDArray[np.float32]:
-    """Return float32 [18], laid out as in `Observation`.
-
-    ``last`` is the state at the previous decision, None at the first.
-    """
+    """Return float32 [18] as in `Observation`; at a first decision ``last`` is None."""
     bus = np.zeros(CAN_BUS_SIZE, np.float64)
     # quaternion of the heading, then motion
     bus[3], bus[6] = math.cos(now.heading / 2), math.sin(now.heading / 2)
@@ -109,11 +106,9 @@ class EgoTrack:
         self._states.clear()
 
     def at(self, times_us: npt.NDArray[np.floating]) -> Floats:
-        """Return [n, 4] of n times: x, y (m), heading (rad, unwrapped), speed (m/s).
-
-        Interpolates between decisions, constant before the first; needs one pose or
-        more.
-        """
+        """Return [n, 4] of n times: x, y (m), heading (rad, unwrapped), speed (m/s)."""
+        # Interpolate between decisions, constant before the first. Ignore what is older
+        # than all of them: a route has thousands of states.
         # Ignore what is older than all of them: a route has thousands of states
         first = max(0, bisect_right(self._times_us, float(np.min(times_us))) - 1)
         states = np.array(self._states[first:], np.float64)

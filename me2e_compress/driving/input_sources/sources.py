@@ -373,11 +373,9 @@ def _projections(seen: Observed, images: str) -> Floats:
 
 
 def _intrinsics(projections: Floats) -> Floats:
-    """Return [cameras, 3, 3], upper triangular, the last row (0, 0, 1).
-
-    The rows of K R are f r1 + c r3, g r2 + d r3 and r3, with orthonormal r: no camera
-    here has skew.
-    """
+    """Return [cameras, 3, 3], upper triangular, the last row (0, 0, 1)."""
+    # The rows of K R are f r1 + c r3, g r2 + d r3 and r3, with orthonormal r: no camera
+    # here has skew
     rows, forward = projections[:, :2, :3], projections[:, 2, :3]
     centre = np.einsum("kij,kj->ki", rows, forward)
     focal = np.linalg.norm(rows - centre[..., None] * forward[:, None], axis=2)

@@ -84,12 +84,10 @@ class GroundPlan:
     def strip(
         self, line: Floats, width_m: float, colour: Colour, kind: PixelClass
     ) -> None:
-        """Paint a band along a polyline [N, 2] of world points.
-
-        The band is painted piece by piece: cv2 fills convex polygons without bias, and
-        no others. Antialiasing widens a polygon by half a texel on each side, so the
-        colours' band is narrower by one texel.
-        """
+        """Paint a band along a polyline [N, 2] of world points."""
+        # Piece by piece: cv2 fills convex polygons without bias, and no others.
+        # Antialiasing widens a polygon by half a texel on each side, so the colours'
+        # band is narrower by one texel.
         normal, length = left_of(line)
         bands = []
         for metres in (width_m, width_m - RESOLUTION_M):
@@ -173,10 +171,7 @@ class GroundTexture:
 
 
 def paint_texture(roadmap: Roadmap, route: Floats) -> GroundTexture:
-    """Paint lanes, markings, stop lines, crosswalks and the verge.
-
-    The texture covers the bounding box of ``route``, [N, 2] metres, and 60 m around.
-    """
+    """Paint all within 60 m of the bounding box of ``route``, [N, 2] metres."""
     # The raster's extent
     west, south = route.min(axis=0) - MARGIN_M
     east, north = route.max(axis=0) + MARGIN_M
@@ -352,10 +347,8 @@ class GroundSampler:
 
 
 def row_depths(rig: CameraRig, taps: int) -> Floats:
-    """Return [T, 6, H], the ground's depth in T samples of each row; inf for the sky.
-
-    A row belongs to the ground if its centre does.
-    """
+    """Return [T, 6, H] the ground's depth in T samples of each row; inf for the sky."""
+    # A row belongs to the ground if its centre does
     row = np.arange(rig.height)
     inside = (np.arange(taps) + 0.5) / taps
     below = row + inside[:, None] - rig.centre_px[1]

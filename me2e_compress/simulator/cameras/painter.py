@@ -76,12 +76,10 @@ def painting_order(right: Floats, forward: Floats, visible: Flags) -> tuple[Ints
 
 
 def _hides(x: Floats, y: Floats, first: Ints, second: Ints) -> tuple[Flags, Flags]:
-    """Return whether an edge shows that second[i], or first[i], is the nearer solid.
-
-    Either an edge of the farther solid has both the camera and the nearer one outside,
-    or an edge of the nearer one has the camera inside. ``x`` and ``y`` are corners
-    [4, V].
-    """
+    """Return whether an edge shows that second[i], or first[i], is the nearer solid."""
+    # x and y are corners (4, V). Either an edge of the farther solid has both the
+    # camera and the nearer one outside, or an edge of the nearer one has the camera
+    # inside.
     # Outward normals of the edges that follow the corners
     following = [1, 2, 3, 0]
     normal_x, normal_y = y[following] - y, x - x[following]

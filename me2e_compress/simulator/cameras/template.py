@@ -172,10 +172,7 @@ def plate(corners: Iterable[tuple[float, float, float]], slot: Slot) -> list[Qua
 def sign_face(
     corners: Iterable[tuple[float, float]], x: float, slot: Slot, *, detail: bool
 ) -> list[Quad]:
-    """Return a face at x that looks backwards, from four (y, z) corners.
-
-    One that is no detail of another face has a grey back.
-    """
+    """Return a face at x that looks backwards, from (y, z); a detail has no back."""
     front = Quad(np.array([(x, y, z) for y, z in corners]), slot, 1.0, detail)
     back = Quad(front.corners[::-1], Slot.TRIM, 1.0, False)
     return [front] if detail else [front, back]

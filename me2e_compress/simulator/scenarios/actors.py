@@ -103,11 +103,9 @@ def opening_door(stage: Stage, street: Street) -> Script:
 
 
 def spun_car(stage: Stage, street: Street) -> Script:
-    """Lower the grip before a car that stands across the lane.
-
-    Substitutes for Bench2Drive's ControlLoss, which adds noise to the controls: that
-    would penalise the driver for the noise.
-    """
+    """Lower the grip before a car that stands across the lane."""
+    # Instead of Bench2Drive's ControlLoss, which adds noise to the controls: that would
+    # penalise the driver for the noise
     s = stage.place("spun_m", 80.0, 92.0)
     flows.keep_clear(stage, street.ahead(), s)
     grip = stage.uniform("grip_mps2", 3.0, 4.0)

@@ -181,10 +181,8 @@ def overtaking(
 
 
 def give_way(moves: tuple[str, ...]) -> Callable[[Stage], Crossing]:
-    """Return the layout of a junction at which the ego has a give-way sign.
-
-    In the types without it, others have it, or nobody.
-    """
+    """Return the layout of a junction at which the ego has a give-way sign."""
+    # In the types without it, others have it, or nobody
     return partial(junction, moves=moves, sign=SignalKind.GIVE_WAY)
 
 

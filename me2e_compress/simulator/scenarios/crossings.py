@@ -63,10 +63,7 @@ class Crossing:
         ]
 
     def arm(self, name: str, out_m: float, left_m: float = 0.0) -> Pose:
-        """Return a pose on an arm, ``out_m`` outside the junction, heading outwards.
-
-        ``left_m`` is measured from the arm's centre line.
-        """
+        """Return an outward pose on an arm, beyond its start and left of its middle."""
         angle = ARMS.index(name) * math.pi / 2
         return self.centre.turned(angle).moved(self.half_m + out_m, left_m)
 
@@ -99,10 +96,7 @@ def signal_junction(
     moves: Sequence[str],
     ego_light: SignalState | None = SignalState.GREEN,
 ) -> Crossing:
-    """Lay a junction with lights that follow a plan.
-
-    ``ego_light`` is what a driver of `USUAL_MPS` finds; None for any.
-    """
+    """Lay a junction with lights; a usual driver finds ``ego_light`` (None: any)."""
     move = moves[0] if len(moves) == 1 else stage.choice("move", moves)
     crossing = _crossing(stage, move, ARMS, 1, 13.0, ())
     for arm in ARMS:
@@ -222,10 +216,7 @@ def ring_way(start: str, end: str) -> list[LaneIndex]:
 
 
 def roundabout(stage: Stage) -> Regulator:
-    """Lay the roundabout; the ego leaves it to the right, ahead or to the left.
-
-    Returns the ego's give-way sign.
-    """
+    """Lay a roundabout with the ego's route; return the ego's give-way sign."""
     # where the entry arcs touch the ring
     half_lane = LANE_WIDTH_M / 2
     sideways = half_lane + ENTRY_M

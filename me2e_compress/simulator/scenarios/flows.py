@@ -52,11 +52,7 @@ HELD_UP_M, HELD_UP_S = 20.0, 4.0
 
 
 def meeting(stage: Stage, chain: Sequence[LaneIndex]) -> float:
-    """Find where a chain of lanes meets the ego's route.
-
-    Returns the arc length on the route of the first crossing, or of the place where the
-    one joins the other.
-    """
+    """Return the arc length of the route where a chain of lanes first meets it."""
     points = np.concatenate([stage.network.centre(index) for index in chain])
     route = stage.path.points
     away = np.hypot(
@@ -129,10 +125,8 @@ class Traffic:
 def stream(
     stage: Stage, name: str, chains: Sequence[Sequence[LaneIndex]], traffic: Traffic
 ) -> list[Car]:
-    """Draw the cars that come by one lane and take one of several chains from there.
-
-    Those that came before the route began are on the lane already.
-    """
+    """Draw the cars that come by one lane and take one of several chains from there."""
+    # Those that came before the route began are on the lane already
     random, network, entry = stage.random(name), stage.network, chains[0][0]
     schedule = stage.schedule
     schedule.claimed.append(entry)
@@ -199,10 +193,8 @@ def _driver(
 
 
 def _free_m(stage: Stage, chain: Sequence[LaneIndex]) -> float:
-    """Return how far on a chain cars may be as a route begins.
-
-    Nobody is so near to a junction that it is too late to decide.
-    """
+    """Return how far on a chain cars may be as a route begins."""
+    # Nobody is so near to a junction that it is too late to decide
     length = 0.0
     for index in chain:
         if index in stage.network.ranks:
@@ -271,10 +263,7 @@ def platoon(
     cars: bool = True,
     late: bool = False,
 ) -> Script:
-    """Drive traffic from one arm of a junction to another, in the far lane.
-
-    See `across` for ``late``.
-    """
+    """Drive traffic between two arms of a junction, in the far lane; see `across`."""
     # Decides nothing, but the routes that ship were admitted with it
     if cars:
         stage.integer("cars", 2, 4)
@@ -369,12 +358,9 @@ def invader(stage: Stage, street: Street) -> Script:
 
 
 def emergency_behind(stage: Stage, street: Street) -> Script:
-    """Let an emergency vehicle come from behind that wants to pass.
-
-    It starts at a random place; whether the ego yielded is decided at the end of the
-    route. scenario_runner's YieldToEmergencyVehicleTest only asks whether the vehicle
-    is ahead then.
-    """
+    """Let an emergency vehicle come from behind that wants to pass."""
+    # Whether the ego yielded is decided at the end of the route. scenario_runner's
+    # YieldToEmergencyVehicleTest only asks whether the vehicle is ahead then.
     lanes = street.ahead()
     mind = Behaviour(
         3.5, headway_s=0.5, jam_gap_m=4.0, obeys_limits=False, obeys_rules=False

@@ -40,13 +40,10 @@ CHANGE_M = 25.0  # length of a lane change
 
 
 class Piece(NamedTuple):
-    """A straight of a length; or an arc of a radius, where positive angles turn left.
+    """A straight, or an arc of the leftmost lane."""
 
-    The radius is the leftmost lane's.
-    """
-
-    size_m: float
-    angle_rad: float = 0.0
+    size_m: float  # length of the straight, or radius of the arc
+    angle_rad: float = 0.0  # of the arc, positive to the left
 
     def end(self, pose: Pose) -> Pose:
         """Return the pose at which it ends."""
@@ -236,10 +233,7 @@ def zebra_street(stage: Stage) -> Street:
 def with_light(
     stage: Stage, street: Street, shoulder_m: float, s_m: float | None = None
 ) -> Street:
-    """Put a light for people on foot at a straight road.
-
-    It is near the goal unless ``s_m`` says where.
-    """
+    """Put a light for people on foot at a road, at ``s_m`` or else near the goal."""
     at = s_m or stage.uniform("light_m", stage.lead_m + LIGHT_M, stage.goal_m - 18.0)
     stage.parameters.setdefault("light_m", at)
     # the crosswalk, and where people begin and end

@@ -57,11 +57,10 @@ class _Body:
 
 
 class EgoVehicle(_Body, Vehicle):  # type: ignore[misc]  # highway-env is untyped
-    """The ego: highway-env's kinematic bicycle with lag, grip and no reverse gear.
+    """The ego: highway-env's kinematic bicycle with lag, grip and no reverse gear."""
 
-    The dynamics are exact for held actuators, so a finer time step changes the
-    trajectory by the held control alone.
-    """
+    # The dynamics are exact for held actuators, so a finer time step changes the
+    # trajectory by the held control alone
 
     def __init__(self, pose: Pose, speed_mps: float) -> None:
         super().__init__(None, flip(pose.x, pose.y), -pose.heading, speed_mps)
@@ -127,10 +126,7 @@ class EgoVehicle(_Body, Vehicle):  # type: ignore[misc]  # highway-env is untype
 
 
 class Walker(_Body, Vehicle):  # type: ignore[misc]  # highway-env is untyped
-    """A pedestrian or cyclist who follows a polyline once started and never yields.
-
-    ``line`` is [N, 2] right-handed metres.
-    """
+    """A pedestrian or cyclist who follows a polyline once started and never yields."""
 
     def __init__(
         self, id: int, kind: ActorKind, line: Floats, speed_mps: float
@@ -140,7 +136,7 @@ class Walker(_Body, Vehicle):  # type: ignore[misc]  # highway-env is untyped
         super().__init__(None, flip(*line[0]), -heading, 0.0)
         self.speed: float = 0.0
         self.become(id, kind)
-        self.line = line
+        self.line = line  # (n, 2) metres, right-handed
         self.top_speed_mps = speed_mps
         self.going = self.crosses = False
         self.walked_m = 0.0
@@ -206,12 +202,10 @@ class StaticObject(_Body, Obstacle):  # type: ignore[misc]  # highway-env is unt
 
 @dataclass(frozen=True, slots=True)
 class Behaviour:
-    """IDM parameters of one car; defaults are highway-env's but for the gaps.
+    """IDM parameters of one car; defaults are highway-env's but for the gaps."""
 
-    highway-env's jam distance of 10 m is measured between centres; ours between
-    bumpers.
-    """
-
+    # highway-env's jam distance of 10 m is measured between centres; ours between
+    # bumpers
     acceleration_mps2: float = 3.0
     braking_mps2: float = 5.0
     hardest_mps2: float = 8.0
@@ -305,11 +299,9 @@ class Car(_Body, IDMVehicle):  # type: ignore[misc]  # highway-env is untyped
         self.braking = wanted < -0.7 or self.speed < 0.2
 
     def idm(self, leader: RoadObject | None, gap_m: float, allowed_mps: float) -> float:
-        """Return IDM's acceleration (m/s2) for a leader at a gap between bumpers.
-
-        highway-env's own `acceleration`, but for the gap: that one subtracts
-        coordinates of the present lane, which means nothing around a corner.
-        """
+        """Return IDM's acceleration (m/s2) for a leader at a gap between bumpers."""
+        # highway-env's own `acceleration` subtracts coordinates of the present lane,
+        # which means nothing around a corner
         allowed = max(min(allowed_mps, float(self.target_speed)), 0.01)
         free = self.COMFORT_ACC_MAX * (1 - (self.speed / allowed) ** self.DELTA)
         free = float(max(free, self.COMFORT_ACC_MIN))
@@ -354,11 +346,9 @@ class Car(_Body, IDMVehicle):  # type: ignore[misc]  # highway-env is untyped
         self.speed = after
 
     def _steering(self, s: float, r: float) -> float:
-        """Return highway-env's `steering_control`, with an offset from the centre.
-
-        The same cascade (lateral position, lateral speed, heading, heading rate,
-        slip) in plain floats, which is five times as fast.
-        """
+        """Return highway-env's `steering_control`, with an offset from the centre."""
+        # The same cascade (lateral position, lateral speed, heading, heading rate,
+        # slip) in plain floats, which is five times as fast
         lane, speed = self.network.lane(self.target_lane_index), max(self.speed, 0.01)
         future = float(lane.heading_at(s + self.speed * self.TAU_PURSUIT))
         sideways = -self.KP_LATERAL * (r + self.offset_m) / speed

@@ -109,10 +109,7 @@ class Network:
     def straight(
         self, start: str, end: str, pose: Pose, length_m: float, section: Section
     ) -> Pose:
-        """Add a straight piece and return the pose where its leftmost lane ends.
-
-        ``pose`` is where the leftmost lane begins.
-        """
+        """Add a straight from ``pose`` on; return where its leftmost lane ends."""
         for i in range(section.lanes):
             first = pose.moved(0.0, -i * section.width)
             last = first.moved(length_m)
@@ -129,11 +126,8 @@ class Network:
         angle_rad: float,
         section: Section,
     ) -> Pose:
-        """Add an arc and return the pose where the leftmost lane ends.
-
-        The radius is the leftmost lane's; positive angles turn left.
-        """
-        # lanes around one centre, the leftmost first
+        """Add an arc (positive angle: left); return where its leftmost lane ends."""
+        # lanes around one centre; the leftmost, first, has the radius
         left_turn = angle_rad > 0
         side = radius_m if left_turn else -radius_m
         centre = pose.moved(0.0, side)
@@ -216,12 +210,11 @@ class Network:
 
 
 class LaneTable:
-    """All lanes of a network as arrays (highway-env's y-down plane).
+    """All lanes of a network as arrays (highway-env's y-down plane)."""
 
-    highway-env asks every lane about every vehicle one by one, which takes most of its
-    time; straight and circular lanes, the only ones we build, allow one vectorised
-    answer.
-    """
+    # highway-env asks every lane about every vehicle one by one, which takes most of
+    # its time; straight and circular lanes, the only ones we build, allow one
+    # vectorised answer
 
     def __init__(self, network: RoadNetwork) -> None:
         lanes = network.lanes_dict()
@@ -271,12 +264,10 @@ class LaneTable:
 
 @dataclass(frozen=True, slots=True)
 class Leg:
-    """A piece of the route on one lane.
+    """A piece of the route on one lane."""
 
-    A hole between the end of a leg and the beginning of the next is filled by a smooth
-    curve: that is how a route changes lanes.
-    """
-
+    # A hole between the end of a leg and the beginning of the next is filled by a
+    # smooth curve: that is how a route changes lanes
     lane: LaneIndex
     command: Command = Command.FOLLOW
     enter_m: float = 0.0

@@ -265,10 +265,7 @@ class RightOfWay:
         return False
 
     def priority_over_ego(self) -> list[tuple[float, Conflict]]:
-        """Return the conflicts in which others have priority over the ego.
-
-        Each with the arc length of the ego's route at which it begins.
-        """
+        """Return conflicts where others go before the ego, and where on its route."""
         ranks = self.network.ranks
         return [
             (begin + conflict.mine[0], conflict)
@@ -278,11 +275,9 @@ class RightOfWay:
         ]
 
     def soonest_s(self) -> float:
-        """Return the seconds until somebody with priority is where the ego enters.
-
-        Who is there already is before the ego, and leaves. Lanes that the ego crosses
-        later do not count.
-        """
+        """Return the seconds until somebody with priority is where the ego enters."""
+        # Who is there already is before the ego, and leaves. Lanes that the ego crosses
+        # later do not count.
         soonest, meets = math.inf, self.priority_over_ego()
         first = min((at for at, _ in meets), default=0.0)
         for at, conflict in meets:
@@ -298,11 +293,9 @@ class RightOfWay:
 
 
 def conflicts_of(network: Network) -> dict[LaneIndex, list[Conflict]]:
-    """Find the pairs of lanes inside junctions that share ground.
-
-    Lanes that leave one place, or follow each other, are no conflict: there drivers
-    keep their distance.
-    """
+    """Find the pairs of lanes inside junctions that share ground."""
+    # Lanes that leave one place, or follow each other, are no conflict: there drivers
+    # keep their distance
     conflicts: dict[LaneIndex, list[Conflict]] = {}
     for a in network.ranks:
         mine = network.centre(a)

@@ -49,16 +49,14 @@ TRAFFIC = "traffic"  # the parameter that, with the seed, decides all arrivals
 
 @dataclass
 class Schedule:
-    """Arrivals and signal plans of one route.
-
-    A script has drawn the traffic of the lanes that are ``claimed``; ``lines`` are
-    lights by the lane that they stop, with the arc length of the line; ``arrivals`` are
-    bodies and the microseconds at which they appear, in order of time once closed.
-    """
+    """Arrivals and signal plans of one route."""
 
     plans: list[SignalPlan] = field(default_factory=list)
+    # Lanes whose traffic a script has drawn
     claimed: list[LaneIndex] = field(default_factory=list)
+    # Lights by the lane that they stop, with the arc length of the line
     lines: dict[LaneIndex, list[tuple[float, Regulator]]] = field(default_factory=dict)
+    # Bodies with their time_us of arrival, in order of time once the stage is set
     arrivals: list[tuple[int, Car | Walker]] = field(default_factory=list)
     _next: int = 0
 
@@ -101,11 +99,9 @@ def is_free(body: Body, present: Sequence[Body], room_m: float = 2.0) -> bool:
 def arrival_times(
     random: np.random.Generator, mean_s: float, begin_s: float, platoons: float
 ) -> list[float]:
-    """Draw arrivals of one lane from ``begin_s`` to `HORIZON_S`.
-
-    Gaps are exponential beyond the shortest; with the probability ``platoons`` a car
-    leads a platoon. The mean gap is the same either way.
-    """
+    """Draw arrival times (s) of one lane, ``mean_s`` apart, until `HORIZON_S`."""
+    # Gaps are exponential beyond the shortest; with the probability `platoons` a car
+    # leads a platoon. The mean gap is the same either way.
     at, times = begin_s + float(random.uniform(0.0, mean_s)), list[float]()
     while at < HORIZON_S:
         times.append(at)
@@ -209,11 +205,7 @@ class Stage:
         return self.goal_m - GOAL_M
 
     def play(self, script: Script) -> None:
-        """Add a script.
-
-        It runs up to its first ``yield`` at once, so that its actors are there at frame
-        0.
-        """
+        """Add a script and run it to its first yield, so that its actors are there."""
         if next(script, self) is not self:
             self.scripts.append(script)
 
@@ -238,10 +230,7 @@ class Stage:
         behaviour: Behaviour | None = None,
         comes: bool = False,
     ) -> Car:
-        """Put a car on a chain of lanes, at an arc length from its beginning.
-
-        One that ``comes`` is not there yet.
-        """
+        """Make a car on a chain of lanes, at an arc length; if it ``comes``, for later."""
         place = (self.network, *self.network.rest(chain, s_m))
         car = Car(self._id(), *place, speed_mps, target_mps, kind, behaviour)
         if not comes:

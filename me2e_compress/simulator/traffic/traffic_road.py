@@ -89,12 +89,11 @@ def _imposed(car: Car, chain: list[LaneIndex]) -> float:
 
 
 class TrafficRoad(Road):  # type: ignore[misc]  # highway-env is untyped
-    """The road: who is in front of whom, and who touches whom.
+    """The road: who is in front of whom, and who touches whom."""
 
-    Connected lanes are searched for leaders, as highway-env's environments of version 1
-    do. A crash is a real overlap of two rectangles: stock highway-env also calls a
-    predicted one a crash, and says neither who nor what was hit.
-    """
+    # Connected lanes are searched for leaders, as highway-env's environments of version
+    # 1 do. A crash is a real overlap of two rectangles: stock highway-env also calls a
+    # predicted one a crash, and says neither who nor what was hit.
 
     def __init__(self, network: Network, rules: RightOfWay) -> None:
         super().__init__(network.graph, neighbour_vehicles_connected_lanes=True)
@@ -204,10 +203,7 @@ class TrafficRoad(Road):  # type: ignore[misc]  # highway-env is untyped
         return body, at - last[0] - (car.LENGTH + body.LENGTH) / 2
 
     def ruled(self, car: Car, lane_s: float, wanted_mps2: float) -> float:
-        """Return the acceleration that rules make of the one that a car wants.
-
-        The car may change lanes then.
-        """
+        """Limit the acceleration that a car wants by the rules; it may change lanes."""
         stop_m = self.rules.stop_m(car, lane_s)
         if stop_m < math.inf:
             wanted_mps2 = min(wanted_mps2, car.idm_stop(stop_m))
