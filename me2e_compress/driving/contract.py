@@ -56,6 +56,20 @@ __all__ = [
 Shape = tuple[int | str | None, ...]
 
 DEFAULT_IMAGE_SIZE = (96, 160)  # rows and columns for a model that takes any size
+Triple = tuple[float, float, float]
+# An option that is a finite number above 0
+Positive: TypeAlias = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
+Count: TypeAlias = Annotated[int, Field(ge=0)]
+# Six waypoints [6, 2], one every 0.5 s: metres in the ego frame of the observation, x
+# forward, y left; the first is where the ego is to be 0.5 s later
+Plan = npt.NDArray[np.floating]
+PLAN_SHAPE = (6, 2)
+PLAN_STEP_US = 500_000  # microseconds between two waypoints
+CAN_BUS_SIZE = 18
+# Times of the waypoints of a `Plan`, seconds
+PLAN_TIMES_S = (1 + np.arange(PLAN_SHAPE[0])) * (PLAN_STEP_US / 1e6)
+# Ranges of the controls in `PedalsAndWheel`
+RANGES = {"throttle": (0.0, 1.0), "steer": (-1.0, 1.0), "brake": (0.0, 1.0)}
 
 
 def shaped(array: Array, port: SessionPort) -> Array:
@@ -73,12 +87,6 @@ def fits(shape: Shape, wanted: Shape) -> bool:
     )
 
 
-Triple = tuple[float, float, float]
-# An option that is a finite number above 0
-Positive: TypeAlias = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
-Count: TypeAlias = Annotated[int, Field(ge=0)]
-
-
 @dataclass(frozen=True, slots=True)
 class EgoKinematics:
     """Pose and motion of the ego in a right-handed world, x east, y north.
@@ -92,15 +100,6 @@ class EgoKinematics:
     speed_mps: float
     acceleration_mps2: Triple
     angular_velocity_radps: Triple
-
-
-# Six waypoints [6, 2], one every 0.5 s: metres in the ego frame of the observation, x
-# forward, y left; the first is where the ego is to be 0.5 s later
-Plan = npt.NDArray[np.floating]
-
-PLAN_SHAPE = (6, 2)
-PLAN_STEP_US = 500_000  # microseconds between two waypoints
-CAN_BUS_SIZE = 18
 
 
 class PedalsAndWheel(NamedTuple):
@@ -220,13 +219,6 @@ class HostedPolicy(Policy, Protocol):
 
 
 # Check a policy's answer, and bring it into one form.
-
-
-# Times of the waypoints of a `Plan`, seconds
-PLAN_TIMES_S = (1 + np.arange(PLAN_SHAPE[0])) * (PLAN_STEP_US / 1e6)
-
-# Ranges of the controls in `PedalsAndWheel`
-RANGES = {"throttle": (0.0, 1.0), "steer": (-1.0, 1.0), "brake": (0.0, 1.0)}
 
 
 def checked(answer: object) -> Trajectory | PedalsAndWheel:

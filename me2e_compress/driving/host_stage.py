@@ -18,6 +18,10 @@ from me2e_compress.base.errors import EvaluationError
 from me2e_compress.base.registry import Registry
 from me2e_compress.driving.contract import Positive
 
+Floats = npt.NDArray[np.float64]
+# Side of a cell of UniAD's occupancy, which its weight of a cell is made for
+UNIAD_CELL_M = 0.5
+
 
 @dataclass(frozen=True, eq=False, slots=True)
 class HostWork:
@@ -73,12 +77,6 @@ HOST_STAGES: Registry[HostStage] = Registry(
     EvaluationError,
     {"collision-optimizer": ("me2e_compress.driving.host_stage:CollisionOptimizer")},
 )
-
-
-Floats = npt.NDArray[np.float64]
-
-# Side of a cell of UniAD's occupancy, which its weight of a cell is made for
-UNIAD_CELL_M = 0.5
 
 
 @dataclass(frozen=True)
@@ -166,8 +164,8 @@ class CollisionOptimizer(HostStage):
         x = self.front_m - self.cell_m * (row + 0.5)
         y = self.left_m - self.cell_m * (column + 0.5)
         cells = np.stack([x, y], axis=-1).astype(np.float64)
-        kept = np.hypot(*(cells - plan[step]).T) <= self.radius_m
-        return cells[kept], step[kept]
+        near = np.hypot(*(cells - plan[step]).T) <= self.radius_m
+        return cells[near], step[near]
 
 
 def cost(

@@ -121,10 +121,10 @@ class OnnxPolicy:
         policy.reset(None)
         policy.plan(inputs.nothing(command=0))
         for name, answer in recurrent.items():
-            given, wanted = policy._state[name].shape, session.inputs[name].shape
-            if not fits(given, wanted):
+            shape, wanted = policy._state[name].shape, session.inputs[name].shape
+            if not fits(shape, wanted):
                 raise EvaluationError(
-                    f"output {answer} has shape {list(given)}, the recurrent input "
+                    f"output {answer} has shape {list(shape)}, the recurrent input "
                     f"{name} takes {list(wanted)}"
                 )
         return policy
@@ -174,10 +174,10 @@ class OnnxPolicy:
 def recurrent_of(session: Session, adapter: Adapter) -> dict[str, str]:
     """Map recurrent inputs to the outputs that answer them, by adapter and metadata."""
     # The adapter feeds some inputs in another way: metadata do not make them recurrent
-    fed_otherwise, entries = {*adapter.feeds, *adapter.images}, adapter.recurrent
+    other_inputs, entries = {*adapter.feeds, *adapter.images}, adapter.recurrent
     if entries is not None:
-        fed_otherwise |= set(contract_names(adapter).values())
-    own = {k: v for k, v in session.recurrent.items() if k not in fed_otherwise}
+        other_inputs |= set(contract_names(adapter).values())
+    own = {k: v for k, v in session.recurrent.items() if k not in other_inputs}
     for name, entry in (entries or {}).items():
         answer = entry.answer or own.get(name)
         if answer is None:

@@ -170,9 +170,9 @@ def driver_named(
         driver = POLICIES.build(PYTHON, {"factory": text})
     else:
         driver = POLICIES.build(MODEL, {"path": text})
-    given = {"adapter": adapter, "module_map": module_map and str(module_map)}
+    files = {"adapter": adapter, "module_map": module_map and str(module_map)}
     fields = type(driver).__dataclass_fields__
-    options = {k: v for k, v in given.items() if v is not None and k in fields}
+    options = {k: v for k, v in files.items() if v is not None and k in fields}
     return POLICIES.with_options(driver, options) if options else driver
 
 

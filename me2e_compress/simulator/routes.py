@@ -157,13 +157,12 @@ def load_routes(path: Path = SHIPPED) -> tuple[Route, ...]:
                 " makes a set"
             )
     # Check that ids are unique
-    seen: dict[str, int] = {}
-    for index, route in enumerate(routes):
-        if route.id in seen:
+    ids = [route.id for route in routes]
+    for index, name in enumerate(ids):
+        if (first := ids.index(name)) < index:
             raise EvaluationError(
-                f"{path}: routes {seen[route.id]} and {index} share the id {route.id}"
+                f"{path}: routes {first} and {index} share the id {name}"
             )
-        seen[route.id] = index
     return tuple(routes)
 
 

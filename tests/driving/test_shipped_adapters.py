@@ -88,7 +88,7 @@ def test_uniad_tiny_is_told_where_its_lidar_is(tmp_path: Path) -> None:
     inputs = ModelInputs.of(session, adapter, {})
 
     assert inputs.image_size == (900, 1600)
-    assert set(inputs.given) == set(session.inputs) - {"img"}
+    assert set(inputs.sources) == set(session.inputs) - {"img"}
 
 
 @pytest.mark.parametrize("name", shipped_adapters())

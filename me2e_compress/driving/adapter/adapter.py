@@ -105,9 +105,9 @@ class FeedPart(BaseModel):
             raise ValueError(f"{self.source.name}: std is zero")
         return self
 
-    def value(self, seen: Observed) -> Array:
+    def value(self, observed: Observed) -> Array:
         """Return the normalised value, of the source's shape."""
-        array = self.source.value(seen)
+        array = self.source.value(observed)
         if self.mean == 0.0 and self.std == 1.0:
             return array
         name = self.source.name
@@ -141,9 +141,9 @@ class Feed(BaseModel):
             return {**table, "joined": True}
         return {"parts": (table,)}
 
-    def value(self, seen: Observed) -> Array:
+    def value(self, observed: Observed) -> Array:
         """Return the input's value, without a batch dimension."""
-        arrays = [part.value(seen) for part in self.parts]
+        arrays = [part.value(observed) for part in self.parts]
         if not self.joined:
             return arrays[0]
         return np.concatenate([array.reshape(-1) for array in arrays])
@@ -213,7 +213,7 @@ class ModelInputs:
     adapter: Adapter
     tables: Mapping[str, ImageInput]  # settings of image inputs
     images: Mapping[str, InputImages]  # those of them that can be fed
-    given: Mapping[str, Feed]  # inputs that are no images
+    sources: Mapping[str, Feed]  # inputs that are no images
     image_size: tuple[int, int]  # rows and columns in which cameras are rendered
     _track: EgoTrack = field(default_factory=EgoTrack, init=False)
 
@@ -243,21 +243,21 @@ class ModelInputs:
         tables = {k: v for k, v in adapter.images.items() if k in ports}
         if names[IMAGES] in ports and names[IMAGES] not in named:
             tables = {names[IMAGES]: ImageInput(), **tables}
-        given = {
+        sources = {
             names[ours]: Feed.model_validate({"source": source})
             for ours, source in CONTRACT.items()
             if names[ours] in ports and names[ours] not in named
         } | {k: v for k, v in adapter.feeds.items() if k in ports}
         # Check that every input has a source, and one that fits
-        sources, problems = ", ".join(INPUT_SOURCES.names()), dict[str, str]()
-        for name in [name for name in ports if name not in {**tables, **given}]:
+        names_of_sources, problems = ", ".join(INPUT_SOURCES.names()), dict[str, str]()
+        for name in [name for name in ports if name not in {**tables, **sources}]:
             problems[name] = (
                 f"input {name} is none of {', '.join((IMAGES, *CONTRACT))}, no output"
                 f" is known to feed it back, and the adapter has no [feeds.{name}]"
-                f" (sources: {sources}) or [images.{name}]"
+                f" (sources: {names_of_sources}) or [images.{name}]"
             )
         images, size, faults = _images(session, adapter, tables)
-        opened = cls(session.inputs, adapter, tables, images, given, size)
+        opened = cls(session.inputs, adapter, tables, images, sources, size)
         return opened, {**problems, **faults, **opened.faults()}
 
     @property
@@ -278,8 +278,8 @@ class ModelInputs:
             arrays[name] = image.apply(observation.images)
         # Inputs that are no images may need the ego's track
         self._track.note(observation.time_us, observation.motion)
-        seen = self._seen(observation)
-        arrays |= {name: feed.value(seen) for name, feed in self.given.items()}
+        observed = self._observed(observation)
+        arrays |= {name: feed.value(observed) for name, feed in self.sources.items()}
         return {
             name: contract.shaped(array, self.ports[name])
             for name, array in arrays.items()
@@ -299,7 +299,7 @@ class ModelInputs:
             target_points=np.zeros((2, 2), np.float32),
         )
 
-    def _seen(self, observation: Observation) -> Observed:
+    def _observed(self, observation: Observation) -> Observed:
         images, lidar2img = self.images.items(), observation.lidar2img
         projections = {name: image.projections(lidar2img) for name, image in images}
         projections = projections or {"": lidar2img}
@@ -309,10 +309,10 @@ class ModelInputs:
         """Return the reason for each input that cannot be fed, in feed order."""
         nothing = self.nothing(0)
         self._track.note(0, nothing.motion)
-        seen, faults = self._seen(nothing), dict[str, str]()
-        for name, feed in self.given.items():
+        observed, faults = self._observed(nothing), dict[str, str]()
+        for name, feed in self.sources.items():
             try:
-                fault = _fault(name, self.ports[name], feed.value(seen))
+                fault = _fault(name, self.ports[name], feed.value(observed))
             except EvaluationError as error:
                 fault = f"input {name}: {error}"
             if fault:

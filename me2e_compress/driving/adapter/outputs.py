@@ -123,9 +123,9 @@ def state_and_plan(
         lent = _lent(model, metadata)
         model.metadata_props.update(lent)
         sources.append((f"metadata of {other.name}", lent))
-    for origin, given in (("map", (None, module_map)), ("adapter", (adapter, None))):
-        named = Path(str(given[0] or given[1])).name
-        sources.append((f"{origin} {named}", adapted(model, *given)))
+    for origin, files in (("map", (None, module_map)), ("adapter", (adapter, None))):
+        named = Path(str(files[0] or files[1])).name
+        sources.append((f"{origin} {named}", adapted(model, *files)))
     added = {key: text for _, own in sources[1:] for key, text in own.items()}
     # What is known, by the source that states it last
     pairs, plan = dict[str, tuple[str | None, str]](), ("", "its name")
@@ -236,7 +236,7 @@ def input_uses(
         cameras = ", ".join(table.cameras)
         words[name] = "the six cameras" if len(table.cameras) == 6 else cameras
         words[name] += ", side by side" if table.stitch else ""
-    for name, feed in inputs.given.items():
+    for name, feed in inputs.sources.items():
         words[name] = ", ".join(INPUT_SOURCES.text(part.source) for part in feed.parts)
     # Faults of types and first values
     for name, port in session.inputs.items():

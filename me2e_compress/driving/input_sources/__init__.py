@@ -20,6 +20,7 @@ from me2e_compress.driving.contract import CAN_BUS_SIZE, EgoKinematics, Observat
 from me2e_compress.runtime.frames import Array
 
 __all__ = ["INPUT_SOURCES", "InputSource", "Observed"]
+Floats = npt.NDArray[np.float64]
 
 
 class Axes(StrEnum):
@@ -78,9 +79,6 @@ def can_bus_between(
         turned = math.remainder(now.heading - last.heading, 2 * math.pi)
         bus[17] = math.degrees(turned)
     return bus.astype(np.float32)
-
-
-Floats = npt.NDArray[np.float64]
 
 
 class EgoTrack:
@@ -156,7 +154,7 @@ class InputSource(abc.ABC):
     name: ClassVar[str]
 
     @abc.abstractmethod
-    def value(self, seen: Observed) -> Array:
+    def value(self, observed: Observed) -> Array:
         """Return an array of fixed shape and type, without a batch dimension.
 
         Raises:

@@ -13,6 +13,12 @@ from me2e_compress.driving.contract import Count, Positive
 from me2e_compress.driving.input_sources import InputSource, Observed
 from me2e_compress.runtime.frames import Array
 
+Quantity = Literal["x", "y", "heading", "speed"]
+MOST = 1000  # steps or classes of an input: more is a slip, and memory without end
+Six = tuple[int, int, int, int, int, int]
+LARGEST = 1e18  # the largest value: within int64
+Floats = npt.NDArray[np.float64]
+
 
 @dataclass(frozen=True)
 class Speed(InputSource):
@@ -20,9 +26,9 @@ class Speed(InputSource):
 
     name: ClassVar[str] = "speed"
 
-    def value(self, seen: Observed) -> Array:
+    def value(self, observed: Observed) -> Array:
         """Return float64 []."""
-        return np.asarray(float(seen.observation.speed_mps))
+        return np.asarray(float(observed.observation.speed_mps))
 
 
 @dataclass(frozen=True)
@@ -31,9 +37,9 @@ class Velocity(InputSource):
 
     name: ClassVar[str] = "velocity"
 
-    def value(self, seen: Observed) -> Array:
+    def value(self, observed: Observed) -> Array:
         """Return float64 [2]."""
-        return seen.turned([seen.observation.speed_mps, 0.0])
+        return observed.turned([observed.observation.speed_mps, 0.0])
 
 
 @dataclass(frozen=True)
@@ -47,10 +53,10 @@ class Acceleration(InputSource):
     name: ClassVar[str] = "acceleration"
     vertical: bool = False
 
-    def value(self, seen: Observed) -> Array:
+    def value(self, observed: Observed) -> Array:
         """Return float64 [2 or 3]."""
-        forward, left, up = seen.observation.can_bus[10:13]
-        level = seen.turned([forward, left])
+        forward, left, up = observed.observation.can_bus[10:13]
+        level = observed.turned([forward, left])
         return np.append(level, up) if self.vertical else level
 
 
@@ -60,13 +66,9 @@ class YawRate(InputSource):
 
     name: ClassVar[str] = "yaw-rate"
 
-    def value(self, seen: Observed) -> Array:
+    def value(self, observed: Observed) -> Array:
         """Return float64 []."""
-        return np.asarray(seen.angle(float(seen.observation.can_bus[15])))
-
-
-Quantity = Literal["x", "y", "heading", "speed"]
-MOST = 1000  # steps or classes of an input: more is a slip, and memory without end
+        return np.asarray(observed.angle(float(observed.observation.can_bus[15])))
 
 
 @dataclass(frozen=True)
@@ -92,18 +94,18 @@ class Past(InputSource):
     deltas: bool = False
     newest_first: bool = False
 
-    def value(self, seen: Observed) -> Array:
+    def value(self, observed: Observed) -> Array:
         """Return float64 [steps, quantities]."""
         # the ego's states, the present one last
-        now = seen.motion
+        now = observed.motion
         back = 1e6 * self.spacing_s * np.arange(self.steps, -1, -1)
-        states = seen.track.at(seen.observation.time_us - back)
+        states = observed.track.at(observed.observation.time_us - back)
         # relative to the present pose, in the model's axes
         states[:, :3] -= (now.x, now.y, states[-1, 2])
         cos, sin = np.cos(now.heading), np.sin(now.heading)
         in_ego = states[:, :2] @ np.array([[cos, -sin], [sin, cos]])
-        states[:, :2] = seen.turned(in_ego)
-        states[:, 2] *= -1.0 if seen.axes.is_left_handed else 1.0
+        states[:, :2] = observed.turned(in_ego)
+        states[:, 2] *= -1.0 if observed.axes.is_left_handed else 1.0
         past = np.diff(states, axis=0) if self.deltas else states[:-1]
         columns = [("x", "y", "heading", "speed").index(q) for q in self.quantities]
         return past[:: -1 if self.newest_first else 1, columns]
@@ -124,11 +126,11 @@ class LidarToGlobalRotation(InputSource):
     name: ClassVar[str] = "l2g-rotation"
     transposed: bool = True
 
-    def value(self, seen: Observed) -> Array:
+    def value(self, observed: Observed) -> Array:
         """Return float64 [3, 3]."""
-        cos, sin = math.cos(seen.motion.heading), math.sin(seen.motion.heading)
+        cos, sin = math.cos(observed.motion.heading), math.sin(observed.motion.heading)
         turn = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
-        rotation = turn @ seen.axes.to_ego
+        rotation = turn @ observed.axes.to_ego
         return rotation.T if self.transposed else rotation
 
 
@@ -138,9 +140,9 @@ class LidarToGlobalTranslation(InputSource):
 
     name: ClassVar[str] = "l2g-translation"
 
-    def value(self, seen: Observed) -> Array:
+    def value(self, observed: Observed) -> Array:
         """Return float64 [3]."""
-        return np.array([seen.motion.x, seen.motion.y, 0.0])
+        return np.array([observed.motion.x, observed.motion.y, 0.0])
 
 
 @dataclass(frozen=True)
@@ -162,23 +164,20 @@ class CanBus(InputSource):
     layout: Literal["bench2drive", "nuscenes"] = "bench2drive"
     absolute: bool = False
 
-    def value(self, seen: Observed) -> Array:
+    def value(self, observed: Observed) -> Array:
         """Return float32 [18]."""
-        given = seen.observation.can_bus
-        bus = np.array(given, np.float32)
+        ours = observed.observation.can_bus
+        bus = np.array(ours, np.float32)
         if self.layout == "nuscenes":
-            bus[7:10], bus[10:13] = given[10:13], given[13:16]
-            bus[13:16] = given[7], 0.0, 0.0
+            bus[7:10], bus[10:13] = ours[10:13], ours[13:16]
+            bus[13:16] = ours[7], 0.0, 0.0
         if self.absolute:
-            bus[0:2] = seen.motion.x, seen.motion.y
+            bus[0:2] = observed.motion.x, observed.motion.y
             bus[17] = math.degrees(bus[16])
         return bus
 
 
 # Input sources of the route ahead, of time, and of constants.
-
-
-Six = tuple[int, int, int, int, int, int]
 
 
 @dataclass(frozen=True)
@@ -204,9 +203,9 @@ class NavigationCommand(InputSource):
             classes = f"one_hot = {self.one_hot} classes, of {MOST} at most"
             raise EvaluationError(f"command: numbers {numbers} do not fit {classes}")
 
-    def value(self, seen: Observed) -> Array:
+    def value(self, observed: Observed) -> Array:
         """Return int64 [], or float32 [classes]."""
-        number = self.numbers[seen.observation.command]
+        number = self.numbers[observed.observation.command]
         if not self.one_hot:
             return np.asarray(number, np.int64)
         return np.asarray(np.eye(self.one_hot)[number], np.float32)
@@ -223,14 +222,14 @@ class TargetPoint(InputSource):
     name: ClassVar[str] = "target-point"
     which: Literal["near", "far"] = "near"
 
-    def value(self, seen: Observed) -> Array:
+    def value(self, observed: Observed) -> Array:
         """Return float64 [2]."""
-        points = seen.observation.target_points
+        points = observed.observation.target_points
         if points is None:
             raise EvaluationError(
                 "the adapter asks for a target point, and the observation has none"
             )
-        return seen.turned(points[0 if self.which == "near" else 1])
+        return observed.turned(points[0 if self.which == "near" else 1])
 
 
 @dataclass(frozen=True)
@@ -244,9 +243,9 @@ class Timestamp(InputSource):
     name: ClassVar[str] = "timestamp"
     unit: Literal["s", "us"] = "s"
 
-    def value(self, seen: Observed) -> Array:
+    def value(self, observed: Observed) -> Array:
         """Return float64 [], or int64 []."""
-        time_us = seen.observation.time_us
+        time_us = observed.observation.time_us
         if self.unit == "us":
             return np.asarray(time_us, np.int64)
         return np.asarray(time_us / 1e6)
@@ -258,12 +257,9 @@ class UsePrevious(InputSource):
 
     name: ClassVar[str] = "use-previous"
 
-    def value(self, seen: Observed) -> Array:
+    def value(self, observed: Observed) -> Array:
         """Return int64 []."""
-        return np.asarray(int(seen.track.decisions > 1), np.int64)
-
-
-LARGEST = 1e18  # the largest value: within int64
+        return np.asarray(int(observed.track.decisions > 1), np.int64)
 
 
 @dataclass(frozen=True)
@@ -286,7 +282,7 @@ class ConstantInput(InputSource):
                 f"constant: {len(self.values)} values have no shape {list(self.shape)}"
             )
 
-    def value(self, seen: Observed) -> Array:
+    def value(self, observed: Observed) -> Array:
         """Return float64, or int64 where all values are whole numbers."""
         whole = all(value.is_integer() for value in self.values)
         array = np.array(self.values, np.int64 if whole else np.float64)
@@ -294,9 +290,6 @@ class ConstantInput(InputSource):
 
 
 # Camera poses and projections, for the pictures that the model sees.
-
-
-Floats = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -310,9 +303,9 @@ class LidarToImage(InputSource):
     name: ClassVar[str] = "lidar2img"
     images: str = ""
 
-    def value(self, seen: Observed) -> Array:
+    def value(self, observed: Observed) -> Array:
         """Return float32 [cameras, 4, 4]."""
-        return _projections(seen, self.images).astype(np.float32)
+        return _projections(observed, self.images).astype(np.float32)
 
 
 @dataclass(frozen=True)
@@ -326,9 +319,9 @@ class LidarToCamera(InputSource):
     name: ClassVar[str] = "lidar2cam"
     images: str = ""
 
-    def value(self, seen: Observed) -> Array:
+    def value(self, observed: Observed) -> Array:
         """Return float64 [cameras, 4, 4]."""
-        projections = _projections(seen, self.images)
+        projections = _projections(observed, self.images)
         matrices = projections.copy()
         inverse = np.linalg.inv(_intrinsics(projections))
         matrices[:, :3] = inverse @ projections[:, :3]
@@ -348,9 +341,9 @@ class Intrinsics(InputSource):
     images: str = ""
     homogeneous: bool = False
 
-    def value(self, seen: Observed) -> Array:
+    def value(self, observed: Observed) -> Array:
         """Return float64 [cameras, 3, 3], or [cameras, 4, 4]."""
-        matrices = _intrinsics(_projections(seen, self.images))
+        matrices = _intrinsics(_projections(observed, self.images))
         if not self.homogeneous:
             return matrices
         padded = np.tile(np.eye(4), (len(matrices), 1, 1))
@@ -358,9 +351,9 @@ class Intrinsics(InputSource):
         return padded
 
 
-def _projections(seen: Observed, images: str) -> Floats:
+def _projections(observed: Observed, images: str) -> Floats:
     """Return [cameras, 4, 4], the model's ground frame to an image input's pixels."""
-    there = seen.projections
+    there = observed.projections
     if images in there:
         lidar2img = there[images]
     elif not images and len(there) == 1:
@@ -369,7 +362,7 @@ def _projections(seen: Observed, images: str) -> Floats:
         raise EvaluationError(
             f"images = {images!r} names no image input; there are {', '.join(there)}"
         )
-    return seen.axes.projection(lidar2img).astype(np.float64)
+    return observed.axes.projection(lidar2img).astype(np.float64)
 
 
 def _intrinsics(projections: Floats) -> Floats:

@@ -101,10 +101,10 @@ def _hides(x: Floats, y: Floats, first: Ints, second: Ints) -> tuple[Flags, Flag
 
 def _sorted(behind: Flags) -> list[int]:
     """Sort topologically: the farthest free solid first, also to break a cycle."""
-    left, result = list(range(len(behind))), list[int]()
-    while left:
-        waits = behind[np.ix_(left, left)].any(axis=0)
-        result.append(left.pop(int(np.argmin(waits))))
+    waiting, result = list(range(len(behind))), list[int]()
+    while waiting:
+        hidden = behind[np.ix_(waiting, waiting)].any(axis=0)
+        result.append(waiting.pop(int(np.argmin(hidden))))
     return result
 
 
@@ -137,8 +137,8 @@ class Painter:
         # their faces that look at the camera, inside its frustum
         view, face = _spread(np.array([len(s.colours) for s in solids]), solid)
         points = self._to_camera(corners[:, :, face], camera[view])
-        seen = self._seen(points, camera[view])
-        points, view, face = points[:, :, seen], view[seen], face[seen]
+        visible = self._visible(points, camera[view])
+        points, view, face = points[:, :, visible], view[visible], face[visible]
         # details that are large enough to be seen
         pixels = self._project(points, camera[view])
         details = np.concatenate([s.template.details for s in solids])[face]
@@ -180,7 +180,7 @@ class Painter:
         forward = axes[..., 2, 0] * dx + axes[..., 2, 1] * dy
         return right, forward
 
-    def _seen(self, points: Floats, camera: Ints) -> Ints:
+    def _visible(self, points: Floats, camera: Ints) -> Ints:
         """Return the indices of the faces [3, 4, M] that a camera sees."""
         # those that look at the camera, by their diagonals
         (ax, ay, az), (bx, by, bz) = (points[:, i] - points[:, i - 2] for i in (2, 3))
@@ -214,9 +214,9 @@ class Painter:
         """Return the pixels of faces, which are cut where they cross the near plane."""
         polygons = list(_fixed(pixels.transpose(2, 1, 0)))
         for i in np.flatnonzero((points[2] < NEAR_M).any(axis=0)).tolist():
-            kept = _cut(points[:, :, i].T.tolist())
-            scale = self.rig.focals_px[camera[i]] / kept[:, 2:]
-            polygons[i] = _fixed(kept[:, :2] * scale + self.rig.centre_px)
+            clipped = _cut(points[:, :, i].T.tolist())
+            scale = self.rig.focals_px[camera[i]] / clipped[:, 2:]
+            polygons[i] = _fixed(clipped[:, :2] * scale + self.rig.centre_px)
         return polygons
 
 
@@ -254,14 +254,14 @@ def _spread(counts: Ints, solid: Ints) -> tuple[Ints, Ints]:
 
 def _cut(polygon: list[list[float]]) -> Floats:
     """Return the part [N, 3] of a polygon (x, y, depth) before the near plane."""
-    kept = list[list[float]]()
+    clipped = list[list[float]]()
     for a, b in zip(polygon, polygon[1:] + polygon[:1], strict=True):
         if a[2] >= NEAR_M:
-            kept.append(a)
+            clipped.append(a)
         if (a[2] >= NEAR_M) != (b[2] >= NEAR_M):
             part = (NEAR_M - a[2]) / (b[2] - a[2])
-            kept.append([p + part * (q - p) for p, q in zip(a, b, strict=True)])
-    return np.array(kept)
+            clipped.append([p + part * (q - p) for p, q in zip(a, b, strict=True)])
+    return np.array(clipped)
 
 
 def _fixed(pixels: Floats) -> npt.NDArray[np.int32]:

@@ -173,8 +173,8 @@ class Sky:
         first, texels = self._strip
         images[:, :first] = ZENITH
         turned = texels + round(heading / (2 * np.pi) * COLUMNS) % COLUMNS
-        seen = self._panorama.take(turned).view(np.uint8)
-        strip = cv2.cvtColor(seen.reshape(-1, self.rig.width, 4), cv2.COLOR_RGBA2RGB)
+        pixels = self._panorama.take(turned).view(np.uint8)
+        strip = cv2.cvtColor(pixels.reshape(-1, self.rig.width, 4), cv2.COLOR_RGBA2RGB)
         images[:, first : self.height] = strip.reshape(*texels.shape, 3)
 
     @cached_property

@@ -27,8 +27,8 @@ RIDE_M = LANE_WIDTH_M + 4.0
 def free_side(stage: Stage) -> float:
     """Return +1 if the lane to pass by is left of the route, -1 if right."""
     here = round(float(stage.parameters.get("obstacle_m", 60.0)))
-    left = float(stage.path.oncoming_m[here])
-    return 1.0 if left > LANE_WIDTH_M else -1.0
+    room_m = float(stage.path.oncoming_m[here])
+    return 1.0 if room_m > LANE_WIDTH_M else -1.0
 
 
 def crashed_cars(stage: Stage, street: Street) -> Script:

@@ -60,8 +60,8 @@ def entries(network: Network) -> list[LaneIndex]:
     """Return the lanes by which traffic comes into the map."""
     follows = _successors(network)
     led_to = {after for several in follows.values() for after in several}
-    left_out = [*network.shoulders, *network.closed]
-    return [index for index in follows if index not in led_to and index not in left_out]
+    excluded = [*network.shoulders, *network.closed]
+    return [index for index in follows if index not in led_to and index not in excluded]
 
 
 def chains_from(network: Network, entry: LaneIndex) -> Iterator[list[LaneIndex]]:
@@ -73,8 +73,8 @@ def chains_from(network: Network, entry: LaneIndex) -> Iterator[list[LaneIndex]]
         if chain[-1] in network.closed:
             continue
         after = follows[chain[-1]]
-        seen = {node for index in chain for node in index[:2]}
-        onward = [index for index in after if index[1] not in seen]
+        passed = {node for index in chain for node in index[:2]}
+        onward = [index for index in after if index[1] not in passed]
         waiting += [[*chain, index] for index in reversed(onward)]
         if not after:
             yield chain

@@ -360,8 +360,8 @@ def lane_drop(stage: Stage) -> Ramp:
     ends = BEFORE_M + stage.place("ends_m", 85.0, 95.0)
     net = stage.network
     after = net.straight("d0", "d1", start, ends, section)
-    left = TOTAL_M + stage.more_m - ends
-    net.straight("d1", "d2", after, left, replace(section, lanes=1))
+    rest_m = TOTAL_M + stage.more_m - ends
+    net.straight("d1", "d2", after, rest_m, replace(section, lanes=1))
     net.closed.append(("d0", "d1", 1))
     block_end(stage, after.moved(0.0, -LANE_WIDTH_M))
     # the ego changes to the left before that

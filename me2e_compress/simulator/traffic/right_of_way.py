@@ -287,8 +287,8 @@ class RightOfWay:
                 nose, tail = user.ends_m
                 if user.id == 0 or tail > conflict.theirs[0]:
                     continue
-                left = max(conflict.theirs[0] - nose, 0.0)
-                soonest = min(soonest, left / max(user.speed_mps, 1.0))
+                gap_m = max(conflict.theirs[0] - nose, 0.0)
+                soonest = min(soonest, gap_m / max(user.speed_mps, 1.0))
         return soonest
 
 

@@ -175,18 +175,18 @@ class Stage:
     def uniform(self, name: str, low: float, high: float) -> float:
         """Draw a parameter between two bounds, to the millimetre."""
         drawn = round(float(self._random(name).uniform(low, high)), 3)
-        return float(self._given(name, drawn))
+        return float(self._set(name, drawn))
 
     def integer(self, name: str, low: int, high: int) -> int:
         """Draw an integer parameter between two bounds, both included."""
-        return int(self._given(name, int(self._random(name).integers(low, high + 1))))
+        return int(self._set(name, int(self._random(name).integers(low, high + 1))))
 
     def choice(self, name: str, options: Sequence[str]) -> str:
         """Draw one of several words."""
         drawn = options[int(self._random(name).integers(len(options)))]
-        return str(self._given(name, drawn))
+        return str(self._set(name, drawn))
 
-    def _given(self, name: str, drawn: Parameter) -> Parameter:
+    def _set(self, name: str, drawn: Parameter) -> Parameter:
         value = self.route.parameters.get(name, drawn)
         self.parameters[name] = value
         return value
@@ -230,7 +230,7 @@ class Stage:
         behaviour: Behaviour | None = None,
         comes: bool = False,
     ) -> Car:
-        """Make a car on a chain of lanes, at an arc length; if it ``comes``, for later."""
+        """Make a car on a chain of lanes, at an arc length; if it ``comes``, later."""
         place = (self.network, *self.network.rest(chain, s_m))
         car = Car(self._id(), *place, speed_mps, target_mps, kind, behaviour)
         if not comes:

@@ -182,7 +182,7 @@ class TrafficRoad(Road):  # type: ignore[misc]  # highway-env is untyped
             along = np.flatnonzero((s >= 0) & (s <= self.table.length[column]))
             columns = (s[along].tolist(), r[along].tolist(), along.tolist())
             rows = zip(*columns, strict=True)
-            self._lanes[column] = sorted(rows, key=lambda each: each[0])
+            self._lanes[column] = sorted(rows, key=lambda row: row[0])
         return self._lanes[column]
 
     def follower(self, car: Car, index: LaneIndex) -> tuple[RoadObject, float] | None:
