@@ -50,11 +50,7 @@ __all__ = [
 ]
 
 
-# The ports of a graph: fit of shapes, and conversion of arrays.
-
-
 Shape = tuple[int | str | None, ...]
-
 DEFAULT_IMAGE_SIZE = (96, 160)  # rows and columns for a model that takes any size
 Triple = tuple[float, float, float]
 # An option that is a finite number above 0
@@ -70,6 +66,9 @@ CAN_BUS_SIZE = 18
 PLAN_TIMES_S = (1 + np.arange(PLAN_SHAPE[0])) * (PLAN_STEP_US / 1e6)
 # Ranges of the controls in `PedalsAndWheel`
 RANGES = {"throttle": (0.0, 1.0), "steer": (-1.0, 1.0), "brake": (0.0, 1.0)}
+
+
+# The ports of a graph: fit of shapes, and conversion of arrays.
 
 
 def shaped(array: Array, port: SessionPort) -> Array:
@@ -228,6 +227,7 @@ def checked(answer: object) -> Trajectory | PedalsAndWheel:
         EvaluationError: It has another form or shape, is not finite, or is out of
             range.
     """
+    # Controls have their ranges
     if isinstance(answer, PedalsAndWheel):
         for name, (low, high) in RANGES.items():
             value = getattr(answer, name)
@@ -236,9 +236,10 @@ def checked(answer: object) -> Trajectory | PedalsAndWheel:
                     f"{name} is {value:g}, it must be from {low:g} to {high:g}"
                 )
         return answer
+    # Waypoints with their times
     if isinstance(answer, Trajectory):
         return Trajectory(_finite(answer.points), np.asarray(answer.times_s))
-    # an array of six waypoints
+    # An array of six waypoints
     if not isinstance(answer, np.ndarray) or answer.dtype.kind != "f":
         kind = type(answer).__name__
         if isinstance(answer, np.ndarray):

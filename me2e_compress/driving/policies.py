@@ -158,6 +158,7 @@ def driver_named(
         EvaluationError: An option that the policy has not, or refuses.
         MissingExtraError: The package that it needs is not installed.
     """
+    # A registered policy, a Python function, or else a file
     if name_in(text) in POLICIES.names():
         driver = POLICIES.parse(text)
         if not isinstance(driver, Driver):
@@ -170,6 +171,7 @@ def driver_named(
         driver = POLICIES.build(PYTHON, {"factory": text})
     else:
         driver = POLICIES.build(MODEL, {"path": text})
+    # Options of the command go to policies that have them
     files = {"adapter": adapter, "module_map": module_map and str(module_map)}
     fields = type(driver).__dataclass_fields__
     options = {k: v for k, v in files.items() if v is not None and k in fields}

@@ -32,15 +32,11 @@ class LatencyModel(StrEnum):
 
 
 def skipped_decisions(latency_us: int, dt_us: int = DT_US) -> int:
-    """Return n of equation 4: how many decisions a latency skips.
-
-    At the benchmark's step of 50 ms everything faster than 100 ms gives n = 0, so 10 ms
-    and 90 ms drive alike. A finer step tells them apart; it also charges the same
-    latency differently (int() drops the remainder of another step: 120 ms are n = 1 at
-    50 ms, a delay of 100 ms, and n = 11 at 10 ms, a delay of 120 ms) and lets a fast
-    policy decide more often than 20 times a second. Results at different steps must not
-    be compared with each other.
-    """
+    """Return n of equation 4: how many decisions a latency skips."""
+    # At a step of 50 ms everything below 100 ms gives n = 0: 10 ms and 90 ms drive
+    # alike. A finer step tells them apart, and charges the same latency differently:
+    # 120 ms delay by 100 ms at a step of 50 ms, by 120 ms at 10 ms. So results at
+    # different steps must not be compared with each other.
     return max(0, _whole(latency_us) // dt_us - 1)
 
 
@@ -60,19 +56,7 @@ def _whole(latency_us: int) -> int:
 
 @dataclass
 class ControlClock(Generic[T]):
-    """Says in which frames a control acts and a decision is due.
-
-    By default one decision at a time is taken: one taken at frame k that skips n = 0
-    decisions acts at once. With n > 0 the control in force before frame k stays for the
-    frames k to k + n, whose observations are not used, and the new one acts from frame
-    k + n + 1 on, where the next decision is taken.
-
-    In a pipeline a decision is due at every frame, and the control decided at frame k
-    acts from frame k + ceil(t / dt) on, until the next one does. First in, first out: a
-    fast decision does not overtake a slow one before it. As many decisions run side by
-    side as the delay has frames, so that says what a delay does, not what one computer
-    that takes t can do.
-    """
+    """Says in which frames a control acts and a decision is due; see `LatencyModel`."""
 
     in_force: T  # at first the control before any decision acts
     dt_us: int = DT_US  # step of the simulated world, microseconds
@@ -89,9 +73,15 @@ class ControlClock(Generic[T]):
     def decide(self, control: T, latency_us: int) -> None:
         """Take the decision that is due, whose control took so long, at this frame."""
         if self.model is LatencyModel.FIFO:
+            # Due at every frame, acting ceil(t / dt) frames later. A fast decision does
+            # not overtake a slow one. As many run side by side as the delay has frames:
+            # that says what a delay does, not what one computer can do.
             acts = self._frame + delayed_frames(latency_us, self.dt_us)
             self._due = self._frame + 1
         else:
+            # With n = 0 the control acts at once. Else the one before stays for frames
+            # k to k + n, whose observations are not used, and the new one acts from
+            # frame k + n + 1 on, where the next decision is taken.
             skipped = skipped_decisions(latency_us, self.dt_us)
             self._due = self._frame + skipped + 1
             acts = self._due if skipped else self._frame

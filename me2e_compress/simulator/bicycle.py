@@ -44,18 +44,16 @@ def advance(
 
 
 def steering_through(forward_m: float, left_m: float, length_m: float) -> float:
-    """Return the steering angle whose circle leads the centre through a point ahead.
-
-    The point is in the ego frame. The chord to a point at distance D leaves the heading
-    by the slip angle b plus half the turn: ``bearing = b + asin(D sin b / length)``.
-    The left side grows with b, so Newton's method from the linear solution needs few
-    steps. Ignoring b (``2 left / D^2`` as the curvature) answers 2.25 times too much at
-    D = 4 m for a 5 m car; the car then cuts into every bend.
-    """
+    """Return the wheel angle (rad) whose circle passes a point of the ego frame."""
+    # The chord to a point at distance D leaves the heading by the slip angle b plus
+    # half the turn: bearing = b + asin(D sin b / length). Ignoring b (2 left / D^2 as
+    # the curvature) answers 2.25 times too much at D = 4 m for a 5 m car, which then
+    # cuts into every bend.
     distance = max(math.hypot(forward_m, left_m), 0.1)
     bearing = math.atan2(left_m, max(forward_m, 0.1))
     steepest = slip_of(MAX_STEERING_RAD)
     reach = min(steepest, math.asin(min(0.99, 0.99 * length_m / distance)))
+    # The right side grows with b: Newton's method from the linear solution
     slip = min(max(bearing / (1 + distance / length_m), -reach), reach)
     for _ in range(4):
         half_turn = distance * math.sin(slip) / length_m

@@ -305,10 +305,7 @@ def _state(moment: Moment) -> str:
 def write_picture(
     path: Path, pictures: Iterable[Image.Image], frame_us: int = 0
 ) -> None:
-    """Write one picture as PNG, or several as a GIF that loops, with one palette.
-
-    The name says which; ``frame_us`` is rounded to hundredths of a second, as GIF has
-    them.
+    """Write one picture as PNG, or, by the name, several as a GIF that loops.
 
     Raises:
         EvaluationError: The file cannot be written.
@@ -322,6 +319,7 @@ def write_picture(
         sheet = Image.fromarray(np.concatenate([np.asarray(image) for image in chosen]))
         palette, none = sheet.quantize(COLOURS), Image.Dither.NONE
         first, *others = (e.quantize(palette=palette, dither=none) for e in images)
+        # in milliseconds, but GIF counts hundredths of a second
         duration = max(20, round(frame_us / 10_000) * 10)
         first.save(
             content,

@@ -266,14 +266,7 @@ SCENARIOS: dict[str, tuple[Callable[..., Any], ...]] = {
 
 
 def stage_of(route: Route, builder: Builder | None = None) -> Stage:
-    """Set up a route: its roads, its actors and their scripts.
-
-    A ``builder`` of one's own brings its traffic, too.
-
-    Raises:
-        EvaluationError: A parameter of the route is wrong, or not one of its
-            scenario's.
-    """
+    """Set up a route: roads, actors and scripts; a ``builder`` brings its traffic."""
     stage = Stage(route)
     if builder is None:
         layout, *scripts = SCENARIOS[route.scenario]

@@ -64,15 +64,8 @@ class Regulator:
         return Signal(self.id, self.kind, *pose, self.state, ends)
 
     def check(self, front_s: float, tail_s: float, speed: float) -> EventKind | None:
-        """Return which rule the ego breaks now, between two arc lengths of its route.
-
-        A red light is run if the tail of the ego crosses the line on red, as in CARLA,
-        which also blames a car that entered too late on yellow. A stop sign is run if
-        the ego did not come to rest before it; a give-way sign if the front enters the
-        conflict less than `YIELD_GAP_S` before a vehicle with priority. Each is
-        reported once.
-        """
-        # give way
+        """Return the rule that the ego, between two arc lengths, breaks now; each once."""
+        # Give way: the front may not enter the conflict just before who has priority
         if front_s >= self.conflict_s and not self._conflict_passed:
             self._conflict_passed = True
             if self.nearest_s() < YIELD_GAP_S:
@@ -85,7 +78,8 @@ class Regulator:
             self._stopped = True
         if tail_s < self.line_s:
             return None
-        # judged once the tail is over the line
+        # Red is run by the tail, as in CARLA, which also blames a car that entered too
+        # late on yellow
         self._tail_passed = True
         if self.kind is SignalKind.STOP_SIGN and not self._stopped:
             return EventKind.STOP_SIGN

@@ -121,10 +121,6 @@ class Stage:
 
     Layouts lay out the network and the route, scripts put actors on it; both do so
     before the first frame. Afterwards scripts are resumed at every decision.
-
-    Parameters are drawn by their names: a value depends on the route's seed and the
-    name alone, and a value in the route's manifest wins. A manifest's values are those
-    that were drawn: its digest says so.
     """
 
     def __init__(self, route: Route) -> None:
@@ -187,6 +183,7 @@ class Stage:
         return str(self._set(name, drawn))
 
     def _set(self, name: str, drawn: Parameter) -> Parameter:
+        # A value depends on the route's seed and the name alone; the manifest's wins
         value = self.route.parameters.get(name, drawn)
         self.parameters[name] = value
         return value
