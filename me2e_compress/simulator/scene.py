@@ -29,10 +29,11 @@ class ActorKind(StrEnum):
     BARRIER = "barrier"
 
 
-# (length, width, height) in metres: nuScenes' mean boxes (the anchor sizes of
+Size = tuple[float, float, float]  # length, width and height in metres
+# nuScenes' mean boxes (the anchor sizes of
 # CenterPoint's nuScenes configuration, github.com/tianweiy/CenterPoint); van and
 # emergency vehicle after a long-wheelbase delivery van; the door is our choice
-DIMENSIONS: dict[ActorKind, tuple[float, float, float]] = {
+DIMENSIONS: dict[ActorKind, Size] = {
     ActorKind.CAR: (4.6, 1.95, 1.73),
     ActorKind.VAN: (5.3, 2.0, 2.1),
     ActorKind.TRUCK: (6.93, 2.51, 2.84),

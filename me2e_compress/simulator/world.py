@@ -204,8 +204,7 @@ class World:
 
 
 def _actor(body: Car | Walker | StaticObject) -> Actor:
-    x, y = body.position.tolist()
-    pose = (x, -y, -float(body.heading))
+    pose, lamps = body.pose, (bool(body.braking), body.indicator)
+    place = (pose.x, pose.y, pose.heading, float(body.speed))
     size = (float(body.LENGTH), float(body.WIDTH), float(body.height))
-    shown = (bool(body.braking), body.indicator)
-    return Actor(body.id, body.kind, *pose, float(body.speed), *size, *shown)
+    return Actor(body.id, body.kind, *place, *size, *lamps)

@@ -15,6 +15,7 @@ import numpy.typing as npt
 
 from me2e_compress.simulator.plane_geometry import Floats
 
+Span = tuple[float, float]  # two ends, or two coordinates
 FULL = (-0.5, 0.5)  # the whole unit box
 # A sun from the upper left; faces differ enough to be told apart
 SHADES = {"top": 1.08, "front": 0.90, "back": 0.78, "left": 0.96, "right": 0.70}
@@ -75,12 +76,12 @@ class Box:
 
     def __init__(
         self,
-        x: tuple[float, float],
-        y: tuple[float, float],
-        z: tuple[float, float],
+        x: Span,
+        y: Span,
+        z: Span,
         slot: Slot,
-        top_x: tuple[float, float] | None = None,
-        top_y: tuple[float, float] | None = None,
+        top_x: Span | None = None,
+        top_y: Span | None = None,
     ) -> None:
         # corners of the foot and of the top: right and left of the rear and the front
         a, b, c, d = _rectangle(x, y, z[0])
@@ -103,9 +104,7 @@ class Box:
         ]
         return [*faces, *decals]
 
-    def on(
-        self, face: str, u: tuple[float, float], v: tuple[float, float], slot: Slot
-    ) -> Quad:
+    def on(self, face: str, u: Span, v: Span, slot: Slot) -> Quad:
         """Return a patch of a face.
 
         ``u`` runs along the face's lower edge, counter-clockwise seen from above, and
@@ -114,13 +113,7 @@ class Box:
         corners = [(u[0], v[0]), (u[1], v[0]), (u[1], v[1]), (u[0], v[1])]
         return self._patch(face, corners, slot)
 
-    def disc(
-        self,
-        face: str,
-        centre: tuple[float, float],
-        radii: tuple[float, float],
-        slot: Slot,
-    ) -> list[Quad]:
+    def disc(self, face: str, centre: Span, radii: Span, slot: Slot) -> list[Quad]:
         """Return an octagon on a face, as three quadrilaterals; see `on` for (u, v)."""
         u, v = centre
         return [
@@ -128,9 +121,7 @@ class Box:
             for band in octagon(*radii)
         ]
 
-    def _patch(
-        self, face: str, corners: Sequence[tuple[float, float]], slot: Slot
-    ) -> Quad:
+    def _patch(self, face: str, corners: Sequence[Span], slot: Slot) -> Quad:
         a, b, c, d = self.faces[face]
         points = [  # bilinear between the corners of the face
             (1 - s) * ((1 - t) * a + t * d) + s * ((1 - t) * b + t * c)
@@ -140,7 +131,7 @@ class Box:
         return Quad(np.array(points), slot, shade, True)
 
 
-def octagon(half_width: float, half_height: float) -> list[list[tuple[float, float]]]:
+def octagon(half_width: float, half_height: float) -> list[list[Span]]:
     """Return three quadrilaterals that make an octagon around the origin."""
     narrow, low = 0.4142 * half_width, 0.4142 * half_height  # tan 22.5 degrees
     bands = (  # lower edge, half its width; upper edge, half its width
@@ -151,12 +142,12 @@ def octagon(half_width: float, half_height: float) -> list[list[tuple[float, flo
     return [[(-a, p), (a, p), (b, q), (-b, q)] for p, a, q, b in bands]
 
 
-def shadow(x: tuple[float, float], y: tuple[float, float]) -> Quad:
+def shadow(x: Span, y: Span) -> Quad:
     """Return the contact shadow on the ground."""
     return Quad(_rectangle(x, y, 0.0), Slot.SHADOW, 1.0, True)
 
 
-def _rectangle(x: tuple[float, float], y: tuple[float, float], z: float) -> Floats:
+def _rectangle(x: Span, y: Span, z: float) -> Floats:
     """Return [4, 3] corners at one height, counter-clockwise from above."""
     return np.array(
         [(x[0], y[0], z), (x[1], y[0], z), (x[1], y[1], z), (x[0], y[1], z)]
@@ -170,7 +161,7 @@ def plate(corners: Iterable[tuple[float, float, float]], slot: Slot) -> list[Qua
 
 
 def sign_face(
-    corners: Iterable[tuple[float, float]], x: float, slot: Slot, *, detail: bool
+    corners: Iterable[Span], x: float, slot: Slot, *, detail: bool
 ) -> list[Quad]:
     """Return a face at x that looks backwards, from (y, z); a detail has no back."""
     front = Quad(np.array([(x, y, z) for y, z in corners]), slot, 1.0, detail)
@@ -178,11 +169,7 @@ def sign_face(
     return [front] if detail else [front, back]
 
 
-def template(
-    quads: Iterable[Quad],
-    x: tuple[float, float] = FULL,
-    y: tuple[float, float] = FULL,
-) -> Template:
+def template(quads: Iterable[Quad], x: Span = FULL, y: Span = FULL) -> Template:
     """Join quadrilaterals; x and y are the extent of the footprint."""
     faces = list(quads)
     return Template(

@@ -19,9 +19,6 @@ from me2e_compress.simulator.traffic.network import LANE_WIDTH_M, LaneIndex
 from me2e_compress.simulator.traffic.right_of_way import DECIDE_M, Regulator
 from me2e_compress.simulator.traffic.stage import Script, Stage, arrival_times, is_free
 
-# Timing of scripts: meeting points, and what waits for the ego.
-
-
 NEAR_M = 30.0  # a standing obstacle counts as met when the ego is this close
 TOUCH_M = 1.0
 # Shares of drivers who follow closely and take short gaps, and of slow ones: our choice
@@ -49,6 +46,9 @@ SPARSE_S = 20.0
 # The ego has not yielded if the vehicle was this close behind for this long, and still
 # is behind at the end: it may come too late to be let by
 HELD_UP_M, HELD_UP_S = 20.0, 4.0
+
+
+# Timing of scripts: meeting points, and what waits for the ego.
 
 
 def meeting(stage: Stage, chain: Sequence[LaneIndex]) -> float:

@@ -12,7 +12,7 @@ from highway_env.vehicle.objects import Obstacle, RoadObject
 
 from me2e_compress.simulator.bicycle import MAX_STEERING_RAD, curvature_of, slip_of
 from me2e_compress.simulator.plane_geometry import Floats
-from me2e_compress.simulator.scene import DIMENSIONS, ActorKind, Control, Ego
+from me2e_compress.simulator.scene import DIMENSIONS, ActorKind, Control, Ego, Size
 from me2e_compress.simulator.traffic.network import LaneIndex, Network, Pose, flip
 
 GRAVITY_MPS2 = 9.81
@@ -47,10 +47,8 @@ class _Body:
         """Its x, y, heading, length and width in highway-env's plane."""
         return (*self.position, self.heading, self.LENGTH, self.WIDTH)
 
-    def become(
-        self, id: int, kind: ActorKind, size: tuple[float, float, float] | None = None
-    ) -> None:
-        """Set identity and size: length, width and height."""
+    def become(self, id: int, kind: ActorKind, size: Size | None = None) -> None:
+        """Set identity and size."""
         self.id, self.kind = id, kind
         self.LENGTH, self.WIDTH, self.height = size or DIMENSIONS[kind]
         self.diagonal = math.hypot(self.LENGTH, self.WIDTH)
@@ -182,11 +180,7 @@ class StaticObject(_Body, Obstacle):  # type: ignore[misc]  # highway-env is unt
     """A static object: parked car, door, cone, barrier."""
 
     def __init__(
-        self,
-        id: int,
-        kind: ActorKind,
-        pose: Pose,
-        size: tuple[float, float, float] | None = None,
+        self, id: int, kind: ActorKind, pose: Pose, size: Size | None = None
     ) -> None:
         super().__init__(None, flip(pose.x, pose.y), -pose.heading, 0.0)
         self.become(id, kind, size)

@@ -64,7 +64,7 @@ class Regulator:
         return Signal(self.id, self.kind, *pose, self.state, ends)
 
     def check(self, front_s: float, tail_s: float, speed: float) -> EventKind | None:
-        """Return the rule that the ego, between two arc lengths, breaks now; each once."""
+        """Return which rule, each once, the ego breaks now between two arc lengths."""
         # Give way: the front may not enter the conflict just before who has priority
         if front_s >= self.conflict_s and not self._conflict_passed:
             self._conflict_passed = True

@@ -4,6 +4,7 @@ Arrivals and signals are drawn before a route begins. Nothing looks at the ego, 
 that who would appear on top of somebody stays away.
 """
 
+import itertools
 import math
 import zlib
 from collections.abc import Callable, Iterator, Sequence
@@ -15,7 +16,7 @@ from highway_env.vehicle.objects import RoadObject
 from me2e_compress.simulator.camera_rig import DRAWN, drawn_weather
 from me2e_compress.simulator.plane_geometry import Floats, Point, RoutePath
 from me2e_compress.simulator.routes import Parameter, Route
-from me2e_compress.simulator.scene import ActorKind, Event, EventKind, SignalKind
+from me2e_compress.simulator.scene import ActorKind, Event, EventKind, SignalKind, Size
 from me2e_compress.simulator.traffic.bodies import (
     Behaviour,
     Car,
@@ -140,7 +141,7 @@ class Stage:
         # set by the world, frame by frame
         self.time_us = 0
         self.ego_s = 0.0
-        self._next_id = 1
+        self._ids = itertools.count(1)  # the ego has 0
         # traffic and weather
         self.ego_lanes: list[tuple[LaneIndex, float]] = []
         # Lanes into the map on which nobody begins between two stations
@@ -229,25 +230,22 @@ class Stage:
     ) -> Car:
         """Make a car on a chain of lanes, at an arc length; if it ``comes``, later."""
         place = (self.network, *self.network.rest(chain, s_m))
-        car = Car(self._id(), *place, speed_mps, target_mps, kind, behaviour)
+        car = Car(next(self._ids), *place, speed_mps, target_mps, kind, behaviour)
         if not comes:
             self.bodies.append(car)
         return car
 
     def walker(self, kind: ActorKind, line: Floats, speed_mps: float) -> Walker:
         """Put a walker at the beginning of a line; `going` starts it."""
-        walker = Walker(self._id(), kind, line, speed_mps)
+        walker = Walker(next(self._ids), kind, line, speed_mps)
         self.bodies.append(walker)
         return walker
 
     def static_object(
-        self,
-        kind: ActorKind,
-        pose: Pose,
-        size: tuple[float, float, float] | None = None,
+        self, kind: ActorKind, pose: Pose, size: Size | None = None
     ) -> StaticObject:
         """Put a static object somewhere."""
-        placed = StaticObject(self._id(), kind, pose, size)
+        placed = StaticObject(next(self._ids), kind, pose, size)
         self.static_objects.append(placed)
         return placed
 
@@ -296,7 +294,3 @@ class Stage:
         other = (None, None) if body is None else (body.id, body.kind)
         speed = float(self.ego.speed)
         return Event(self.time_us, kind, detail, pose.x, pose.y, speed, *other)
-
-    def _id(self) -> int:
-        self._next_id += 1
-        return self._next_id - 1
