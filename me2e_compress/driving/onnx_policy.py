@@ -21,7 +21,7 @@ from me2e_compress.driving.contract import (
 )
 from me2e_compress.driving.host_stage import HostStage
 from me2e_compress.runtime.frames import Array
-from me2e_compress.runtime.plan_adapter import PlanAdapter
+from me2e_compress.runtime.plan_adapter import Arrays, PlanAdapter
 from me2e_compress.runtime.providers import CPU, Provider
 from me2e_compress.runtime.session import Session, zero_state
 
@@ -146,7 +146,7 @@ class OnnxPolicy:
         ports, begin = self.session.inputs, self.recurrent.keys() - self.first.keys()
         self._state = {name: zero_state(name, ports[name]) for name in sorted(begin)}
 
-    def first_values(self, feeds: Mapping[str, Array]) -> dict[str, Array]:
+    def first_values(self, feeds: Arrays) -> dict[str, Array]:
         """Return the recurrent inputs that begin with an input's value, and that."""
         return {name: feeds[source] for name, source in self.first.items()}
 
@@ -159,16 +159,21 @@ class OnnxPolicy:
         outputs = self.session.run({**self._state, **feeds})
         self._begins = False
         self._state = {name: outputs[to] for name, to in self.recurrent.items()}
-        # Read the plan, and convert it to the ego frame
-        command = np.array([observation.command])
-        points = self.reads.plan(outputs, {**feeds, COMMAND: command})
-        plan = self.reads.trajectory(self.adapter.to_ego(points))
+        plan = self.trajectory(outputs, feeds, observation)
         # The host stage changes six waypoints every 0.5 s
         if self.stage is not None:
             work = self.stage.work(six_waypoints(plan), outputs)
             self.host_iterations, self.host_cells = work.iterations, work.cells
             plan = Trajectory(work.plan, PLAN_TIMES_S)
         return plan
+
+    def trajectory(
+        self, outputs: Arrays, feeds: Arrays, observation: Observation
+    ) -> Trajectory:
+        """Return the plan of the network's outputs, in the ego frame."""
+        command = np.array([observation.command])
+        points = self.reads.plan(outputs, {**feeds, COMMAND: command})
+        return self.reads.trajectory(self.adapter.to_ego(points))
 
 
 def recurrent_of(session: Session, adapter: Adapter) -> dict[str, str]:

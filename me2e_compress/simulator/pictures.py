@@ -11,10 +11,15 @@ import numpy as np
 import numpy.typing as npt
 from PIL import Image, ImageDraw, ImageFont
 
-from me2e_compress.base.atomic import write_bytes
+from me2e_compress.base.atomic import write_bytes, writing_errors
 from me2e_compress.base.errors import EvaluationError
 from me2e_compress.simulator.camera_rig import CAMERA_NAMES
-from me2e_compress.simulator.cameras.ground import RESOLUTION_M, GroundTexture
+from me2e_compress.simulator.cameras.ground import (
+    RESOLUTION_M,
+    Bytes,
+    Colour,
+    GroundTexture,
+)
 from me2e_compress.simulator.plane_geometry import Floats, corners
 from me2e_compress.simulator.scene import (
     INFRACTIONS,
@@ -29,9 +34,6 @@ from me2e_compress.simulator.scene import (
     SignalState,
     box_of,
 )
-
-Bytes = npt.NDArray[np.uint8]
-Colour = tuple[int, int, int]
 
 # As in nuScenes' figures. Rear images are not mirrored: in BACK, what is to the left of
 # the car is to the right of the image.
@@ -330,9 +332,5 @@ def write_picture(
             loop=0,
             optimize=False,
         )
-    try:
+    with writing_errors(path, EvaluationError):
         write_bytes(path, content.getvalue())
-    except OSError as error:
-        raise EvaluationError(
-            f"{path}: the picture cannot be written: {error.strerror or error}"
-        ) from error

@@ -17,8 +17,7 @@ import pytest
 import me2e_compress as me2e
 from me2e_compress.commands.inspect import inspect
 from me2e_compress.driving.adapter import Adapter
-from me2e_compress.driving.adapter.adapter import ModelInputs
-from me2e_compress.driving.onnx_policy import FirstValues, OnnxPolicy, recurrent_of
+from me2e_compress.driving.onnx_policy import OnnxPolicy
 from me2e_compress.driving.shipped_adapters import adapter_file
 from me2e_compress.runtime.frames import Array
 from me2e_compress.runtime.session import DTYPES, Session, replay
@@ -56,17 +55,14 @@ def test_a_graph_is_fed_by_the_adapter_beside_it(
     )
     toml = tmp_path / "a.toml"
     toml.write_text(adapter.text)
-    session, read = Session(model, threads=1), Adapter.load(toml)
-    recurrent = recurrent_of(session, read)
-    inputs = ModelInputs.of(session, read, recurrent)
-    pictures = np.zeros((6, *inputs.image_size, 3), np.uint8)
+    policy = OnnxPolicy.open(model, Adapter.load(toml))
+    pictures = np.zeros((6, *policy.image_size, 3), np.uint8)
 
-    feeds = inputs.feeds(observation(motion(0.0, 0.0, 0.0), images=pictures))
+    feeds = policy.inputs.feeds(observation(motion(0.0, 0.0, 0.0), images=pictures))
 
-    first = FirstValues.of(session, read.recurrent, recurrent)
-    feeds |= first.at(feeds)
-    feeds |= first.zeros
-    for name, port in session.inputs.items():
+    policy.reset(None)
+    feeds |= policy._state | policy.first_values(feeds)
+    for name, port in policy.session.inputs.items():
         assert feeds[name].shape == port.shape
         assert feeds[name].dtype == DTYPES[port.type]
 

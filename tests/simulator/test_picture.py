@@ -135,6 +135,6 @@ def test_a_gif_has_all_frames_and_their_pace(tmp_path: Path) -> None:
 @pytest.mark.parametrize("name", ["moment.png", "moment.gif"])
 def test_a_place_that_cannot_be_written_is_named(tmp_path: Path, name: str) -> None:
     path = tmp_path / "missing" / name
-    with pytest.raises(EvaluationError, match=f"{name}: the picture cannot be"):
+    with pytest.raises(EvaluationError, match=f"{name}: cannot be written"):
         write_picture(path, [picture(moment(0)).frame(0)])
     assert not list(tmp_path.iterdir())

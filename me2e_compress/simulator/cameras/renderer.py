@@ -14,17 +14,16 @@ from me2e_compress.simulator.camera_rig import (
     CameraRig,
     Weather,
 )
-from me2e_compress.simulator.cameras.ground import SKY_M, GroundSampler, GroundTexture
+from me2e_compress.simulator.cameras.ground import (
+    SKY_M,
+    Bytes,
+    GroundSampler,
+    GroundTexture,
+)
 from me2e_compress.simulator.cameras.painter import Faces, Painter, draw
 from me2e_compress.simulator.cameras.solids import solids_of
+from me2e_compress.simulator.plane_geometry import Floats
 from me2e_compress.simulator.scene import Scene
-
-# The effects of weather and sensor faults on the images.
-
-
-Bytes = npt.NDArray[np.uint8]
-Floats = npt.NDArray[np.float64]
-
 
 # Contrast after d metres of fog is exp(-3 d / visibility): 5 % at the visibility
 # (Koschmieder's law, CIE definition of meteorological optical range)
@@ -44,6 +43,9 @@ HILLS, TREES = (122, 146, 142), (66, 94, 60)
 COLUMNS, ROWS = 2880, 64  # panorama: 0.125 degrees a column
 # Tangent of the elevation of the panorama's upper edge; above it the sky is even
 TALLEST = 0.1
+
+
+# The effects of weather and sensor faults on the images.
 
 
 @dataclass(frozen=True, eq=False)

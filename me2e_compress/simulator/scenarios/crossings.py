@@ -39,6 +39,11 @@ ENTRY_M = 14.0  # radius of the arcs between arms and ring
 LIMIT_MPS = 11.0  # on the ring
 
 
+def _quarters(start: str, end: str) -> int:
+    """Return how far one arm is from another: 1 turns right, 2 goes on, 3 left."""
+    return (ARMS.index(end) - ARMS.index(start)) % 4
+
+
 @dataclass(frozen=True)
 class Crossing:
     """A finished junction."""
@@ -53,7 +58,7 @@ class Crossing:
 
     def way(self, origin: str, to: str, lane: int = 0) -> list[LaneIndex]:
         """Return the chain of lanes from one arm to another."""
-        turn = (ARMS.index(to) - ARMS.index(origin)) % 4
+        turn = _quarters(origin, to)
         entry = {1: self.lanes - 1, 2: lane, 3: 0}[turn]
         inside = lane if turn == 2 else 0
         return [
@@ -81,9 +86,8 @@ def junction(
     The ego's move is drawn if there are several ``moves``. Without a sign, traffic from
     its sides gives way.
     """
-    move = moves[0] if len(moves) == 1 else stage.choice("move", moves)
     minor = ("left", "right") if sign is None else ("back", "ahead")
-    crossing = _crossing(stage, move, arms, lanes, limit_mps, minor)
+    crossing = _crossing(stage, moves, arms, lanes, limit_mps, minor)
     if sign is not None:
         line = _stop_line(crossing, "back")
         width = lanes * LANE_WIDTH_M
@@ -97,8 +101,7 @@ def signal_junction(
     ego_light: SignalState | None = SignalState.GREEN,
 ) -> Crossing:
     """Lay a junction with lights; a usual driver finds ``ego_light`` (None: any)."""
-    move = moves[0] if len(moves) == 1 else stage.choice("move", moves)
-    crossing = _crossing(stage, move, ARMS, 1, 13.0, ())
+    crossing = _crossing(stage, moves, ARMS, 1, 13.0, ())
     for arm in ARMS:
         line = _stop_line(crossing, arm)
         crossing.signals[arm] = stage.regulate(SignalKind.TRAFFIC_LIGHT, line)
@@ -136,13 +139,14 @@ def _stop_line(crossing: Crossing, arm: str) -> Pose:
 
 def _crossing(
     stage: Stage,
-    move: str,
+    moves: Sequence[str],
     arms: Sequence[str],
     lanes: int,
     limit_mps: float,
     minor: Sequence[str],
 ) -> Crossing:
     # the junction's size and position
+    move = moves[0] if len(moves) == 1 else stage.choice("move", moves)
     approach = stage.place("approach_m", 55.0, 70.0)
     half = HALF_M + (lanes - 1) * LANE_WIDTH_M
     centre = origin(stage).moved(approach + half)
@@ -159,8 +163,7 @@ def _crossing(
     for start, end in itertools.permutations(arms, 2):
         _connect(net, crossing, start, end, limit_mps)
         # straight on before right before left, then minor roads
-        turn = (ARMS.index(end) - ARMS.index(start)) % 4
-        rank = {2: 0, 1: 1, 3: 2}[turn] + (3 if start in minor else 0)
+        rank = {2: 0, 1: 1, 3: 2}[_quarters(start, end)] + (3 if start in minor else 0)
         for lane in range(len(net.graph.graph[f"{start}.in"][f"{end}.out"])):
             net.ranks[f"{start}.in", f"{end}.out", lane] = rank
     # the ego's route
@@ -178,7 +181,7 @@ def _connect(
     first = crossing.arm(start, 0.0, LANE_WIDTH_M / 2).turned(math.pi)
     here, there = f"{start}.in", f"{end}.out"
     # straight on, right, or left: radii that meet the lanes of the arms
-    turn = (ARMS.index(end) - ARMS.index(start)) % 4
+    turn = _quarters(start, end)
     inside = replace(PLAIN, limit_mps=limit_mps)
     if turn == 2:
         through = replace(inside, lanes=lanes, between=LaneMarking.NONE)
@@ -198,21 +201,13 @@ def _connect(
 
 def ring_way(start: str, end: str) -> list[LaneIndex]:
     """Return the chain of lanes from one arm around the ring to another."""
-    chain: list[LaneIndex] = [
-        (f"{start}.far", f"{start}.in", 0),
-        (f"{start}.in", f"{start}.on", 0),
-    ]
-    arm = start
-    while True:
-        after = ARMS[(ARMS.index(arm) + 1) % len(ARMS)]
-        chain.append((f"{arm}.on", f"{after}.off", 0))
-        if after == end:
-            break
-        chain.append((f"{after}.off", f"{after}.on", 0))
-        arm = after
-    chain.append((f"{end}.off", f"{end}.out", 0))
-    chain.append((f"{end}.out", f"{end}.end", 0))
-    return chain
+    nodes = [f"{start}.far", f"{start}.in", f"{start}.on"]
+    # counter-clockwise past the arms between
+    for k in range(1, _quarters(start, end)):
+        arm = ARMS[(ARMS.index(start) + k) % 4]
+        nodes += [f"{arm}.off", f"{arm}.on"]
+    nodes += [f"{end}.off", f"{end}.out", f"{end}.end"]
+    return [(a, b, 0) for a, b in itertools.pairwise(nodes)]
 
 
 def roundabout(stage: Stage) -> Regulator:
