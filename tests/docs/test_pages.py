@@ -55,7 +55,9 @@ def test_a_graph_is_fed_by_the_adapter_beside_it(
     )
     toml = tmp_path / "a.toml"
     toml.write_text(adapter.text)
-    policy = OnnxPolicy.open(model, Adapter.load(toml))
+    policy = OnnxPolicy.open(
+        model, Adapter.load(toml).model_copy(update={"plan": None})
+    )
     pictures = np.zeros((6, *policy.image_size, 3), np.uint8)
 
     feeds = policy.inputs.feeds(observation(motion(0.0, 0.0, 0.0), images=pictures))
