@@ -49,7 +49,6 @@ __all__ = [
     "Trajectory",
 ]
 
-
 Shape = tuple[int | str | None, ...]
 DEFAULT_IMAGE_SIZE = (96, 160)  # rows and columns for a model that takes any size
 Triple = tuple[float, float, float]
@@ -62,8 +61,7 @@ Plan = npt.NDArray[np.floating]
 PLAN_SHAPE = (6, 2)
 PLAN_STEP_US = 500_000  # microseconds between two waypoints
 CAN_BUS_SIZE = 18
-# Times of the waypoints of a `Plan`, seconds
-PLAN_TIMES_S = (1 + np.arange(PLAN_SHAPE[0])) * (PLAN_STEP_US / 1e6)
+PLAN_TIMES_S = (1 + np.arange(PLAN_SHAPE[0])) * (PLAN_STEP_US / 1e6)  # of waypoints
 # Ranges of the controls in `PedalsAndWheel`
 RANGES = {"throttle": (0.0, 1.0), "steer": (-1.0, 1.0), "brake": (0.0, 1.0)}
 

@@ -19,8 +19,7 @@ from me2e_compress.base.registry import Registry
 from me2e_compress.driving.contract import Positive
 
 Floats = npt.NDArray[np.float64]
-# Side of a cell of UniAD's occupancy, which its weight of a cell is made for
-UNIAD_CELL_M = 0.5
+UNIAD_CELL_M = 0.5  # side of a cell of UniAD's occupancy, as its weight assumes
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -129,6 +128,7 @@ class CollisionOptimizer(HostStage):
         """Return the plan moved off occupied cells; the same plan if none are near."""
         from scipy.optimize import minimize  # takes a second to import
 
+        # Check the network's output
         occupancy = outputs.get(self.output)
         if occupancy is None:
             raise EvaluationError(
@@ -143,7 +143,7 @@ class CollisionOptimizer(HostStage):
         cells, step = self.near(plan, np.asarray(occupancy[0], np.float64))
         if not len(cells):
             return HostWork(plan)
-        # UniAD's weight is of its own cells
+        # Minimise from the network's plan on; UniAD's weight is of its own cells
         reference = np.asarray(plan, np.float64)
         weight = self.weight * (self.cell_m / UNIAD_CELL_M) ** 2
         problem, how = (reference, cells, step, self.sigma_m, weight), self.solver
@@ -182,6 +182,7 @@ def cost(
     near, ``weight`` that of one cell.
     """
     waypoints = flat.reshape(reference.shape)
+    # Of sum |p - r|^2 + sum height exp(-|p - o|^2 / (2 s^2)), by p
     moved, away = waypoints - reference, waypoints[step] - cells
     height = weight / (math.sqrt(2.0 * math.pi) * sigma)
     hills = height * np.exp(-(away**2).sum(axis=1) / (2.0 * sigma**2))

@@ -56,8 +56,7 @@ class DecisionFacts:
     host_cells: int = 0
 
 
-# Maps the facts of a decision to the microseconds it takes on the vehicle
-Charge = Callable[[DecisionFacts], int]
+Charge = Callable[[DecisionFacts], int]  # to microseconds on the vehicle
 
 
 @dataclass(frozen=True)
@@ -224,6 +223,7 @@ class TraceLatency(LatencySource):
 
     def on_route(self, route: str) -> Charge:
         """Charge the next sample of the trace."""
+        # The same stream on a route whatever drove before
         scaled = [round(sample * self.scale) for sample in self.samples_us]
         if self.in_order:
             replay = cycle(scaled)
@@ -277,6 +277,7 @@ def parse_latency(text: str, *, seed: int = 0) -> LatencySource:
 
 def with_draws(source: LatencySource, seed: int) -> LatencySource:
     """Give the innermost source the seed of its draws, if it draws and names none."""
+    # Go down to the source that draws
     below = getattr(source, "source", None)
     if isinstance(below, LatencySource):
         drawn = with_draws(below, seed)
@@ -325,6 +326,7 @@ class LayeredLatency(LatencySource):
 
     def to_json(self) -> dict[str, Any]:
         """Return the options, and the source below."""
+        # Options in the order of their fields: fingerprints depend on it
         named = (field.name for field in fields(self) if field.name != "source")
         own = {name: getattr(self, name) for name in named}
         return {**own, "of": self.source.to_json()}

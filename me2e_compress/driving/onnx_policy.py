@@ -117,7 +117,7 @@ class OnnxPolicy:
         reads = plan_read(session, adapter)
         first = first_sources(session, adapter, recurrent)
         policy = cls(session, adapter, inputs, reads, recurrent, first, stage)
-        # Find a misfit that only a run shows
+        # Find a misfit that only a run shows: of types, of shapes, of recurrent outputs
         policy.reset(None)
         policy.plan(inputs.nothing(command=0))
         for name, answer in recurrent.items():

@@ -113,6 +113,7 @@ class PythonDriver(Driver):
 
     def open(self) -> Policy:
         """Import the module and make the policy."""
+        # Import and call their code; any error of it is one line
         module, name = self.factory.split(":")
         _look_here()
         try:

@@ -24,8 +24,7 @@ T = TypeVar("T")
 class LatencyModel(StrEnum):
     """What a latency does to the controls; results under different ones are apart."""
 
-    # One decision at a time: those due meanwhile are dropped (equation 4)
-    DROP = "drop"
+    DROP = "drop"  # decisions due during another are dropped (equation 4)
     # A decision every frame, each acting ceil(t / dt) frames later, in their order: the
     # "delayed control execution through FIFO action buffering" of Bench2Drive-Robust
     FIFO = "fifo"

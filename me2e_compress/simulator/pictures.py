@@ -38,8 +38,7 @@ from me2e_compress.simulator.scene import (
 # As in nuScenes' figures. Rear images are not mirrored: in BACK, what is to the left of
 # the car is to the right of the image.
 MONTAGE = (("FRONT_LEFT", "FRONT", "FRONT_RIGHT"), ("BACK_LEFT", "BACK", "BACK_RIGHT"))
-# Pixels: width of a camera's tile, between two pictures, height of a line of text
-TILE, GAP, CAPTION = 320, 4, 30
+TILE, GAP, CAPTION = 320, 4, 30  # pixels of a camera, between pictures, of text
 COLOURS = 256  # colours of an animation's palette
 FINE = 2  # the view from above is drawn so much larger, then reduced: smooth edges
 AHEAD_M, BEHIND_M = 50.0, 22.0

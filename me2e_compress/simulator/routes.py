@@ -85,8 +85,7 @@ SHIPPED = Path(__file__).with_name("routes_220.json")
 
 
 GENERATION = {"road": 2}  # what every route says in a file, and what its digest counts
-# Key of a set, in its first record: what its routes were when they were admitted
-DIGEST = "set_sha256"
+DIGEST = "set_sha256"  # in a set's first record: its routes as they were admitted
 # What makes roads and traffic of a route, in the first record of a set and in the
 # manifest of its drives: another version makes another route of it
 VERSION, ROAD_VERSION = "road_version", 1

@@ -99,8 +99,7 @@ class Ego:
     acceleration_mps2: float
     lateral_acceleration_mps2: float  # positive to the left
     yaw_rate_radps: float
-    # Front wheel angle as the actuator holds it, positive to the left
-    steering_rad: float
+    steering_rad: float  # front wheel angle, held by the actuator; left is positive
     length: float
     width: float
 
@@ -130,8 +129,7 @@ class Signal:
     kind: SignalKind
     x: float
     y: float
-    # Direction of the traffic that must obey, not the way the lamp faces
-    heading: float
+    heading: float  # of the traffic that must obey, not the way the lamp faces
     state: SignalState | None  # None for signs
     stop_line: tuple[tuple[float, float], tuple[float, float]]
 

@@ -20,10 +20,8 @@ from me2e_compress.simulator.traffic.right_of_way import RightOfWay
 from me2e_compress.simulator.traffic.traffic_road import TrafficRoad
 
 DT_US = 50_000  # 20 Hz, as Bench2Drive
-# Actors decide at 10 Hz whatever the frame rate; they move at the frame rate
-DECISION_US = 100_000
-# The ego's centre may be this far outside every lane (OutsideRouteLanesTest)
-TOLERANCE_M = 0.5
+DECISION_US = 100_000  # actors decide at 10 Hz and move at the frame rate
+TOLERANCE_M = 0.5  # of the ego's centre outside lanes (OutsideRouteLanesTest)
 # Contact with an ego slower than this is no collision of the ego's, and the route goes
 # on: CollisionTest in Bench2Drive's atomic_criteria.py
 STANDING_MPS = 0.1

@@ -61,8 +61,7 @@ class RecurrentEntry(BaseModel):
 
     # The output that is fed back; None leaves it to metadata and naming rules
     answer: str | None = Field(default=None, alias="from")
-    # The value where a route begins: zeros, or that of this input of the graph
-    first: str = ZEROS
+    first: str = ZEROS  # at a route's start: zeros, or that of an input of the graph
 
     @model_validator(mode="before")
     @classmethod

@@ -113,7 +113,7 @@ class ImageInput(BaseModel):
     def _fits_together(self) -> Self:
         if (self.mean is None) != (self.std is None):
             raise ValueError("mean and std belong together")
-        # c, h and w, each letter once
+        # The layout has c, h and w, and every letter once
         letters = "chw" if self.layout is None else self.layout
         known = set("chw") <= set(letters) <= set("bnchw")
         if not known or len(set(letters)) != len(letters):
@@ -121,6 +121,7 @@ class ImageInput(BaseModel):
                 f"layout {letters!r} must be the letters c, h and w, with b and n if "
                 "there are such dimensions"
             )
+        # Crops lie in the picture of which they count pixels, one for each camera
         if self.crop is not None:
             if self.camera_size is None:
                 raise ValueError("crop needs the camera_size whose pixels it counts")

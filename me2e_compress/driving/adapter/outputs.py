@@ -88,10 +88,10 @@ def adapted(
         modules = ModuleMap.load(str(module_map))
         for ports in (*modules.optional, modules.ports):
             metadata |= _of_map(model, modules, ports, metadata)
+    # The adapter overrides the map
     if adapter is not None:
         adapter_of = Adapter.load(adapter_file(Path(adapter)))
         inputs = [str(value.name) for value in model.graph.inputs]
-        # every input that the adapter names must exist
         for name in (*adapter_of.feeds, *adapter_of.images):
             if name not in inputs:
                 raise EvaluationError(
@@ -135,6 +135,7 @@ def state_and_plan(
                 pairs[name] = answer, origin
         if own.get(PLAN, plan[0]) != plan[0]:
             plan = own[PLAN], origin
+    # Inputs and plan in words, by their source
     known = dict[str, list[str]]()
     for name in recurrent_inputs(model):
         _, origin = pairs.get(name, ("", "its name"))
@@ -150,6 +151,7 @@ def _lent(model: ir.Model, metadata: Mapping[str, str]) -> dict[str, str]:
     """Return what another graph's metadata state, and this one's lack, that fits it."""
     (inputs, outputs), own = sides(model), model.metadata_props
     lent, ends = dict[str, str](), (None, *outputs)
+    # Pairs of which this graph has both names, and a plan that it answers
     if RECURRENT not in own and (pairs := declared_pairs(metadata)) is not None:
         fit = {k: end for k, end in pairs.items() if k in inputs and end in ends}
         if fit or not pairs:
@@ -168,7 +170,8 @@ def _of_map(
     """Return the metadata that a map states; none where optional ports do not fit."""
     own, plan = {**model.metadata_props, **before}, ports.plan
     pairs, is_optional = dict(ports.recurrent), ports is not modules.ports
-    if is_optional:  # the graph's own metadata come first
+    # The graph's own metadata override ports that are optional
+    if is_optional:
         declared, plan = declared_pairs(own), None if PLAN in own else plan
         known = declared or {}
         pairs = {name: out for name, out in pairs.items() if name not in known}
@@ -176,9 +179,11 @@ def _of_map(
     sets = {} if SETS in own or not ports.sets else {SETS: json.dumps(ports.sets)}
     if plan is None and not pairs and not sets:
         return {}
+    # State the rest as an adapter would
     origin = f"map {modules.name}"
     adapter = Adapter.parse({"plan": plan, "recurrent": pairs}, origin)
     metadata = adapter.metadata(own) | sets
+    # Every name must be one of the graph's
     try:
         _check_fit(model, origin, adapter.plan, metadata)
         outputs = [str(output.name) for output in model.graph.outputs]

@@ -27,12 +27,9 @@ class Axes(StrEnum):
     """Ground frame of a model's waypoints and of its lidar2img."""
 
     FORWARD_LEFT = "forward-left"  # x forward, y left: ours
-    # x right, y forward: the lidar of nuScenes, of UniAD and of VAD
-    RIGHT_FORWARD = "right-forward"
-    # x forward, y right, left-handed: CARLA's, and Bench2DriveZoo's TCP's
-    FORWARD_RIGHT = "forward-right"
-    # x right, y backward, left-handed: OpenDriveLab's TCP's
-    RIGHT_BACKWARD = "right-backward"
+    RIGHT_FORWARD = "right-forward"  # x right, y forward: nuScenes' lidar, UniAD, VAD
+    FORWARD_RIGHT = "forward-right"  # left-handed: CARLA's, Bench2DriveZoo's TCP
+    RIGHT_BACKWARD = "right-backward"  # left-handed: OpenDriveLab's TCP
 
     @property
     def to_ego(self) -> npt.NDArray[np.float64]:
@@ -107,7 +104,6 @@ class EgoTrack:
         """Return [n, 4] of n times: x, y (m), heading (rad, unwrapped), speed (m/s)."""
         # Interpolate between decisions, constant before the first. Ignore what is older
         # than all of them: a route has thousands of states.
-        # Ignore what is older than all of them: a route has thousands of states
         first = max(0, bisect_right(self._times_us, float(np.min(times_us))) - 1)
         states = np.array(self._states[first:], np.float64)
         states[:, 2] = np.unwrap(states[:, 2])
@@ -117,16 +113,13 @@ class EgoTrack:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Observed:
-    """The data of a decision that sources may use.
-
-    ``track`` includes this decision. ``projections`` map the ego frame to pixels of
-    each image input as the model sees it, float32 [cameras, 4, 4], by the input's name;
-    without image inputs, under the empty name, to those of the six cameras.
-    """
+    """The data of a decision that sources may use."""
 
     observation: Observation
     axes: Axes
-    track: EgoTrack
+    track: EgoTrack  # this decision included
+    # float32 (cameras, 4, 4), ego frame to pixels of each image input as the model sees
+    # it, by its name; without image inputs, by the empty name, of the six cameras
     projections: Mapping[str, npt.NDArray[np.float32]]
 
     @property

@@ -33,29 +33,23 @@ ASPHALT = (98, 98, 101)
 SHOULDER = (116, 112, 105)
 KERB = (138, 134, 124)
 WHITE = (238, 238, 238)
-# A lighter rim around all pavement: where the road ends is seen without a line
-KERB_M = 0.3
+KERB_M = 0.3  # a lighter rim around all pavement: the road's end without a line
 LINE_M = 0.2  # a little wider than the 0.15 m of real lines: our images are small
-# 3 m painted, 6 m free, from the start of the lane: the pattern of highway-env
-DASH_M, DASH_PERIOD_M, DASH_STEP_M = 3.0, 9.0, 0.5
+DASH_M, DASH_PERIOD_M, DASH_STEP_M = 3.0, 9.0, 0.5  # as in highway-env
 STOP_LINE_M = 0.5
 BAR_M, BAR_PERIOD_M = 0.5, 1.0  # zebra bars
-# Metres of a texel at the finest level: a 0.15 m line is just wider than one
-RESOLUTION_M = 0.125
+RESOLUTION_M = 0.125  # of a texel at the finest level: a line is just wider
 LEVELS = 6
 # How far the texture reaches beyond the route's bounding box. What lies further repeats
 # its border, which continues a straight road.
 MARGIN_M = 60.0
 GRASS = (92, 122, 70)
-# Grey levels of the mottling
-GRASS_GRAIN, ASPHALT_GRAIN = np.float32(10.0), np.float32(3.0)
-# Metres of a patch, and its share of the mottling
-GRAINS = ((16.0, 0.8), (2.0, 0.6), (0.5, 0.4))
+GRASS_GRAIN, ASPHALT_GRAIN = np.float32(10.0), np.float32(3.0)  # in grey levels
+GRAINS = ((16.0, 0.8), (2.0, 0.6), (0.5, 0.4))  # metres of a patch, share of mottling
 ROWS_AT_ONCE = 32
 FARTHEST_M = 400.0  # depth of the last row before the horizon, at most
 SKY_M = 4000.0  # the sky counts as this far away
-# From these depths (metres) on, a row is the mean of this many samples
-TAPS = ((0.0, 1), (10.0, 4))
+TAPS = ((0.0, 1), (10.0, 4))  # samples of a row, from these depths (m) on
 # A mip level is chosen whose texel is this part of a sample's length on the ground:
 # less shimmers, more blurs
 BLUR = 0.5

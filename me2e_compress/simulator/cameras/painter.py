@@ -31,8 +31,7 @@ Flags = npt.NDArray[np.bool_]
 
 TOUCH_M = 0.05  # footprints that sink into each other by less still count as apart
 NEAR_M = 0.2  # polygons are cut at this depth
-# Details whose longer side is less are left out: others, lamps
-LEAST_PX = np.array([2.0, 0.7])
+LEAST_PX = np.array([2.0, 0.7])  # smaller details are left out: others, lamps
 LIMIT_PX = 20_000.0  # far outside any image, and safe in cv2's fixed-point numbers
 
 

@@ -41,8 +41,7 @@ POOL = 2  # the noise comes from a pool of this many sets of images, at a random
 ZENITH, HAZE = (128, 170, 224), (216, 228, 238)
 HILLS, TREES = (122, 146, 142), (66, 94, 60)
 COLUMNS, ROWS = 2880, 64  # panorama: 0.125 degrees a column
-# Tangent of the elevation of the panorama's upper edge; above it the sky is even
-TALLEST = 0.1
+TALLEST = 0.1  # tangent of the panorama's upper edge; above it the sky is even
 
 
 # The effects of weather and sensor faults on the images.

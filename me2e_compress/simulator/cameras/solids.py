@@ -255,8 +255,7 @@ def _octagon(x: float, radius: float, slot: Slot, *, detail: bool) -> list[Quad]
 
 
 Colour = tuple[int, int, int]
-# What is further from the ego is not drawn: a car is less than 3 px wide there
-FARTHEST_M = 120.0
+FARTHEST_M = 120.0  # nothing is drawn beyond: a car is less than 3 px wide there
 # Half periods: indicators blink 1.4 times a second (60 to 120 a minute by UN Regulation
 # 48), beacons 2.5 times
 BLINK_US, BEACON_US = 350_000, 200_000

@@ -32,8 +32,7 @@ class Slot(IntEnum):
     SKIN = 5
     LEGS = 6
     STRIPE = 7
-    # from here on: lamps, which shine by themselves
-    HEADLAMP = 8
+    HEADLAMP = 8  # from here on: lamps, which shine by themselves
     TAIL_LAMP = 9
     THIRD_LAMP = 10
     INDICATOR_LEFT = 11

@@ -10,18 +10,14 @@ from me2e_compress.simulator.traffic.bodies import Behaviour, Car, Walker
 from me2e_compress.simulator.traffic.network import LANE_WIDTH_M, LaneIndex
 from me2e_compress.simulator.traffic.stage import HORIZON_S, Script, Stage
 
-# Cyclists stay a row that is as short as it begins
-TOGETHER = Behaviour(headway_s=0.4, jam_gap_m=1.5)
+TOGETHER = Behaviour(headway_s=0.4, jam_gap_m=1.5)  # cyclists stay a short row
 ONCOMING_S = (16.0, 24.0)  # mean gap of the oncoming traffic where one must overtake
 AWAY_MPS = 10.0
-# How slowly, and how long, a car crawls after it has cut in
-CRAWL_MPS, CRAWL_S = 2.2, (4.0, 9.0)
+CRAWL_MPS, CRAWL_S = 2.2, (4.0, 9.0)  # of a car that has cut in
 HALF_LANE_M = LANE_WIDTH_M / 2
-# Mean number of people who cross at a light, each time it lets them
-WALKERS_A_CYCLE = 2.0
+WALKERS_A_CYCLE = 2.0  # mean number of people each time a light lets them cross
 LATE = 0.2  # share of them who cross at any time of their phase, even as it ends
-# How far from the middle of the road the first cyclist begins
-RIDE_M = LANE_WIDTH_M + 4.0
+RIDE_M = LANE_WIDTH_M + 4.0  # from the road's middle to the first cyclist
 
 
 def free_side(stage: Stage) -> float:

@@ -27,17 +27,13 @@ from me2e_compress.simulator.traffic.stage import Script, Stage
 
 
 FAST_MPS = 13.5  # roads with a higher limit carry more traffic
-# Mean time between two cars of a lane, by road class: 340 to 1030 vehicles an hour
-GAP_S, FAST_GAP_S = (6.5, 10.5), (3.5, 6.5)
+GAP_S, FAST_GAP_S = (6.5, 10.5), (3.5, 6.5)  # mean between cars of a lane
 WALKER_EVERY_M = (11.0, 20.0)  # mean distance between two people beside the road
 CYCLIST = 0.25  # share of them who ride
 WALK_MPS, RIDE_MPS = (1.0, 1.7), (3.0, 5.0)
-# People are no farther from the route as they begin, and no more than these
-NEAR_M, MOST = 45.0, 26
-# How far from the edge of a lane people may be; the nearest place off the road
-ASIDE_M = (0.9, 1.5, 2.2, 3.0, 4.0, 5.0)
-# Metres that a line keeps from every lane, and is shorter at its ends
-OFF_M, END_M = 0.5, 10
+NEAR_M, MOST = 45.0, 26  # of people: farthest from the route, and number
+ASIDE_M = (0.9, 1.5, 2.2, 3.0, 4.0, 5.0)  # from a lane's edge to people beside it
+OFF_M, END_M = 0.5, 10  # a line's distance from lanes, and from its ends
 
 
 def populate(stage: Stage) -> None:
@@ -122,6 +118,7 @@ def pavements(network: Network) -> Iterator[Floats]:
     for index in network.graph.lanes_dict():
         if index in network.ranks or index in network.shoulders:
             continue
+        # people walk beside the outer lanes: more to the right than to the left
         a, b, lane = index
         asides = list[float]()
         if lane == len(network.graph.graph[a][b]) - 1:

@@ -20,15 +20,13 @@ from me2e_compress.simulator.traffic.network import (
 from me2e_compress.simulator.traffic.right_of_way import Regulator, SignalPlan
 from me2e_compress.simulator.traffic.stage import Stage
 
-# Counter-clockwise; the ego comes from "back"
-ARMS = ("ahead", "left", "back", "right")
+ARMS = ("ahead", "left", "back", "right")  # the ego comes from "back"
 _TURNS = {"left": Command.LEFT, "right": Command.RIGHT, "ahead": Command.STRAIGHT}
 # Half the side of a one-lane junction: a right turn of 10 m radius, which the ego's
 # bicycle (7.6 m at full lock) can drive
 HALF_M = 12.0
 ARM_M = 130.0
-# The stop line is this far before the junction (a crosswalk lies between)
-SETBACK_M = 3.0
+SETBACK_M = 3.0  # from the stop line to the junction: room for a crosswalk
 GREEN_S = (9.0, 15.0)  # of either group of lights
 USUAL_MPS = 9.0  # the speed for which a plan is said to show a driver red or green
 # Seconds after green at which the usual driver arrives

@@ -21,12 +21,9 @@ from me2e_compress.simulator.traffic.stage import Script, Stage, arrival_times, 
 
 NEAR_M = 30.0  # a standing obstacle counts as met when the ego is this close
 TOUCH_M = 1.0
-# Shares of drivers who follow closely and take short gaps, and of slow ones: our choice
-HEEDLESS, SLOW = 0.12, 0.15
-# Share of drivers of a conflict who obey neither lights nor signs, where some do
-LATE = 0.45
-# Share of drivers of a conflict who do not make room for an ego that comes in
-BLIND_TO_EGO = 0.4
+HEEDLESS, SLOW = 0.12, 0.15  # shares of close followers, of slow drivers
+LATE = 0.45  # share of drivers of a conflict who obey neither lights nor signs
+BLIND_TO_EGO = 0.4  # share of drivers of a conflict who make the ego no room
 TURNING = 0.4  # share of traffic that turns at a junction
 # The ego and another meet if one is so far before or after the place of the conflict,
 # the other so near to it: the ego waits at a line before it
@@ -41,8 +38,7 @@ DENSE_S = (2.5, 4.0)  # mean gap in the lane that the ego changes into
 # into it
 INVADING, INTO_M = 0.4, (0.9, 1.2)
 ASIDE_M = 1.1  # how far right of its lane's centre traffic keeps there, to have room
-# Mean gap in the ego's lane where an emergency vehicle comes: others make room
-SPARSE_S = 20.0
+SPARSE_S = 20.0  # mean gap where an emergency vehicle comes: others make room
 # The ego has not yielded if the vehicle was this close behind for this long, and still
 # is behind at the end: it may come too late to be let by
 HELD_UP_M, HELD_UP_S = 20.0, 4.0
@@ -114,8 +110,7 @@ class Traffic:
     """Who drives on a lane."""
 
     gap_s: float  # mean time between two cars
-    # Lowest and highest wanted speed; None for about the limit
-    speed: tuple[float, float] | None = None
+    speed: tuple[float, float] | None = None  # range; None for about the limit
     platoons: float = 0.25  # share of arrivals that lead a platoon
     reckless: float = 0.0  # share of drivers who obey neither lights nor signs
     joins: tuple[LaneIndex, ...] = ()  # the chain that they join where their lane ends
@@ -165,6 +160,7 @@ def _driver(
     traffic: Traffic,
 ) -> Car:
     """Draw one driver with a vehicle."""
+    # its wanted speed
     limit = float(stage.network.lane(chain[0]).speed_limit)
     heedless, slow, kind, reckless = random.random(4)
     wanted = limit * float(random.uniform(0.85, 1.0))
@@ -172,6 +168,7 @@ def _driver(
         wanted = float(random.uniform(*traffic.speed))
     elif slow < SLOW:
         wanted *= float(random.uniform(0.6, 0.75))
+    # its mind
     mind = Behaviour(
         acceleration_mps2=float(random.uniform(1.5, 3.0)),
         jam_gap_m=float(random.uniform(2.0, 3.5)),
@@ -183,6 +180,7 @@ def _driver(
     )
     if heedless < HEEDLESS:
         mind = replace(mind, headway_s=0.7, jam_gap_m=1.8, gap_s=0.5)
+    # its vehicle
     vehicle = ActorKind.VAN if kind < 0.12 else ActorKind.CAR
     vehicle = ActorKind.TRUCK if kind > 0.93 else vehicle
     car = stage.car(chain, s_m, wanted, wanted, vehicle, mind, comes=True)

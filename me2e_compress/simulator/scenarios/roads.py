@@ -24,16 +24,12 @@ Edge = tuple[str, str]
 BEYOND_M = 120.0  # road beyond the goal
 TOTAL_M = BEFORE_M + GOAL_M + BEYOND_M
 PARKING_M = 2.5  # width of a parking lane
-# Green for the traffic, and for people on foot: they walk 8 m at 1.2 m/s in 6.7 s
-GREEN_S, WALK_S = (14.0, 24.0), 8.0
-# A light stands at least so far behind the place of a conflict's beginning
-LIGHT_M = 125.0
+GREEN_S, WALK_S = (14.0, 24.0), 8.0  # for traffic; for 8 m on foot at 1.2 m/s
+LIGHT_M = 125.0  # from the beginning of a conflict to a light, at least
 LIMIT_MPS = 14.0  # of fast roads
 RAMP_RADIUS_M = 80.0
-# Sideways distance between a ramp's straight and the lane it becomes
-RAMP_APART_M = 7.0
-# How far each of a ramp's two arcs turns
-RAMP_RAD = math.acos(1 - RAMP_APART_M / (2 * RAMP_RADIUS_M))
+RAMP_APART_M = 7.0  # sideways from a ramp's straight to the lane it becomes
+RAMP_RAD = math.acos(1 - RAMP_APART_M / (2 * RAMP_RADIUS_M))  # of either arc
 RAMP = Section(limit_mps=LIMIT_MPS)
 BESIDE = replace(RAMP, left=LaneMarking.DASHED)
 CHANGE_M = 25.0  # length of a lane change

@@ -16,8 +16,7 @@ from me2e_compress.simulator.scene import DIMENSIONS, ActorKind, Control, Ego, S
 from me2e_compress.simulator.traffic.network import LaneIndex, Network, Pose, flip
 
 GRAVITY_MPS2 = 9.81
-# Largest acceleration that the tyres transmit: friction 0.8, dry asphalt
-DRY_GRIP_MPS2 = 0.8 * GRAVITY_MPS2
+DRY_GRIP_MPS2 = 0.8 * GRAVITY_MPS2  # of tyres on dry asphalt: friction 0.8
 ACCELERATION_RANGE_MPS2 = (-8.0, 4.0)  # limits of the ego's brakes and engine
 ACCELERATION_LAG_S = 0.2
 # Time constants of the ego's first-order actuators: our choice. highway-env acts at
@@ -209,10 +208,8 @@ class Behaviour:
     obeys_limits: bool = True  # False for emergency vehicles
     obeys_rules: bool = True  # False for those who pass red lights and priority traffic
     gap_s: float = 1.2  # time to spare before priority traffic
-    # Whether MOBIL decides, every second, if a lane beside is better
-    changes_lanes: bool = False
-    # MOBIL's weight of what a lane change costs others; highway-env has 0
-    politeness: float = 0.0
+    changes_lanes: bool = False  # whether MOBIL looks for a better lane
+    politeness: float = 0.0  # MOBIL's weight of others; highway-env has 0
 
 
 class Car(_Body, IDMVehicle):  # type: ignore[misc]  # highway-env is untyped
@@ -249,12 +246,10 @@ class Car(_Body, IDMVehicle):  # type: ignore[misc]  # highway-env is untyped
         self.lanes, self.leg = list(lanes), 0
         self.target_lane_index = self.lane_index = self.lanes[0]
         self.action = {"acceleration": 0.0, "steering": 0.0}
-        # An acceleration that a script imposes instead of IDM's
-        self.forced_mps2: float | None = None
+        self.forced_mps2: float | None = None  # by a script, instead of IDM's
         self.offset_m = 0.0  # how far left of the lane's centre it drives
         self.until_change = id % 10  # decisions until it looks for a better lane
-        # The chain that it joins where its own ends
-        self.joins: list[LaneIndex] | None = None
+        self.joins: list[LaneIndex] | None = None  # where its own chain ends
 
     @property
     def lane_s(self) -> float:

@@ -28,8 +28,7 @@ from me2e_compress.simulator.plane_geometry import (
 )
 
 LaneIndex = tuple[str, str, int]
-# Width of an urban lane in CARLA's towns and of most lanes in nuScenes
-LANE_WIDTH_M = 3.5
+LANE_WIDTH_M = 3.5  # of urban lanes in CARLA's towns and most of nuScenes
 CHORD_M = 1.0  # spacing of the points of a lane's centre line
 _LINE = {
     LaneMarking.NONE: LineType.NONE,
@@ -90,8 +89,7 @@ class Section:
     shoulder: bool = False
 
 
-# An unpainted lane, as inside a junction
-PLAIN = Section(left=LaneMarking.NONE, right=LaneMarking.NONE)
+PLAIN = Section(left=LaneMarking.NONE, right=LaneMarking.NONE)  # in junctions
 
 
 class Network:
@@ -100,10 +98,8 @@ class Network:
     def __init__(self) -> None:
         self.graph = RoadNetwork()
         self.shoulders: list[LaneIndex] = []
-        # Lanes inside junctions; those of a lower rank have priority
-        self.ranks: dict[LaneIndex, int] = {}
-        # Lanes that end, or begin, in the middle of a road
-        self.closed: list[LaneIndex] = []
+        self.ranks: dict[LaneIndex, int] = {}  # in junctions; low ones go first
+        self.closed: list[LaneIndex] = []  # ending or beginning within a road
         self._sampled: dict[LaneIndex, tuple[Floats, Floats]] = {}
 
     def straight(

@@ -19,13 +19,11 @@ STOPPED_MPS = 0.1  # slower than this is stopped, as in CARLA's RunningStopTest
 # Where a stop counts: metres from the front bumper to the line. CARLA looks for the
 # stop within 4 m of the sign.
 STOP_ZONE_M = (-1.0, 5.0)
-# With a priority vehicle nearer than this to the conflict, the ego did not yield
-YIELD_GAP_S = 1.5
+YIELD_GAP_S = 1.5  # least time to a priority vehicle at the conflict
 # Yellow is 3 s in CARLA (its traffic lights' default) and at 50 km/h in most countries;
 # two seconds in which all have red clear a junction of 24 m at 12 m/s
 YELLOW_S, ALL_RED_S = 3.0, 2.0
-# Lanes whose centres come closer than this are in conflict: a car and a margin
-TOUCH_M = 2.6
+TOUCH_M = 2.6  # lanes closer than this are in conflict: a car and a margin
 REACH_M = 70.0  # how far from a junction others are looked for; 5 s at 14 m/s
 DECIDE_M = 30.0  # how far from a junction a driver decides whether to enter
 START_MPS2 = 2.0  # acceleration with which a driver expects anybody to enter
@@ -242,13 +240,16 @@ class RightOfWay:
             for user in users:
                 if user.id == car.id:
                     continue
+                # who has passed, or is held back, does not count
                 nose, tail = user.ends_m
                 if tail > conflict.theirs[1] or (user.bound and nose < 0.0):
                     continue
+                # nor who waits outside and has no priority: rank, distance, then id
                 mine = (rank, round(front_m), car.id)
                 theirs = (user.rank, round(-nose), user.id)
                 if nose < 0.0 and theirs > mine:
                     continue
+                # wait for who is in the conflict, or would be there at the same time
                 if nose > conflict.theirs[0]:
                     return True
                 comes = _seconds(conflict.theirs[0] - nose, user.speed_mps)

@@ -35,16 +35,13 @@ from me2e_compress.simulator.traffic.network import (
 from me2e_compress.simulator.traffic.right_of_way import Regulator, SignalPlan
 
 Body = Car | Walker | StaticObject | EgoVehicle
-# Arrivals are drawn for as long as a route may last (the leaderboard's 4000 ticks)
-HORIZON_S = 200.0
+HORIZON_S = 200.0  # a route may last so long (the leaderboard's 4000 ticks)
 SHORTEST_S = 1.6  # two cars of one lane do not arrive closer to each other
 PLATOON_S = (1.6, 2.6)
 PLATOON = 4  # most followers in a platoon
-# One actor script: resumed at every decision, it yields until the next one
-Script = Iterator[None]
+Script = Iterator[None]  # of an actor, resumed at every decision
 GOAL_M = 150.0  # length of a route without what is drawn before and after
-# Metres before the places of a scenario, and after them
-LEAD_M, AFTER_M = (25.0, 60.0), (25.0, 190.0)
+LEAD_M, AFTER_M = (25.0, 60.0), (25.0, 190.0)  # around a scenario's places
 TRAFFIC = "traffic"  # the parameter that, with the seed, decides all arrivals
 
 
@@ -147,8 +144,7 @@ class Stage:
         # Lanes into the map on which nobody begins between two stations
         self.clear: dict[LaneIndex, tuple[float, float]] = {}
         self.schedule = Schedule()
-        # Where people who cross at a light begin and end, metres left of the route
-        self.light_across_m = (0.0, 0.0)
+        self.light_across_m = (0.0, 0.0)  # ends of a crossing, left of the route
         self.lead_m: float = self.uniform("lead_m", *LEAD_M)
         low, high = AFTER_M
         spread = self.uniform("after_share", 0.0, 1.0)

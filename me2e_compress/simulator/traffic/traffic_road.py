@@ -28,8 +28,7 @@ NEAREST_M = 2.0  # gap between bumpers below which nobody changes
 SETTLED_M = 30.0
 SLOWEST_MPS = 1.0
 FORESEEN_S = (1.0, 2.0, 3.0)  # when drivers foresee people who cross, seconds from now
-# The ego is wholly in a lane if it is so near to its centre and direction
-INSIDE_M, ALONG_RAD = 0.6, 0.3
+INSIDE_M, ALONG_RAD = 0.6, 0.3  # the ego nearer is wholly in a lane
 BESIDE_M = 0.25  # two bodies closer than this sideways are in each other's way
 
 
