@@ -42,11 +42,7 @@ class World:
     """
 
     def __init__(
-        self,
-        route: Route,
-        *,
-        dt_us: int = DT_US,
-        builder: Builder | None = None,
+        self, route: Route, *, dt_us: int = DT_US, builder: Builder | None = None
     ) -> None:
         if not 0 < dt_us <= DECISION_US:
             raise EvaluationError(
