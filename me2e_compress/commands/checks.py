@@ -38,7 +38,7 @@ from me2e_compress.base.listener import Listener
 from me2e_compress.calibration.dataset import CalibrationSet, npz_bytes
 from me2e_compress.commands import opening_main
 from me2e_compress.commands.options import GraphOptions
-from me2e_compress.driving.adapter.outputs import adapted, state_and_plan
+from me2e_compress.driving.adapter.outputs import state_and_plan, write_port_metadata
 from me2e_compress.graph.modules.assign import map_of
 from me2e_compress.graph.modules.module_map import ModuleMap
 from me2e_compress.graph.nodes import is_read, is_standard, nodes_of, opset_of
@@ -88,10 +88,10 @@ def read_graph(
 ) -> ir.Model:
     """Read a graph; warn of another opset and of its shortcomings.
 
-    What an adapter and a map state becomes metadata of the graph; see :func:`adapted`.
+    What an adapter and a map state becomes metadata; see `write_port_metadata`.
     """
     model = load_graph(path)
-    adapted(model, adapter, module_map or map_name(path))
+    write_port_metadata(model, adapter, module_map or map_name(path))
     if change := read_as(model):
         listener.on_warning(f"{path}: {change}")
     if hint := shortcomings(model):

@@ -23,7 +23,7 @@ from me2e_compress.commands.checks import check_folder, model_path, try_first, w
 from me2e_compress.commands.options import FramesOptions
 from me2e_compress.commands.result import Result
 from me2e_compress.driving.adapter import Adapter
-from me2e_compress.driving.adapter.outputs import adapted
+from me2e_compress.driving.adapter.outputs import write_port_metadata
 from me2e_compress.driving.onnx_policy import OnnxPolicy
 from me2e_compress.driving.shipped_adapters import adapter_file
 from me2e_compress.graph import load, sha256_of
@@ -106,7 +106,7 @@ def record_frames(
         else:
             # Frames of a drive: the shipped driver drives, the model looks on
             try_first(model, model.name, listener=listener, provider=options.runs_on)
-            metadata = adapted(load(model), None, options.module_map)
+            metadata = write_port_metadata(load(model), None, options.module_map)
             digests += f" {metadata}" if metadata else ""
             about["seed"] = options.seed
             frames_from = _drive_source(model, adapter, metadata, options)

@@ -23,7 +23,7 @@ from me2e_compress.commands.checks import (
 )
 from me2e_compress.commands.options import InspectOptions
 from me2e_compress.commands.result import Result, View
-from me2e_compress.driving.adapter.outputs import adapted
+from me2e_compress.driving.adapter.outputs import write_port_metadata
 from me2e_compress.graph import provenance
 from me2e_compress.graph.modules.assign import Item, assign, itemise
 from me2e_compress.graph.modules.module_map import ModuleMap
@@ -138,7 +138,7 @@ def inspect(model: str | Path, options: InspectOptions | None = None) -> Inspect
     # Read the graph as its adapter, map and dimensions have it
     options, path = options or InspectOptions(), model_path(model)
     loaded = load_graph(path)
-    adapted(loaded, options.adapter, options.module_map)
+    write_port_metadata(loaded, options.adapter, options.module_map)
     modules = load_map(options.module_map, loaded)
     if options.dims:
         loaded = FixShapes(options.dims).run(loaded, Context(modules)).model

@@ -21,7 +21,7 @@ from me2e_compress.commands.checks import (
 )
 from me2e_compress.commands.options import PlanOptions
 from me2e_compress.commands.result import Result, View
-from me2e_compress.driving.adapter.outputs import adapted
+from me2e_compress.driving.adapter.outputs import write_port_metadata
 from me2e_compress.graph.modules.module_map import ModuleMap
 from me2e_compress.manager import PassManager, recipe
 from me2e_compress.passes import Context, Pass
@@ -201,7 +201,7 @@ def plan(
                 if options.overrides is None
                 else Path(options.overrides),
             )
-            adapted(loaded, None, options.module_map or map_name(source))
+            write_port_metadata(loaded, None, options.module_map or map_name(source))
             ready = PreparedGraph.of(source, loaded, options.module_map)
             decided = quantizer.plan(ready.model, Context(ready.modules))
             TARGETS.parse(quantizer.target).check_types(decided, ready.model)

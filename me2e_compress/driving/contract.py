@@ -69,7 +69,7 @@ RANGES = {"throttle": (0.0, 1.0), "steer": (-1.0, 1.0), "brake": (0.0, 1.0)}
 # The ports of a graph: fit of shapes, and conversion of arrays.
 
 
-def shaped(array: Array, port: SessionPort) -> Array:
+def fit_to_port(array: Array, port: SessionPort) -> Array:
     """Return an array with the rank and type of a port."""
     missing = len(port.shape) - array.ndim
     sides = (1,) * missing + array.shape if missing >= 0 else array.shape[-missing:]
@@ -218,7 +218,7 @@ class HostedPolicy(Policy, Protocol):
 # Check a policy's answer, and bring it into one form.
 
 
-def checked(answer: object) -> Trajectory | PedalsAndWheel:
+def check_answer(answer: object) -> Trajectory | PedalsAndWheel:
     """Return a policy's answer, a plan with the times of its waypoints.
 
     Raises:
@@ -250,14 +250,14 @@ def checked(answer: object) -> Trajectory | PedalsAndWheel:
     return Trajectory(_finite(answer), PLAN_TIMES_S)
 
 
-def timed(plan: Plan | Trajectory) -> Trajectory:
+def with_times(plan: Plan | Trajectory) -> Trajectory:
     """Return a plan with the times of its waypoints."""
     return plan if isinstance(plan, Trajectory) else Trajectory(plan, PLAN_TIMES_S)
 
 
 def six_waypoints(answer: object) -> npt.NDArray[np.float64]:
     """Return a plan as six waypoints every 0.5 s, interpolated if need be."""
-    control = checked(answer)
+    control = check_answer(answer)
     if isinstance(control, PedalsAndWheel):
         raise EvaluationError("the policy answers controls: there is no plan")
     if np.array_equal(control.times_s, PLAN_TIMES_S):

@@ -10,7 +10,7 @@ import numpy as np
 from me2e_compress.base.errors import EvaluationError, FramesError, GraphError
 from me2e_compress.driving.adapter import Adapter
 from me2e_compress.driving.adapter.adapter import ZEROS, ModelInputs, contract_names
-from me2e_compress.driving.adapter.outputs import COMMAND, plan_read
+from me2e_compress.driving.adapter.outputs import COMMAND, find_plan
 from me2e_compress.driving.contract import (
     PLAN_TIMES_S,
     Observation,
@@ -114,7 +114,7 @@ class OnnxPolicy:
         """Drive a graph that is open, and run it once on zeros; see :meth:`open`."""
         recurrent = recurrent_of(session, adapter)
         inputs = ModelInputs.of(session, adapter, recurrent)
-        reads = plan_read(session, adapter)
+        reads = find_plan(session, adapter)
         first = first_sources(session, adapter, recurrent)
         policy = cls(session, adapter, inputs, reads, recurrent, first, stage)
         # Find a misfit that only a run shows: of types, of shapes, of recurrent outputs

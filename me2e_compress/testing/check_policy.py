@@ -14,7 +14,7 @@ from me2e_compress.driving.contract import (
     Policy,
     RouteInfo,
     Trajectory,
-    checked,
+    check_answer,
 )
 from me2e_compress.driving.policies import POLICIES, Driver
 from me2e_compress.testing.form import check_form, require
@@ -88,7 +88,7 @@ def _answers(driver: Driver, policy: Policy) -> Answers:
     listeners = Listeners(lambda world: asked.append((world, world.time_us)), answered)
     episode = drive(route, watched, Drive(), listeners)
     require(watched.finished, f"{driver.name}: {episode.failure}")
-    return tuple(checked(answer) for answer in watched.answers)
+    return tuple(check_answer(answer) for answer in watched.answers)
 
 
 @dataclass

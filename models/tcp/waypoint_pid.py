@@ -7,7 +7,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
 from me2e_compress.base.errors import EvaluationError
-from me2e_compress.driving.contract import PedalsAndWheel, Plan, timed
+from me2e_compress.driving.contract import PedalsAndWheel, Plan, with_times
 from me2e_compress.runtime.plan_adapter import Trajectory
 
 Place = tuple[float, float]
@@ -76,7 +76,7 @@ class WaypointPid:
         ``node`` is the next node of the route, metres to the right and forward.
         """
         # mean speed of the plan, its waypoints as (right, forward)
-        asked, trajectory = self.options, timed(plan)
+        asked, trajectory = self.options, with_times(plan)
         forward, left = trajectory.points.T
         waypoints = np.stack([-left, forward], axis=1).astype(np.float64)
         if len(waypoints) < 2:

@@ -23,7 +23,7 @@ from me2e_compress.commands.options import (
 from me2e_compress.commands.profile import profile
 from me2e_compress.commands.search import measure_sensitivity
 from me2e_compress.driving.adapter import Adapter
-from me2e_compress.driving.adapter.outputs import adapted
+from me2e_compress.driving.adapter.outputs import write_port_metadata
 from me2e_compress.fidelity.compare import SetOutputs
 from me2e_compress.graph.recurrence import recurrent_inputs
 from me2e_compress.runtime.plan_adapter import PlanAdapter
@@ -106,7 +106,7 @@ def test_a_map_says_which_outputs_are_sets(mine: Path, tmp_path: Path) -> None:
     sets, model = tmp_path / "sets.toml", graph.load(mine)
     named = '[sets]\nboxes = "remembered"\nscores = "remembered"\nothers = {}\n'
     sets.write_text(PARTS + named.format('["waypoints"]'))
-    adapted(model, None, sets)
+    write_port_metadata(model, None, sets)
     own = SetOutputs.of(
         model.metadata_props, {"remembered": (1, 8), "waypoints": (1, 8)}
     )
@@ -115,7 +115,7 @@ def test_a_map_says_which_outputs_are_sets(mine: Path, tmp_path: Path) -> None:
     )
     sets.write_text(PARTS + named.format('["nowhere"]'))
     with pytest.raises(EvaluationError, match="map sets: sets: no output nowhere"):
-        adapted(graph.load(mine), None, sets)
+        write_port_metadata(graph.load(mine), None, sets)
     assert map_name(shipped_model("highway")) == "highway"
     assert map_name(mine) is None
 
@@ -164,7 +164,7 @@ def test_an_adapter_or_a_map_of_another_graph_is_refused(
 
     start = "^map parts:?" if of_map else r"a\.toml:"
     with pytest.raises(EvaluationError, match=f"{start} .*{why}"):
-        adapted(graph.load(mine), *given)
+        write_port_metadata(graph.load(mine), *given)
 
 
 def test_the_command_that_picks_a_mode_has_the_name_of_the_graph() -> None:
@@ -178,7 +178,7 @@ def test_the_command_that_picks_a_mode_has_the_name_of_the_graph() -> None:
 def test_an_adapter_overrides_the_map(mine: Path, adapter: Path, parts: Path) -> None:
     parts.write_text(parts.read_text() + "step_s = 0.1\n")
 
-    said = adapted(graph.load(mine), adapter, parts)
+    said = write_port_metadata(graph.load(mine), adapter, parts)
 
     assert "step_s" not in said["me2e.plan"]
 
@@ -196,7 +196,7 @@ def test_optional_names_hold_where_all_are_there(
 ) -> None:
     parts.write_text(f"{PARTS}\n[[optional]]\n{table}")
 
-    said = adapted(graph.load(mine), None, parts)
+    said = write_port_metadata(graph.load(mine), None, parts)
 
     found = json.loads(said["me2e.plan"])["output"] if said else None
     assert found == expected
@@ -212,7 +212,7 @@ def test_optional_names_leave_what_the_graph_says_of_itself(
     state = 'recurrent = { memory = "remembered" }'
     parts.write_text(f"{PARTS}\n{optional}\n{state}")
 
-    assert adapted(model, None, parts) == {}
+    assert write_port_metadata(model, None, parts) == {}
 
 
 PRESETS = [
@@ -231,7 +231,7 @@ def test_presets_name_plan_and_state(
     text = MINE.replace("WEIGHT", ", ".join(["0.0"] * 144)).replace("waypoints", plan)
     model = parsed(text.replace("memory", taken).replace("remembered", given))
 
-    adapted(model, None, preset)
+    write_port_metadata(model, None, preset)
 
     assert json.loads(model.metadata_props["me2e.plan"])["output"] == plan
     assert recurrent_inputs(model) == {taken: given}

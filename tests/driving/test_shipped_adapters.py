@@ -8,7 +8,7 @@ import pytest
 from me2e_compress.base.errors import EvaluationError
 from me2e_compress.driving.adapter import Adapter
 from me2e_compress.driving.adapter.adapter import ModelInputs
-from me2e_compress.driving.contract import Trajectory, checked
+from me2e_compress.driving.contract import Trajectory, check_answer
 from me2e_compress.driving.onnx_policy import OnnxPolicy
 from me2e_compress.driving.shipped_adapters import adapter_file, shipped_adapters
 from me2e_compress.evaluators.highway.drivers import OnnxDriver
@@ -48,7 +48,7 @@ def test_tcps_waypoints_are_turned_to_ours(tcp: Path) -> None:
     pictures = np.zeros((6, 288, 512, 3), np.uint8)
     policy.reset(EXIT)
     still = motion(0.0, 0.0, 0.0, speed=0.0)
-    result = checked(policy.plan(observation(still, images=pictures)))
+    result = check_answer(policy.plan(observation(still, images=pictures)))
     assert isinstance(result, Trajectory)
     assert result.times_s.tolist() == [0.5, 1.0, 1.5, 2.0]
 

@@ -280,7 +280,7 @@ class ModelInputs:
         observed = self._observed(observation)
         arrays |= {name: feed.value(observed) for name, feed in self.sources.items()}
         return {
-            name: contract.shaped(array, self.ports[name])
+            name: contract.fit_to_port(array, self.ports[name])
             for name, array in arrays.items()
         }
 

@@ -30,7 +30,7 @@ from me2e_compress.runtime.session import DTYPES, Session, SessionPort, zero_sta
 COMMAND = "command"  # name of the navigator's command among the inputs
 
 
-def plan_read(session: Session, adapter: Adapter) -> PlanAdapter:
+def find_plan(session: Session, adapter: Adapter) -> PlanAdapter:
     """Return how the plan of a graph is read, checked against its ports."""
     plan = plan_of(adapter.plan, session.metadata, list(session.outputs))
     check_command(plan, session.inputs)
@@ -73,7 +73,7 @@ def plan_of(
 Given: TypeAlias = str | Path | None
 
 
-def adapted(
+def write_port_metadata(
     model: ir.Model, adapter: Given, module_map: Given = None
 ) -> dict[str, str]:
     """Write what a map and an adapter state of plan and state into a graph's metadata.
@@ -115,7 +115,7 @@ def state_and_plan(
 
     What neither adapter, map nor own metadata state is taken from the metadata of
     `others`, if the graph has what they name. It is written into the graph's metadata
-    and returned; see :func:`adapted`.
+    and returned; see `write_port_metadata`.
     """
     # In the order in which one overrides the others
     sources = [(f"metadata of {path.name}", dict(model.metadata_props))]
@@ -125,7 +125,7 @@ def state_and_plan(
         sources.append((f"metadata of {other.name}", lent))
     for origin, files in (("map", (None, module_map)), ("adapter", (adapter, None))):
         named = Path(str(files[0] or files[1])).name
-        sources.append((f"{origin} {named}", adapted(model, *files)))
+        sources.append((f"{origin} {named}", write_port_metadata(model, *files)))
     added = {key: text for _, own in sources[1:] for key, text in own.items()}
     # What is known, by the source that states it last
     pairs, plan = dict[str, tuple[str | None, str]](), ("", "its name")
@@ -277,7 +277,7 @@ def output_uses(
     uses = {answer: f"fed back to {name}" for name, answer in recurrent.items()}
     problem = ""
     try:
-        plan = plan_read(session, adapter)
+        plan = find_plan(session, adapter)
     except (EvaluationError, GraphError) as error:
         problem = str(error)
     else:

@@ -29,7 +29,7 @@ from typing import Self
 import numpy as np
 from scipy.interpolate import CubicSpline
 
-from me2e_compress.driving.contract import PedalsAndWheel, Plan, Trajectory, timed
+from me2e_compress.driving.contract import PedalsAndWheel, Plan, Trajectory, with_times
 from me2e_compress.simulator.bicycle import (
     advance,
     slip_of,
@@ -69,7 +69,7 @@ class AnchoredPlan:
     @classmethod
     def of(cls, plan: Plan | Trajectory, ego: Ego, time_us: int) -> Self:
         """Anchor a plan (ego frame) at the ego's pose."""
-        trajectory = timed(plan)
+        trajectory = with_times(plan)
         waypoints = np.asarray(trajectory.points, np.float64)
         times = np.concatenate([[0.0], trajectory.times_s])
         knots, travel = _advance_only(np.vstack([np.zeros((1, 2)), waypoints]))

@@ -59,11 +59,11 @@ class OnnxDriver(Driver):
 
     def metadata(self) -> dict[str, str]:
         """Return what the map says, as metadata of the graph."""
-        from me2e_compress.driving.adapter.outputs import adapted
+        from me2e_compress.driving.adapter.outputs import write_port_metadata
 
         if self.module_map is None:
             return {}
-        return adapted(load(self.path), None, self.module_map)
+        return write_port_metadata(load(self.path), None, self.module_map)
 
     @property
     def label(self) -> str:

@@ -16,7 +16,7 @@ from me2e_compress.driving.contract import (
     HostedPolicy,
     PedalsAndWheel,
     Policy,
-    checked,
+    check_answer,
 )
 from me2e_compress.driving.latency import DecisionFacts
 from me2e_compress.driving.realtime import ControlClock
@@ -178,7 +178,7 @@ class _Drive:
         self.listeners.on_answer()
         # Convert its answer; the latency source may use the measured time
         try:
-            valid = checked(answer)
+            valid = check_answer(answer)
         except EvaluationError as error:
             raise PolicyFailedError(str(error)) from error
         if isinstance(valid, PedalsAndWheel):

@@ -35,8 +35,8 @@ def crashed_cars(stage: Stage, street: Street) -> Script:
         askew = stage.uniform(f"{name}_askew_rad", -0.35, 0.35)
         aside = -0.4 * free_side(stage)
         place = stage.route_pose(s + 8.0 + 7.0 * k, aside)
-        stage.static_object(ActorKind.PARKED, place.turned(askew))
-    stage.static_object(ActorKind.EMERGENCY, stage.route_pose(s))
+        stage.add_object(ActorKind.PARKED, place.turned(askew))
+    stage.add_object(ActorKind.EMERGENCY, stage.route_pose(s))
     yield from flows.meet(stage, s, "crashed_cars")
 
 
@@ -47,11 +47,11 @@ def construction(stage: Stage, street: Street) -> Script:
     length = stage.uniform("works_m", 8.0, 14.0)
     for k in range(4):
         place = stage.route_pose(s + 2.0 * k, -1.4 + 0.8 * k)
-        stage.static_object(ActorKind.CONE, place)
+        stage.add_object(ActorKind.CONE, place)
     for along in (9.0, 9.0 + length):
-        stage.static_object(ActorKind.BARRIER, stage.route_pose(s + along))
+        stage.add_object(ActorKind.BARRIER, stage.route_pose(s + along))
     for k in range(int(length // 3)):
-        stage.static_object(ActorKind.CONE, stage.route_pose(s + 10.5 + 3.0 * k, 1.3))
+        stage.add_object(ActorKind.CONE, stage.route_pose(s + 10.5 + 3.0 * k, 1.3))
     yield from flows.meet(stage, s, "construction")
 
 
@@ -61,7 +61,7 @@ def parked_car(stage: Stage, street: Street) -> Script:
     flows.keep_clear(stage, street.ahead(), s)
     kind = ActorKind(stage.choice("obstacle", ("parked", "van", "truck")))
     aside = stage.uniform("aside_m", 0.0, 0.6) * -free_side(stage)
-    stage.static_object(kind, stage.route_pose(s, aside))
+    stage.add_object(kind, stage.route_pose(s, aside))
     yield from flows.meet(stage, s, "parked_car")
 
 
@@ -74,14 +74,14 @@ def slow_cyclists(stage: Stage, street: Street) -> Script:
     flows.keep_clear(stage, street.ahead(), first + 60.0)
     for k in range(count):
         s, kind = BEFORE_M + first + 4.5 * k, ActorKind.BICYCLE
-        rider = stage.car(street.ahead(), s, speed, speed, kind, TOGETHER)
+        rider = stage.add_car(street.ahead(), s, speed, speed, kind, TOGETHER)
         rider.offset_m = -0.8
         right = rider.pose.moved(0.0, -0.8)
         rider.position[:] = (right.x, -right.y)
         last = last or rider
     while last and stage.gap_m(last) > flows.NEAR_M - 10.0:
         yield
-    stage.fire("slow_cyclists", last)
+    stage.record_trigger("slow_cyclists", last)
 
 
 def opening_door(stage: Stage, street: Street) -> Script:
@@ -90,12 +90,12 @@ def opening_door(stage: Stage, street: Street) -> Script:
     flows.keep_clear(stage, street.ahead(), s)
     side = -(LANE_WIDTH_M / 2 + 1.05)
     for k in range(-2, 3):
-        stage.static_object(ActorKind.PARKED, stage.route_pose(s + 6.5 * k, side))
+        stage.add_object(ActorKind.PARKED, stage.route_pose(s + 6.5 * k, side))
     yield from flows.near(stage, s)
     hinge = side + 1.95 / 2
     pose = stage.route_pose(s + 0.6, hinge + 0.6)
-    door = stage.static_object(ActorKind.DOOR, pose, (0.2, 1.2, 1.2))
-    stage.fire("opening_door", door)
+    door = stage.add_object(ActorKind.DOOR, pose, (0.2, 1.2, 1.2))
+    stage.record_trigger("opening_door", door)
 
 
 def spun_car(stage: Stage, street: Street) -> Script:
@@ -108,12 +108,12 @@ def spun_car(stage: Stage, street: Street) -> Script:
     begin = s - stage.uniform("slick_m", 35.0, 45.0)
     askew = stage.uniform("askew_rad", 0.4, 0.7)
     place = stage.route_pose(s, -0.7 * free_side(stage))
-    car = stage.static_object(ActorKind.PARKED, place.turned(askew))
+    car = stage.add_object(ActorKind.PARKED, place.turned(askew))
     dry = stage.ego.grip_mps2
     while stage.ahead_m(begin) > 0:
         yield
     stage.ego.grip_mps2 = grip
-    stage.fire("spun_car", car)
+    stage.record_trigger("spun_car", car)
     while stage.ahead_m(s + 5.0) > 0:
         yield
     stage.ego.grip_mps2 = dry
@@ -135,13 +135,13 @@ def hard_brake(stage: Stage, street: Street) -> Script:
     where = stage.place("brake_m", 35.0, 60.0)
     hardest = stage.uniform("brake_mps2", 5.0, 7.0)
     speed = float(stage.ego.speed)
-    car = stage.car(street.ahead(), BEFORE_M + gap + 5.0, speed)
+    car = stage.add_car(street.ahead(), BEFORE_M + gap + 5.0, speed)
     flows.keep_clear(stage, street.ahead(), where + 30.0)
     # it drives by IDM until the ego passes a place
     stands = stage.uniform("stands_s", 2.0, 6.0)
     car.target_speed = stage.uniform("lead_mps", 8.0, 10.0)
     yield from flows.near(stage, where)
-    stage.fire("hard_brake", car)
+    stage.record_trigger("hard_brake", car)
     car.forced_mps2 = -hardest
     yield from flows.hold(stage, car.speed / hardest + stands)
     flows.release(car, AWAY_MPS)
@@ -153,8 +153,8 @@ def pull_out(stage: Stage, street: Street) -> Script:
     crawl_s = stage.uniform("crawl_s", *CRAWL_S)
     side = -(LANE_WIDTH_M / 2 + 1.25)
     for along in (-13.0, -6.5, 14.0, 20.5):
-        stage.static_object(ActorKind.PARKED, stage.route_pose(s + along, side))
-    car = stage.car(street.shoulder(), BEFORE_M + s, 0.0)
+        stage.add_object(ActorKind.PARKED, stage.route_pose(s + along, side))
+    car = stage.add_car(street.shoulder(), BEFORE_M + s, 0.0)
     flows.stand(car)
     yield from flows.near(stage, s - 2.0)
     yield from _cut_in(stage, car, street.ahead(), 1, "pull_out", crawl_s)
@@ -170,7 +170,7 @@ def queue_cut_in(stage: Stage, street: Street) -> Script:
     for index in (lane, street.lane):
         flows.keep_clear(stage, street.ahead(index), s)
     places = (-14.0, -7.0, 0.0, 11.0, 18.0)
-    queue = [stage.car(chain, BEFORE_M + s + aside, 0.0) for aside in places]
+    queue = [stage.add_car(chain, BEFORE_M + s + aside, 0.0) for aside in places]
     for car in queue:
         flows.stand(car)
     # leave when the ego is near
@@ -204,7 +204,7 @@ def slow_queue(stage: Stage, ramp: Ramp) -> Script:
         for car in cars:
             car.target_speed += 5.0
 
-    stage.play(speed_up())
+    stage.play_script(speed_up())
     yield from flows.encounter(stage, cars, ramp.merge_s, "slow_queue")
 
 
@@ -215,7 +215,7 @@ def queue_at_light(stage: Stage, crossing: Crossing) -> Script:
     chain = crossing.way("back", crossing.move)
     begin = stage.network.length(chain[0]) - crossing.approach_m
     queue = [
-        stage.car(chain, begin + line - 3.5 - 7.0 * k, 0.0, AWAY_MPS)
+        stage.add_car(chain, begin + line - 3.5 - 7.0 * k, 0.0, AWAY_MPS)
         for k in range(count)
     ]
     tail = line - 3.5 - 7.0 * (count - 1) - 2.5
@@ -226,7 +226,7 @@ def blocked_exit(stage: Stage, crossing: Crossing) -> Script:
     """Block the ego's way out of the junction with a truck, for some time."""
     chain = crossing.way("back", crossing.move)
     into = stage.uniform("into_m", 1.0, 5.0)
-    truck = stage.car(chain[2:], into + 2.0, 0.0, kind=ActorKind.TRUCK)
+    truck = stage.add_car(chain[2:], into + 2.0, 0.0, kind=ActorKind.TRUCK)
     flows.stand(truck)
     leaves_s = stage.uniform("leaves_s", 18.0, 40.0)
 
@@ -234,7 +234,7 @@ def blocked_exit(stage: Stage, crossing: Crossing) -> Script:
         yield from flows.hold(stage, leaves_s)
         flows.release(truck, AWAY_MPS)
 
-    stage.play(leave())
+    stage.play_script(leave())
     pose = truck.pose
     s, _ = stage.path.project(pose.x, pose.y)
     yield from flows.meet(stage, s, "blocked_exit", truck, 40.0)
@@ -244,7 +244,7 @@ def _cut_in(
     stage: Stage, car: Car, lanes: list[LaneIndex], side: int, name: str, crawl_s: float
 ) -> Script:
     """Move into the ego's lane, crawl there, drive off."""
-    stage.fire(name, car)
+    stage.record_trigger(name, car)
     # change lanes at a crawl, from beside the first lane of the chain
     here, _ = stage.network.lane(lanes[0]).local_coordinates(car.position)
     target, _ = stage.network.rest(lanes, float(here))
@@ -266,7 +266,7 @@ def walker_behind_van(stage: Stage, _: Street) -> Script:
     s = stage.place("crossing_m", 60.0, 85.0)
     speed = stage.uniform("walk_mps", 1.5, 2.5)
     van = stage.route_pose(s - 5.0, -(HALF_LANE_M + 1.1))
-    stage.static_object(ActorKind.VAN, van)
+    stage.add_object(ActorKind.VAN, van)
     walker = _across_route(stage, s, speed, -(HALF_LANE_M + 2.2), 6.5)
     yield from flows.step_out(stage, walker, s, "walker_behind_van")
 
@@ -277,7 +277,7 @@ def walker_between_cars(stage: Stage, _: Street) -> Script:
     speed = stage.uniform("walk_mps", 1.4, 2.2)
     for aside in (-16.5, -10.0, -3.3, 3.3, 9.9):
         pose = stage.route_pose(s + aside, -(HALF_LANE_M + 1.3))
-        stage.static_object(ActorKind.PARKED, pose)
+        stage.add_object(ActorKind.PARKED, pose)
     walker = _across_route(stage, s, speed, -(HALF_LANE_M + 2.4), 7.0)
     yield from flows.step_out(stage, walker, s, "walker_between_cars")
 
@@ -354,7 +354,7 @@ def _cross_exit(
         begin = crossing.arm(crossing.move, out_m, side * start)
         stop = crossing.arm(crossing.move, out_m, -side * end)
         line = np.array([[begin.x, begin.y], [stop.x, stop.y]])
-        people.append(stage.walker(kind, line, speed))
+        people.append(stage.add_walker(kind, line, speed))
     yield from flows.step_out(stage, people[1], route_s, name)
     for walker in people:
         walker.going = True
@@ -366,4 +366,4 @@ def _across_route(
     """Place a pedestrian who crosses the route at a right angle; offsets are left."""
     begin, end = stage.route_pose(s_m, from_m), stage.route_pose(s_m, to_m)
     line = np.array([[begin.x, begin.y], [end.x, end.y]])
-    return stage.walker(ActorKind.PEDESTRIAN, line, speed)
+    return stage.add_walker(ActorKind.PEDESTRIAN, line, speed)

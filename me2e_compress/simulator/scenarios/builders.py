@@ -107,7 +107,7 @@ def _people(stage: Stage) -> None:
             away = np.hypot(*(stage.path.points - part[begin]).T).min()
             if away > NEAR_M or len(stage.bodies) >= most:
                 continue
-            walker = stage.walker(kind, part[begin:], speed)
+            walker = stage.add_walker(kind, part[begin:], speed)
             walker.going, walker.speed = True, speed
 
 
@@ -269,7 +269,7 @@ def stage_of(route: Route, builder: Builder | None = None) -> Stage:
         layout, *scripts = SCENARIOS[route.scenario]
         place = layout(stage)
         for script in scripts:
-            stage.play(script(stage, place))
+            stage.play_script(script(stage, place))
         populate(stage)
     else:
         builder(stage)

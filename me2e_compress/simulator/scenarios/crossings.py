@@ -89,7 +89,7 @@ def junction(
     if sign is not None:
         line = _stop_line(crossing, "back")
         width = lanes * LANE_WIDTH_M
-        crossing.signals["back"] = stage.regulate(sign, line, width_m=width)
+        crossing.signals["back"] = stage.add_regulator(sign, line, width_m=width)
     return crossing
 
 
@@ -102,7 +102,7 @@ def signal_junction(
     crossing = _crossing(stage, moves, ARMS, 1, 13.0, ())
     for arm in ARMS:
         line = _stop_line(crossing, arm)
-        crossing.signals[arm] = stage.regulate(SignalKind.TRAFFIC_LIGHT, line)
+        crossing.signals[arm] = stage.add_regulator(SignalKind.TRAFFIC_LIGHT, line)
     # their plan
     lights, schedule = crossing.signals, stage.schedule
     green = (stage.uniform("green_s", *GREEN_S), stage.uniform("cross_s", *GREEN_S))
@@ -168,7 +168,7 @@ def _crossing(
     incoming, inside, outgoing = crossing.way("back", move)
     begin = net.length(incoming) - approach
     legs = [Leg(incoming, enter_m=begin), Leg(inside, _TURNS[move]), Leg(outgoing)]
-    stage.drive(legs, start_speed(stage))
+    stage.set_route(legs, start_speed(stage))
     return crossing
 
 
@@ -226,10 +226,10 @@ def roundabout(stage: Stage) -> Regulator:
     begin = stage.network.length(incoming) - approach
     legs = [Leg(incoming, enter_m=begin)]
     legs += [Leg(index, command) for index in inside]
-    stage.drive([*legs, Leg(outgoing)], start_speed(stage))
+    stage.set_route([*legs, Leg(outgoing)], start_speed(stage))
     # its give-way line
     line = centre.turned(math.pi).moved(reach + 1.0, half_lane)
-    return stage.regulate(SignalKind.GIVE_WAY, line.turned(math.pi))
+    return stage.add_regulator(SignalKind.GIVE_WAY, line.turned(math.pi))
 
 
 def _circle_arm(

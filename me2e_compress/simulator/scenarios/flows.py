@@ -67,7 +67,7 @@ def step_out(stage: Stage, walker: Walker, route_s: float, name: str) -> Script:
     walker.crosses = True
     yield from near(stage, route_s)
     walker.going = True
-    stage.fire(name, walker)
+    stage.record_trigger(name, walker)
 
 
 def meet(
@@ -80,7 +80,7 @@ def meet(
     """Record the event of a script once the ego has come near a place."""
     while stage.ahead_m(route_s) > within_m:
         yield
-    stage.fire(name, body)
+    stage.record_trigger(name, body)
 
 
 def hold(stage: Stage, seconds: float) -> Script:
@@ -183,7 +183,7 @@ def _driver(
     # its vehicle
     vehicle = ActorKind.VAN if kind < 0.12 else ActorKind.CAR
     vehicle = ActorKind.TRUCK if kind > 0.93 else vehicle
-    car = stage.car(chain, s_m, wanted, wanted, vehicle, mind, comes=True)
+    car = stage.add_car(chain, s_m, wanted, wanted, vehicle, mind, comes=True)
     car.joins = list(traffic.joins) or None
     if traffic.blind_to_ego and random.random() < traffic.blind_to_ego:
         car.behaviour = replace(mind, sees_ego=False)
@@ -236,7 +236,7 @@ def encounter(
             x, y = body.position
             near = math.hypot(x - at.x, -y - at.y) < OTHER_M
             if near and body.road is not None:
-                stage.fire(name, body)
+                stage.record_trigger(name, body)
                 return
 
 
@@ -364,7 +364,7 @@ def emergency_behind(stage: Stage, street: Street) -> Script:
         3.5, headway_s=0.5, jam_gap_m=4.0, obeys_limits=False, obeys_rules=False
     )
     begin = BEFORE_M - stage.uniform("behind_m", 24.0, 56.0)
-    car = stage.car(lanes, begin, 16.0, 20.0, ActorKind.EMERGENCY, mind)
+    car = stage.add_car(lanes, begin, 16.0, 20.0, ActorKind.EMERGENCY, mind)
     stream(stage, "same_way", [lanes], Traffic(SPARSE_S))
     delay_s = 0.0
 
@@ -378,5 +378,5 @@ def emergency_behind(stage: Stage, street: Street) -> Script:
         yield
         if -HELD_UP_M < stage.gap_m(car) < 0:
             if delay_s == 0.0:
-                stage.fire("emergency_behind", car)
+                stage.record_trigger("emergency_behind", car)
             delay_s += 0.1

@@ -179,7 +179,7 @@ def street(
     road = lay_road(stage.network, "r", start, pieces, section, oncoming, shoulder_m)
     first, *others = road.ahead(lane)
     legs = [Leg(first, enter_m=BEFORE_M), *(Leg(index) for index in others)]
-    stage.drive(legs, start_speed(stage))
+    stage.set_route(legs, start_speed(stage))
     road = replace(road, lane=lane)
     return with_light(stage, road, shoulder_m) if light else road
 
@@ -215,7 +215,7 @@ def parking_bay(stage: Stage) -> Street:
         Leg(bay, enter_m=BEFORE_M, leave_m=BEFORE_M + stay),
         Leg(lane, Command.CHANGE_LEFT, enter_m=BEFORE_M + stay + 14.0),
     ]
-    stage.drive(legs, 2.0)
+    stage.set_route(legs, 2.0)
     return street
 
 
@@ -241,12 +241,12 @@ def with_light(
     stage.add_crosswalk([stage.route_pose(at + along, side) for along, side in places])
     # lights both ways, and their plan
     kind, lights = SignalKind.TRAFFIC_LIGHT, list[Regulator]()
-    lights.append(stage.regulate(kind, stage.route_pose(at - 3.5)))
+    lights.append(stage.add_regulator(kind, stage.route_pose(at - 3.5)))
     (lane,) = street.ahead()[:1]
     stage.schedule.lines[lane] = [(BEFORE_M + at - 3.5, lights[0])]
     if street.backward:
         line = stage.route_pose(at + 3.5, LANE_WIDTH_M).turned(math.pi)
-        lights.append(stage.regulate(kind, line))
+        lights.append(stage.add_regulator(kind, line))
         (lane,) = street.oncoming()[:1]
         length = stage.network.length(lane)
         stage.schedule.lines[lane] = [(length - BEFORE_M - at - 3.5, lights[1])]
@@ -305,7 +305,7 @@ def on_ramp(stage: Stage, ego_on_ramp: bool = True) -> Ramp:
     # the ego's route
     if not ego_on_ramp:
         legs = [Leg(main.ahead()[0], enter_m=BEFORE_M)]
-        stage.drive(legs, start_speed(stage))
+        stage.set_route(legs, start_speed(stage))
         return Ramp(main, ramp, 0.0)
     begun = length + 2 * RAMP_RADIUS_M * math.sin(RAMP_RAD)
     leave = stage.uniform("leave_m", 15.0, 25.0)
@@ -316,7 +316,7 @@ def on_ramp(stage: Stage, ego_on_ramp: bool = True) -> Ramp:
         Leg(ramp[3], leave_m=leave),
         Leg(main.ahead()[0], Command.CHANGE_LEFT, begun + leave + CHANGE_M),
     ]
-    stage.drive(legs, start_speed(stage))
+    stage.set_route(legs, start_speed(stage))
     # where the route is beside the middle of the change
     beside_m = start.moved(begun + leave + CHANGE_M / 2, -1.5 * LANE_WIDTH_M)
     return Ramp(main, ramp, stage.path.project(beside_m.x, beside_m.y)[0])
@@ -345,7 +345,7 @@ def off_ramp(stage: Stage) -> Ramp:
         Leg(ramp[0], Command.CHANGE_RIGHT, 10.0 + CHANGE_M),
         *(Leg(index) for index in ramp[1:]),
     ]
-    stage.drive(legs, start_speed(stage))
+    stage.set_route(legs, start_speed(stage))
     return Ramp(main, ramp, first + CHANGE_M / 2)
 
 
@@ -367,7 +367,7 @@ def lane_drop(stage: Stage) -> Ramp:
         Leg(("d0", "d1", 0), Command.CHANGE_LEFT, change + CHANGE_M),
         Leg(("d1", "d2", 0)),
     ]
-    stage.drive(legs, start_speed(stage))
+    stage.set_route(legs, start_speed(stage))
     main = Street((("d0", "d1"), ("d1", "d2")))
     return Ramp(main, [], ends - 30.0 - BEFORE_M)
 
@@ -384,11 +384,11 @@ def four_lanes(stage: Stage) -> Street:
         legs.append(Leg(road.ahead(lane)[0], command, s, leave))
         s += stay + CHANGE_M
         stay = 11.0
-    stage.drive(legs, start_speed(stage))
+    stage.set_route(legs, start_speed(stage))
     return road
 
 
 def block_end(stage: Stage, pose: Pose) -> None:
     """Put barriers where a lane ends."""
     for left in (-0.9, 0.9):
-        stage.static_object(ActorKind.BARRIER, pose.moved(1.0, left), (0.5, 1.6, 0.98))
+        stage.add_object(ActorKind.BARRIER, pose.moved(1.0, left), (0.5, 1.6, 0.98))

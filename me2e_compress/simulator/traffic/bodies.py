@@ -272,17 +272,17 @@ class Car(_Body, IDMVehicle):  # type: ignore[misc]  # highway-env is untyped
         """Decide: follow the lane, keep the gap, obey the script."""
         # enter the next lane of the chain where the present one ends
         lane = self.lanes[self.leg]
-        s, r = self.road.seat(self, lane)
+        s, r = self.road.lane_position(self, lane)
         if self.leg + 1 < len(self.lanes) and s > self.network.length(lane):
             self.leg += 1
-            s, r = self.road.seat(self, self.lanes[self.leg])
+            s, r = self.road.lane_position(self, self.lanes[self.leg])
         self.target_lane_index = self.lane_index = self.lanes[self.leg]
         # follow it, keep the gap, obey the rules, or the script
         wanted = self.forced_mps2
         if wanted is None:
             lead, gap = self.road.lead(self) or (None, math.inf)
             wanted = self.idm(lead, gap, self.allowed_mps(s))
-            wanted = self.road.ruled(self, s, wanted)
+            wanted = self.road.limit_by_rules(self, s, wanted)
         wanted = min(max(wanted, -self.behaviour.hardest_mps2), self.COMFORT_ACC_MAX)
         self.action = {"acceleration": wanted, "steering": self._steering(s, r)}
         self.braking = wanted < -0.7 or self.speed < 0.2

@@ -189,7 +189,7 @@ class RightOfWay:
             self._note_car(car)
 
     def _note_car(self, car: Car) -> None:
-        start = -car.road.seat(car, car.lanes[car.leg])[0]
+        start = -car.road.lane_position(car, car.lanes[car.leg])[0]
         reckless, bound = not car.behaviour.obeys_rules, False
         for index in car.lanes[car.leg :]:
             if start > REACH_M:

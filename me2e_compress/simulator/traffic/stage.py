@@ -198,12 +198,12 @@ class Stage:
         """Metres of the route that are drawn, before and after the scenario."""
         return self.goal_m - GOAL_M
 
-    def play(self, script: Script) -> None:
+    def play_script(self, script: Script) -> None:
         """Add a script and run it to its first yield, so that its actors are there."""
         if next(script, self) is not self:
             self.scripts.append(script)
 
-    def drive(self, legs: Sequence[Leg], speed_mps: float) -> None:
+    def set_route(self, legs: Sequence[Leg], speed_mps: float) -> None:
         """Set the ego's route and put the ego at its beginning."""
         self.path = build_path(self.network, legs, self.goal_m)
         for leg in legs:
@@ -214,7 +214,7 @@ class Stage:
         (x, y), heading = self.path.points[0], self.path.headings[0]
         self.ego = EgoVehicle(Pose(float(x), float(y), float(heading)), speed_mps)
 
-    def car(
+    def add_car(
         self,
         chain: Sequence[LaneIndex],
         s_m: float,
@@ -231,13 +231,13 @@ class Stage:
             self.bodies.append(car)
         return car
 
-    def walker(self, kind: ActorKind, line: Floats, speed_mps: float) -> Walker:
+    def add_walker(self, kind: ActorKind, line: Floats, speed_mps: float) -> Walker:
         """Put a walker at the beginning of a line; `going` starts it."""
         walker = Walker(next(self._ids), kind, line, speed_mps)
         self.bodies.append(walker)
         return walker
 
-    def static_object(
+    def add_object(
         self, kind: ActorKind, pose: Pose, size: Size | None = None
     ) -> StaticObject:
         """Put a static object somewhere."""
@@ -245,7 +245,7 @@ class Stage:
         self.static_objects.append(placed)
         return placed
 
-    def regulate(
+    def add_regulator(
         self, kind: SignalKind, line: Pose, width_m: float = LANE_WIDTH_M
     ) -> Regulator:
         """Put a light or a sign at a stop line, given by its middle and width."""
@@ -278,7 +278,7 @@ class Stage:
         s, _ = self.path.project(pose.x, pose.y)
         return float(s - self.ego_s - (self.ego.LENGTH + car.LENGTH) / 2)
 
-    def fire(self, script: str, body: RoadObject | None = None) -> None:
+    def record_trigger(self, script: str, body: RoadObject | None = None) -> None:
         """Record that a script's event happens now."""
         self.events.append(self.event(EventKind.TRIGGER, script, body))
 

@@ -32,9 +32,9 @@ INSIDE_M, ALONG_RAD = 0.6, 0.3  # the ego nearer is wholly in a lane
 BESIDE_M = 0.25  # two bodies closer than this sideways are in each other's way
 
 
-def _change(car: Car, wanted_mps2: float) -> None:
+def _change_lane_if_better(car: Car, wanted_mps2: float) -> None:
     """Change to a lane beside if that is better, once a second."""
-    if car.indicator and abs(car.road.seat(car, car.lanes[car.leg])[1]) < 0.4:
+    if car.indicator and abs(car.road.lane_position(car, car.lanes[car.leg])[1]) < 0.4:
         car.indicator = 0
     car.until_change -= 1
     if car.until_change > 0 or car.speed < SLOWEST_MPS or car.indicator:
@@ -43,10 +43,13 @@ def _change(car: Car, wanted_mps2: float) -> None:
     lane = car.lanes[car.leg][2]
     best, gained = None, MIN_GAIN_MPS2
     for side, other in ((1, lane - 1), (-1, lane + 1)):
-        chain = _beside(car, other)
-        if chain is None or (imposed := _imposed(car, chain)) > MOST_IMPOSED_MPS2:
+        chain = _chain_beside(car, other)
+        if (
+            chain is None
+            or (imposed := _braking_imposed(car, chain)) > MOST_IMPOSED_MPS2
+        ):
             continue
-        gain = _wanted(car, chain) - wanted_mps2
+        gain = _acceleration_on(car, chain) - wanted_mps2
         gain -= car.behaviour.politeness * max(imposed, 0.0)
         if gain > gained:
             best, gained = (chain, side), gain
@@ -54,7 +57,7 @@ def _change(car: Car, wanted_mps2: float) -> None:
         car.change_lane(*best)
 
 
-def _beside(car: Car, lane: int) -> list[LaneIndex] | None:
+def _chain_beside(car: Car, lane: int) -> list[LaneIndex] | None:
     """Return the rest of a car's chain in another lane; None if it is not all there."""
     graph, lanes = car.network.graph.graph, list[LaneIndex]()
     for a, b, _ in car.lanes[car.leg :]:
@@ -64,7 +67,7 @@ def _beside(car: Car, lane: int) -> list[LaneIndex] | None:
     return lanes
 
 
-def _wanted(car: Car, chain: list[LaneIndex]) -> float:
+def _acceleration_on(car: Car, chain: list[LaneIndex]) -> float:
     """Return the acceleration that a car would have on a chain."""
     lead, gap = car.road.lead(car, chain) or (None, math.inf)
     if gap < NEAREST_M:
@@ -72,7 +75,7 @@ def _wanted(car: Car, chain: list[LaneIndex]) -> float:
     return car.idm(lead, gap, float(car.target_speed))
 
 
-def _imposed(car: Car, chain: list[LaneIndex]) -> float:
+def _braking_imposed(car: Car, chain: list[LaneIndex]) -> float:
     """Return the braking that a car imposes on who is behind it in another lane."""
     follower = car.road.follower(car, chain[0])
     if follower is None:
@@ -134,7 +137,7 @@ class TrafficRoad(Road):  # type: ignore[misc]  # highway-env is untyped
             self._half[first + row] = float(body.WIDTH * cos + body.LENGTH * sin) / 2
         self._ego = [body.id == 0 for body in self._bodies]
 
-    def seat(self, car: Car, index: LaneIndex) -> tuple[float, float]:
+    def lane_position(self, car: Car, index: LaneIndex) -> tuple[float, float]:
         """Return a car's arc length and right offset in a lane, at the last refresh."""
         row, column = self._row[id(car)], self.table.column[index]
         return float(self._s[row, column]), float(self._r[row, column])
@@ -201,7 +204,7 @@ class TrafficRoad(Road):  # type: ignore[misc]  # highway-env is untyped
         body = self._bodies[last[1]]
         return body, at - last[0] - (car.LENGTH + body.LENGTH) / 2
 
-    def ruled(self, car: Car, lane_s: float, wanted_mps2: float) -> float:
+    def limit_by_rules(self, car: Car, lane_s: float, wanted_mps2: float) -> float:
         """Limit the acceleration that a car wants by the rules; it may change lanes."""
         stop_m = self.rules.stop_m(car, lane_s)
         if stop_m < math.inf:
@@ -211,8 +214,8 @@ class TrafficRoad(Road):  # type: ignore[misc]  # highway-env is untyped
             chain = car.joins
             station = car.network.lane(chain[0]).local_coordinates(car.position)[0]
             lanes, _ = car.network.rest(chain, float(station))
-            bearable = _imposed(car, lanes) <= JOIN_IMPOSED_MPS2
-            if bearable and _wanted(car, lanes) >= -4.0:
+            bearable = _braking_imposed(car, lanes) <= JOIN_IMPOSED_MPS2
+            if bearable and _acceleration_on(car, lanes) >= -4.0:
                 car.change_lane(lanes, 1)
                 car.joins = None
                 return wanted_mps2
@@ -220,7 +223,7 @@ class TrafficRoad(Road):  # type: ignore[misc]  # highway-env is untyped
             return min(wanted_mps2, car.idm_stop(max(end - lane_s, 0.1)))
         begins = car.leg > 0 and lane_s < SETTLED_M
         if car.behaviour.changes_lanes and not begins:
-            _change(car, wanted_mps2)
+            _change_lane_if_better(car, wanted_mps2)
         return wanted_mps2
 
     def act(self) -> None:

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from me2e_compress.base.errors import EvaluationError
-from me2e_compress.driving.contract import Answer, PedalsAndWheel, checked
+from me2e_compress.driving.contract import Answer, PedalsAndWheel, check_answer
 from me2e_compress.driving.latency import FixedLatency
 from me2e_compress.evaluators import Drive
 from me2e_compress.evaluators.highway.runner import drive
@@ -53,7 +53,7 @@ def answer(model: Path, heads: ActionHeads, *, fused: bool) -> Answer:
     pictures = np.zeros((6, 288, 512, 3), np.uint8)
     policy.reset(EXIT)
     still = motion(0.0, 0.0, 0.0, speed=0.0)
-    return checked(policy.plan(observation(still, images=pictures)))
+    return check_answer(policy.plan(observation(still, images=pictures)))
 
 
 @pytest.mark.parametrize(

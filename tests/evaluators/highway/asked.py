@@ -3,7 +3,7 @@
 import numpy as np
 import numpy.typing as npt
 
-from me2e_compress.driving.contract import Observation, Policy, Trajectory, checked
+from me2e_compress.driving.contract import Observation, Policy, Trajectory, check_answer
 from me2e_compress.simulator.camera_rig import CameraRig
 
 RIG = CameraRig(16, 24)
@@ -18,6 +18,6 @@ def observation(seed: int = 0, command: int = 2) -> Observation:
 
 def planned(policy: Policy, seen: Observation) -> npt.NDArray[np.floating]:
     """Ask a policy that answers waypoints."""
-    result = checked(policy.plan(seen))
+    result = check_answer(policy.plan(seen))
     assert isinstance(result, Trajectory)
     return result.points

@@ -96,8 +96,8 @@ def test_two_actors_that_collide_are_told_from_the_ego() -> None:
     def rear_end(stage: Stage) -> None:
         street = two_way(stage)
         (lane,) = street.ahead(0)
-        stage.car([lane], 150.0, 0.0).forced_mps2 = -1.0
-        stage.car([lane], 135.0, 9.0).forced_mps2 = 0.0
+        stage.add_car([lane], 150.0, 0.0).forced_mps2 = -1.0
+        stage.add_car([lane], 135.0, 9.0).forced_mps2 = 0.0
 
     world = World(route_of(), builder=rear_end)
     coast(world, 60, Control(-8.0, 0.0))
@@ -117,7 +117,7 @@ def test_a_standing_ego_that_is_struck_has_not_collided(
         street = two_way(stage)
         (lane,) = street.ahead(0)
         blind = Behaviour(sees_ego=False)
-        stage.car([lane], 20.0, 20.0, behaviour=blind).forced_mps2 = 0.0
+        stage.add_car([lane], 20.0, 20.0, behaviour=blind).forced_mps2 = 0.0
 
     world = World(route_of(), builder=struck)
     coast(world, 120, Control(brake, 0.0))
@@ -139,13 +139,13 @@ def test_leaving_the_road_is_measured() -> None:
 def test_a_script_may_add_actors_while_it_runs() -> None:
     def late(stage: Stage) -> None:
         two_way(stage)
-        stage.play(surprise(stage))
+        stage.play_script(surprise(stage))
 
     def surprise(stage: Stage) -> Script:
         while stage.time_s < 0.5:
             yield
-        stage.static_object(ActorKind.CONE, stage.route_pose(40.0))
-        stage.fire("surprise")
+        stage.add_object(ActorKind.CONE, stage.route_pose(40.0))
+        stage.record_trigger("surprise")
 
     world = World(route_of(), builder=late)
     assert world.scene().actors == ()
@@ -159,7 +159,9 @@ def test_a_script_may_add_actors_while_it_runs() -> None:
 def test_cars_that_leave_the_map_are_gone() -> None:
     def leaver(stage: Stage) -> None:
         street = two_way(stage)
-        stage.car(street.ahead(0), stage.network.length(street.ahead()[0]) - 6.0, 10.0)
+        stage.add_car(
+            street.ahead(0), stage.network.length(street.ahead()[0]) - 6.0, 10.0
+        )
 
     world = World(route_of(), builder=leaver)
     assert len(world.scene().actors) == 1
