@@ -198,7 +198,17 @@ class World:
 
 
 def _actor(body: Car | Walker | StaticObject) -> Actor:
-    pose, lamps = body.pose, (bool(body.braking), body.indicator)
-    place = (pose.x, pose.y, pose.heading, float(body.speed))
-    size = (float(body.LENGTH), float(body.WIDTH), float(body.height))
-    return Actor(body.id, body.kind, *place, *size, *lamps)
+    pose = body.pose
+    return Actor(
+        body.id,
+        body.kind,
+        pose.x,
+        pose.y,
+        pose.heading,
+        float(body.speed),
+        float(body.LENGTH),
+        float(body.WIDTH),
+        float(body.height),
+        bool(body.braking),
+        body.indicator,
+    )

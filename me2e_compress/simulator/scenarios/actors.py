@@ -1,5 +1,7 @@
 """Things in the way: accidents, road works, parked cars, doors, slow cyclists."""
 
+from typing import NamedTuple
+
 import numpy as np
 
 from me2e_compress.simulator.scenarios import flows
@@ -17,7 +19,18 @@ CRAWL_MPS, CRAWL_S = 2.2, (4.0, 9.0)  # of a car that has cut in
 HALF_LANE_M = LANE_WIDTH_M / 2
 WALKERS_A_CYCLE = 2.0  # mean number of people each time a light lets them cross
 LATE = 0.2  # share of them who cross at any time of their phase, even as it ends
-RIDE_M = LANE_WIDTH_M + 4.0  # from the road's middle to the first cyclist
+# From the road's middle to the first who walks, and who rides
+WALK_M, RIDE_M = LANE_WIDTH_M + 1.5, LANE_WIDTH_M + 4.0
+
+
+class Row(NamedTuple):
+    """A row of people who cross the arm that the ego leaves by."""
+
+    kind: ActorKind
+    speed_mps: float
+    start_m: float  # from the road's middle to the first of them
+    count: int
+    spacing_m: float
 
 
 def free_side(stage: Stage) -> float:
@@ -312,15 +325,16 @@ def walkers_at_light(stage: Stage) -> list[Walker]:
 
 def pedestrians_on_exit(stage: Stage, crossing: Crossing) -> Script:
     """Send three pedestrians across the arm that the ego turns into."""
-    speed, start = stage.uniform("walk_mps", 1.3, 2.0), LANE_WIDTH_M + 1.5
-    row = (ActorKind.PEDESTRIAN, speed, start, 3, 1.3)
-    yield from _cross_exit(stage, crossing, "pedestrians_on_exit", *row)
+    speed = stage.uniform("walk_mps", 1.3, 2.0)
+    row = Row(ActorKind.PEDESTRIAN, speed, WALK_M, 3, 1.3)
+    yield from _cross_exit(stage, crossing, "pedestrians_on_exit", row)
 
 
 def cyclists_on_exit(stage: Stage, crossing: Crossing) -> Script:
     """Send three cyclists across the arm that the ego turns into."""
-    row = (ActorKind.BICYCLE, stage.uniform("ride_mps", 2.8, 4.0), RIDE_M, 3, 2.4)
-    yield from _cross_exit(stage, crossing, "cyclists_on_exit", *row)
+    speed = stage.uniform("ride_mps", 2.8, 4.0)
+    row = Row(ActorKind.BICYCLE, speed, RIDE_M, 3, 2.4)
+    yield from _cross_exit(stage, crossing, "cyclists_on_exit", row)
 
 
 def bicycle_stream(stage: Stage, crossing: Crossing) -> Script:
@@ -328,33 +342,24 @@ def bicycle_stream(stage: Stage, crossing: Crossing) -> Script:
     speed = stage.uniform("ride_mps", 3.0, 4.0)
     count = stage.integer("cyclists", 4, 7)
     spacing = stage.uniform("spacing_m", 2.6, 3.6)
-    row = (ActorKind.BICYCLE, speed, RIDE_M, count, spacing)
-    yield from _cross_exit(stage, crossing, "bicycle_stream", *row)
+    row = Row(ActorKind.BICYCLE, speed, RIDE_M, count, spacing)
+    yield from _cross_exit(stage, crossing, "bicycle_stream", row)
 
 
-def _cross_exit(
-    stage: Stage,
-    crossing: Crossing,
-    name: str,
-    kind: ActorKind,
-    speed: float,
-    start_m: float,
-    count: int,
-    spacing_m: float,
-) -> Script:
+def _cross_exit(stage: Stage, crossing: Crossing, name: str, row: Row) -> Script:
     """Send a row across the arm that the ego leaves by; the second of them counts."""
     side = -1.0 if stage.choice("side", ("right", "left")) == "right" else 1.0
-    out_m = 2.0 if kind is ActorKind.PEDESTRIAN else 3.0
+    out_m = 2.0 if row.kind is ActorKind.PEDESTRIAN else 3.0
     target = crossing.arm(crossing.move, out_m, -HALF_LANE_M)
     route_s, _ = stage.path.project(target.x, target.y)
     people = list[Walker]()
-    for k in range(count):
-        start = start_m + spacing_m * k
-        end = LANE_WIDTH_M + 3.0 + spacing_m * (count - k)
+    for k in range(row.count):
+        start = row.start_m + row.spacing_m * k
+        end = LANE_WIDTH_M + 3.0 + row.spacing_m * (row.count - k)
         begin = crossing.arm(crossing.move, out_m, side * start)
         stop = crossing.arm(crossing.move, out_m, -side * end)
         line = np.array([[begin.x, begin.y], [stop.x, stop.y]])
-        people.append(stage.add_walker(kind, line, speed))
+        people.append(stage.add_walker(row.kind, line, row.speed_mps))
     yield from flows.step_out(stage, people[1], route_s, name)
     for walker in people:
         walker.going = True

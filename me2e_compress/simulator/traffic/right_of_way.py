@@ -58,8 +58,8 @@ class Regulator:
         right = self.line.moved(0.0, -self.width_m / 2)
         post = self.line.moved(0.5, -self.width_m / 2 - 0.8)
         ends = (left.x, left.y), (right.x, right.y)
-        pose = post.x, post.y, post.heading
-        return Signal(self.id, self.kind, *pose, self.state, ends)
+        x, y, heading = post.x, post.y, post.heading
+        return Signal(self.id, self.kind, x, y, heading, self.state, ends)
 
     def check(self, front_s: float, tail_s: float, speed: float) -> EventKind | None:
         """Return which rule, each once, the ego breaks now between two arc lengths."""

@@ -225,8 +225,10 @@ class Stage:
         comes: bool = False,
     ) -> Car:
         """Make a car on a chain of lanes, at an arc length; if it ``comes``, later."""
-        place = (self.network, *self.network.rest(chain, s_m))
-        car = Car(next(self._ids), *place, speed_mps, target_mps, kind, behaviour)
+        number, (lanes, s_m) = next(self._ids), self.network.rest(chain, s_m)
+        car = Car(
+            number, self.network, lanes, s_m, speed_mps, target_mps, kind, behaviour
+        )
         if not comes:
             self.bodies.append(car)
         return car
