@@ -119,7 +119,7 @@ class OnnxPolicy:
         policy = cls(session, adapter, inputs, reads, recurrent, first, stage)
         # Find a misfit that only a run shows: of types, of shapes, of recurrent outputs
         policy.reset(None)
-        policy.plan(inputs.nothing(command=0))
+        policy.plan(inputs.blank_observation())
         for name, answer in recurrent.items():
             shape, wanted = policy._state[name].shape, session.inputs[name].shape
             if not fits(shape, wanted):

@@ -284,7 +284,7 @@ class ModelInputs:
             for name, array in arrays.items()
         }
 
-    def nothing(self, command: int) -> Observation:
+    def blank_observation(self) -> Observation:
         """Return an observation of zeros, for a dry run."""
         still = (0.0, 0.0, 0.0)
         return Observation(
@@ -292,7 +292,7 @@ class ModelInputs:
             np.zeros((len(CAMERA_NAMES), *self.image_size, 3), np.uint8),
             np.tile(np.eye(4, dtype=np.float32), (len(CAMERA_NAMES), 1, 1)),
             np.zeros(contract.CAN_BUS_SIZE, np.float32),
-            command,
+            0,
             0.0,
             motion=EgoKinematics(0.0, 0.0, 0.0, 0.0, still, still),
             target_points=np.zeros((2, 2), np.float32),
@@ -306,9 +306,9 @@ class ModelInputs:
 
     def faults(self) -> dict[str, str]:
         """Return the reason for each input that cannot be fed, in feed order."""
-        nothing = self.nothing(0)
-        self._track.note(0, nothing.motion)
-        observed, faults = self._observed(nothing), dict[str, str]()
+        blank, faults = self.blank_observation(), dict[str, str]()
+        self._track.note(0, blank.motion)
+        observed = self._observed(blank)
         for name, feed in self.sources.items():
             try:
                 fault = _fault(name, self.ports[name], feed.value(observed))
