@@ -135,7 +135,9 @@ class Painter:
         camera, solid = painting_order(*self._views(footprints))
         # their faces that look at the camera, inside its frustum
         view, face = _spread(np.array([len(s.colours) for s in solids]), solid)
-        points = self._to_camera(corners[:, :, face], camera[view])
+        placed = corners[:, :, face]  # (3, 4, faces) in the ego frame
+        right, forward = self._right_and_forward(placed, camera[view])
+        points = np.stack([right, CAMERA_HEIGHT_M - placed[2], forward])
         visible = self._visible(points, camera[view])
         points, view, face = points[:, :, visible], view[visible], face[visible]
         # details that are large enough to be seen
@@ -165,11 +167,6 @@ class Painter:
         hidden = np.asarray((forward < NEAR_M).all(axis=1))
         hidden |= (right > edge).all(axis=1) | (right < -edge).all(axis=1)
         return right, forward, ~hidden
-
-    def _to_camera(self, points: Floats, camera: Ints) -> Floats:
-        """Convert [3, 4, M] of the ego frame to [3, 4, M] right, down, forward."""
-        right, forward = self._right_and_forward(points, camera)
-        return np.stack([right, CAMERA_HEIGHT_M - points[2], forward])
 
     def _right_and_forward(self, points: Floats, camera: Ints) -> tuple[Floats, Floats]:
         """Convert x and y (points[0], points[1]) of the ego frame to cameras' axes."""

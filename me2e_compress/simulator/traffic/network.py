@@ -10,7 +10,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 from highway_env.road.lane import AbstractLane, CircularLane, LineType, StraightLane
 from highway_env.road.road import RoadNetwork
 
@@ -295,13 +294,17 @@ def build_path(network: Network, legs: Sequence[Leg], goal_m: float) -> RoutePat
     dense = np.concatenate(pieces)
     steps = np.hypot(*np.diff(dense, axis=0).T)
     points = resample(dense[np.concatenate([[True], steps > 1e-6])], SPACING_M)
-    ends = [end for end, _ in owners]
-    at = np.searchsorted(ends, np.arange(len(points)) * SPACING_M)
+    stations = np.arange(len(points)) * SPACING_M
+    at = np.searchsorted([end for end, _ in owners], stations)
     owner = [owners[min(i, len(owners) - 1)][1] for i in at.tolist()]
     width = np.array([network.lane(legs[i].lane).width for i in owner], float)
     limit = np.array([network.lane(legs[i].lane).speed_limit for i in owner], float)
     headings = polyline_headings(points)
-    commands = _commands(len(points), marks)
+    # commands, announced before their stretch
+    commands = np.full(len(points), int(Command.FOLLOW), dtype=np.int64)
+    for begin, end, command in marks:
+        if command is not Command.FOLLOW:
+            commands[(stations >= begin) & (stations < end)] = int(command)
     beside = _room_beside(network, points, headings)
     return RoutePath(points, headings, width, limit, commands, goal_m, *beside)
 
@@ -320,17 +323,6 @@ def _bridge(before: Floats, after: Floats) -> Floats:
         + (t**3 - t**2) * into
     )
     return np.asarray(points)
-
-
-def _commands(
-    count: int, marks: Sequence[tuple[float, float, Command]]
-) -> npt.NDArray[np.int64]:
-    commands = np.full(count, int(Command.FOLLOW), dtype=np.int64)
-    stations = np.arange(count) * SPACING_M
-    for begin, end, command in marks:
-        if command is not Command.FOLLOW:
-            commands[(stations >= begin) & (stations < end)] = int(command)
-    return commands
 
 
 def _room_beside(
