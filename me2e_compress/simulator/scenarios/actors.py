@@ -29,7 +29,7 @@ class Row(NamedTuple):
     kind: ActorKind
     speed_mps: float
     start_m: float  # from the road's middle to the first of them
-    count: int
+    people: int
     spacing_m: float
 
 
@@ -353,9 +353,9 @@ def _cross_exit(stage: Stage, crossing: Crossing, name: str, row: Row) -> Script
     target = crossing.arm(crossing.move, out_m, -HALF_LANE_M)
     route_s, _ = stage.path.project(target.x, target.y)
     people = list[Walker]()
-    for k in range(row.count):
+    for k in range(row.people):
         start = row.start_m + row.spacing_m * k
-        end = LANE_WIDTH_M + 3.0 + row.spacing_m * (row.count - k)
+        end = LANE_WIDTH_M + 3.0 + row.spacing_m * (row.people - k)
         begin = crossing.arm(crossing.move, out_m, side * start)
         stop = crossing.arm(crossing.move, out_m, -side * end)
         line = np.array([[begin.x, begin.y], [stop.x, stop.y]])

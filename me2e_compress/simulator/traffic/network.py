@@ -294,8 +294,8 @@ def build_path(network: Network, legs: Sequence[Leg], goal_m: float) -> RoutePat
     dense = np.concatenate(pieces)
     steps = np.hypot(*np.diff(dense, axis=0).T)
     points = resample(dense[np.concatenate([[True], steps > 1e-6])], SPACING_M)
-    stations = np.arange(len(points)) * SPACING_M
-    at = np.searchsorted([end for end, _ in owners], stations)
+    arc = np.arange(len(points)) * SPACING_M
+    at = np.searchsorted([end for end, _ in owners], arc)
     owner = [owners[min(i, len(owners) - 1)][1] for i in at.tolist()]
     width = np.array([network.lane(legs[i].lane).width for i in owner], float)
     limit = np.array([network.lane(legs[i].lane).speed_limit for i in owner], float)
@@ -304,7 +304,7 @@ def build_path(network: Network, legs: Sequence[Leg], goal_m: float) -> RoutePat
     commands = np.full(len(points), int(Command.FOLLOW), dtype=np.int64)
     for begin, end, command in marks:
         if command is not Command.FOLLOW:
-            commands[(stations >= begin) & (stations < end)] = int(command)
+            commands[(arc >= begin) & (arc < end)] = int(command)
     beside = _room_beside(network, points, headings)
     return RoutePath(points, headings, width, limit, commands, goal_m, *beside)
 
