@@ -1,0 +1,318 @@
+"""Fuse patterns that one standard operator can express."""
+
+import dataclasses
+import itertools
+import math
+
+import numpy as np
+import onnx_ir as ir
+
+from me2e_compress.graph import (
+    array_of,
+    bias_of,
+    channel_axis,
+    provenance,
+    static_shape,
+)
+from me2e_compress.graph.nodes import (
+    ELEMENTWISE,
+    FLOATS,
+    Array,
+    Numbers,
+    holds_numbers,
+    maker,
+    numbers_of,
+    overflow,
+    sole_reader,
+)
+from me2e_compress.graph.rewrite import (
+    Facts,
+    Fusion,
+    Kit,
+    Match,
+    constant,
+    either,
+    fuse,
+    op,
+    var,
+)
+from me2e_compress.passes.base import Context, Pass, PassResult
+
+
+@dataclasses.dataclass(frozen=True)
+class FuseBasic(Pass):
+    """Fuse patterns of standard operators into fewer standard operators.
+
+    Given:   Conv -> BatchNormalization -> Relu;  MatMul(x, w) + b of rank 2
+
+    Result:  Conv -> Relu;  Gemm(x, w, b)
+
+    Outputs are equal up to rounding. Gelu and LayerNormalization stay decomposed where
+    they are: runtimes find them. A residual Conv + Add stays, in the form that TensorRT
+    and onnxruntime fuse with the next activation.
+    """
+
+    name = "fuse-basic"
+    exact = True
+
+    def run(self, model: ir.Model, context: Context) -> PassResult:
+        """Try every fusion on every node until none applies."""
+        fused = fuse(model, FUSIONS, by=self.name)
+        residual = sum(
+            node.op_type == "Add"
+            and any(maker(value, "Conv") for value in node.inputs)
+            and all(array_of(value) is None for value in node.inputs)
+            for node in model.graph
+        )
+        left = (
+            f"left {residual} residual Conv + Add as they are: TensorRT and onnxruntime"
+            " fuse them with the activation behind",
+        )
+        notes = (*fused.notes(), *(left if residual else ()))
+        return PassResult(model, fused.changes, notes)
+
+
+# Fold scales and shifts around a layer into its weights: with y = k x + d per output
+# channel, weight' = k weight and bias' = k bias + d, computed in float64 (Ioffe,
+# Szegedy 2015 for the k and d of a normalization).
+
+SHARED = var("weight")
+LAYER = op(("Conv", "ConvTranspose", "Gemm"), var("x"), SHARED, more=True)
+NUMBERS = constant()
+STATISTICS = tuple(constant() for _ in range(4))
+"""Gamma, beta, mean and variance."""
+
+AFFINE = either(
+    op("BatchNormalization", LAYER, *STATISTICS),
+    op(("Add", "Sub", "Mul", "Div"), LAYER, NUMBERS),
+    op("Sub", NUMBERS, LAYER),
+)
+
+
+def _is_affine(match: Match, facts: Facts) -> bool:
+    node = match.root
+    if node.op_type != "BatchNormalization":
+        return _affine(match) is not None
+    training = node.attributes.get_int("training_mode", 0)
+    outputs = [value for value in node.outputs[1:] if value.name]
+    return not training and not outputs and facts.opset >= 9
+
+
+def _affine(match: Match) -> tuple[Numbers, Numbers] | None:
+    """Return scale and shift, one number per channel; None if they vary in one."""
+    node = match.root
+    if node.op_type == "BatchNormalization":
+        gamma, beta, mean, variance = (match.numbers(part) for part in STATISTICS)
+        epsilon = node.attributes.get_float("epsilon", 1e-5)
+        scale = gamma / np.sqrt(variance + epsilon)
+        return scale, beta - mean * scale
+    if not _is_per_channel(match):
+        return None
+    numbers, one, zero = match.numbers(NUMBERS).reshape(-1), np.ones(1), np.zeros(1)
+    if node.op_type == "Add":
+        return one, numbers
+    if node.op_type == "Sub":
+        first = match[LAYER] is node.inputs[0]
+        return (one, -numbers) if first else (-one, numbers)
+    if not numbers.all():
+        return None
+    factor = numbers if node.op_type == "Mul" else 1 / numbers
+    # zero times a sum would lose the sign of its zeros
+    return (factor, zero) if factor.all() else None
+
+
+def _is_per_channel(match: Match) -> bool:
+    source, given = match[LAYER], match.array(NUMBERS).shape
+    shape = static_shape(source)
+    rank = len(source.shape) if source.shape is not None else 0
+    if len(given) > rank or rank < 2:
+        return False
+    if math.prod(given) == 1:
+        return True
+    full = (1,) * (rank - len(given)) + given
+    if any(size != 1 for axis, size in enumerate(full) if axis != 1):
+        return False
+    same = shape == static_shape(match.root.outputs[0])
+    return same and shape is not None and shape[1] == full[1]
+
+
+def _fold_affine(match: Match, kit: Kit) -> str | None:
+    layer, affine = match.node(LAYER), _affine(match)
+    bias, what = _bias(layer), layer.op_type
+    if affine is None or bias is None or not holds_numbers(match[SHARED]):
+        return f"{what} whose weights are computed"
+    # Compute the new weight and bias in float64
+    stored, shift = match.array(SHARED), affine[1]
+    scale = _per_output(layer, affine[0])
+    weight = _scaled(layer, match.numbers(SHARED), scale)
+    bias = np.broadcast_to(bias * scale + shift, scale.shape)
+    if overflow(weight, stored) or overflow(bias, stored):
+        return f"{what} whose weights would overflow"
+    # Store them, unless others read the weight as it is
+    name = match[SHARED].name or layer.name or "layer"
+    if not (scale == 1).all():
+        if sole_reader(match[SHARED]) is not layer:
+            return f"{what} that shares its weights"
+        kit.refill(layer, 1, weight.astype(stored.dtype), name)
+    kit.refill(
+        layer, 2, bias.astype(stored.dtype), f"{name.removesuffix('.weight')}.bias"
+    )
+    if what == "Gemm":
+        layer.attributes["beta"] = ir.AttrFloat32("beta", 1.0)  # it is in the bias
+    kit.absorb(layer)
+    return None
+
+
+def _per_output(layer: ir.Node, scale: Numbers) -> Numbers:
+    """Return the scale of every output channel."""
+    shape, groups = static_shape(layer.inputs[1]) or (1, 1), 1
+    if layer.op_type == "ConvTranspose":
+        groups = layer.attributes.get_int("group", 1)
+    return np.broadcast_to(scale, (shape[channel_axis(layer)] * groups,))
+
+
+def _bias(layer: ir.Node) -> Numbers | None:
+    """Return the bias as a vector (zero if none); None if it is not a vector."""
+    if bias_of(layer) is None:
+        return np.zeros(1)
+    bias = numbers_of(bias_of(layer))
+    if bias is None or any(size != 1 for size in bias.shape[:-1]):
+        return None
+    beta = layer.attributes.get_float("beta", 1.0)
+    return bias.reshape(-1) * (beta if layer.op_type == "Gemm" else 1.0)
+
+
+def _scaled(layer: ir.Node, weight: Numbers, scale: Numbers) -> Numbers:
+    if layer.op_type == "Gemm":
+        flip = layer.attributes.get_int("transB", 0)
+        return weight * (scale[:, None] if flip else scale)
+    rest = (1,) * (weight.ndim - 2)
+    if layer.op_type == "Conv":
+        return weight * scale.reshape(-1, 1, *rest)
+    groups = layer.attributes.get_int("group", 1)
+    rows = np.repeat(scale.reshape(groups, -1), weight.shape[0] // groups, axis=0)
+    return weight * rows.reshape(*rows.shape, *rest)
+
+
+CANCELLATION = 1e3
+"""Constants that cancel more than three decimal digits are not added in advance."""
+
+# MatMul and bias of rank 2 as a Gemm. At rank 3 they stay: Reshape, Gemm, Reshape would
+# hide the product from attention patterns and misplace the quantizers.
+
+LEFT, RIGHT, OFFSET = var("left"), var("right"), constant(floating=False)
+INNER = op("MatMul", LEFT, RIGHT)
+PLUS = op("Add", INNER, OFFSET)
+
+
+def _is_of_matrices(match: Match, facts: Facts) -> bool:
+    """Return whether the product has rank 2 and the offset varies only by column."""
+    inner = match.node(INNER)
+    if facts.opset < 7 or match.root.outputs[0].dtype not in FLOATS:
+        return False
+    left, right, out = map(static_shape, (*inner.inputs, *inner.outputs))
+    if left is None or right is None or out is None:
+        return False
+    columns = out[-1:]
+    added = match.array(OFFSET).shape
+    return len(left) == len(right) == 2 and added in ((), (1,), columns, (1, *columns))
+
+
+SOURCE = var("source", computed=True)
+FIRST, SECOND = constant(), constant()
+
+
+def _chain(match: Match, kit: Kit) -> str | None:
+    """Multiply (or add) two consecutive constants in advance."""
+    first, second = match.numbers(FIRST), match.numbers(SECOND)
+    op_type, output = match.root.op_type, match.root.outputs[0]
+    # Combine in float64, unless digits would be lost
+    together = second * first if op_type == "Mul" else second + first
+    if op_type == "Add" and np.any(np.abs(first) > CANCELLATION * np.abs(together)):
+        return "constants that cancel when added up"
+    size = np.abs(together[together != 0])
+    limits = None if output.dtype is None else np.finfo(output.dtype.numpy())
+    if limits is None or not np.all((size <= limits.max) & (size >= limits.tiny)):
+        return "constants that overflow when multiplied"
+    if together.size > max(first.size, second.size):
+        return "constants that grow when combined"
+    array = together.astype(limits.dtype)
+    value = kit.constant(array, f"{output.name}_{op_type.lower()}")
+    kit.put(op_type, [match[SOURCE], value])
+    return None
+
+
+# Whether any condition is true: torch writes ``count_nonzero(x) > 0`` in this form. A
+# sum of ones is above 0 in either type, and onnxruntime's CPU (1.31) adds 2.56 million
+# float32 in 0.2 ms, int64 in 5.
+
+CONDITIONS = var("conditions")
+ZERO = constant(floating=False, scalar=True)
+SUM = op("ReduceSum", op("Cast", CONDITIONS), more=True)
+ANY_OF = op("Greater", SUM, ZERO)
+
+
+def _counts(match: Match, facts: Facts) -> bool:
+    zero = match.array(ZERO)
+    integers = zero.dtype.kind in "iu" and not zero.any()
+    return integers and match[CONDITIONS].dtype == ir.DataType.BOOL
+
+
+def _add_in_float(match: Match, kit: Kit) -> None:
+    total, zero = match.node(SUM), match.array(ZERO)
+    real = kit.add("Cast", [match[CONDITIONS]], {"to": int(ir.DataType.FLOAT)})
+    options = {name: attr.value for name, attr in total.attributes.items()}
+    added = kit.add("ReduceSum", [real, *total.inputs[1:]], options)
+    name = f"{match[ZERO].name}_float"
+    kit.put("Greater", [added, kit.constant(zero.astype(np.float32), name)])
+
+
+# A constant of one number gets the rank of the other operand if the last axes of that
+# have size 1; the result is the same. onnxruntime's CPU (1.31) merges axes of size 1
+# only if both operands have them, and computes one element at a time otherwise: a
+# comparison of 240,000 elements takes 1.39 ms, not 0.03.
+
+LEAST = 1000
+"""Elements that take onnxruntime 6 us one at a time: three starts of a node."""
+
+
+def _slow_scalar(node: ir.Node) -> tuple[int, Array] | None:
+    """Return the index of a constant of one number, and that with the other's rank."""
+    for index in (0, 1):
+        array = array_of(node.inputs[index])
+        shape = static_shape(node.inputs[1 - index])
+        if array is None or array.size != 1 or shape is None:
+            continue
+        ones = sum(1 for _ in itertools.takewhile(lambda n: n == 1, reversed(shape)))
+        if ones and array.ndim <= ones and math.prod(shape) >= LEAST:
+            return index, array.reshape((1,) * len(shape))
+    return None
+
+
+def _give_axes(match: Match, kit: Kit) -> None:
+    node, slow = match.root, _slow_scalar(match.root)
+    assert slow is not None
+    kit.refill(node, *slow, f"{node.outputs[0].name}_scalar")
+    provenance.inherit(node, (node,), by=kit.by)
+
+
+FUSIONS = (
+    Fusion("layers with what follows them", AFFINE, _fold_affine, where=_is_affine),
+    Fusion(
+        "MatMul + bias",
+        PLUS,
+        lambda match, kit: kit.put("Gemm", [match[LEFT], match[RIGHT], match[OFFSET]]),
+        where=_is_of_matrices,
+    ),
+    *(
+        Fusion("constant chains", op(kind, op(kind, SOURCE, FIRST), SECOND), _chain)
+        for kind in ("Add", "Mul")
+    ),
+    Fusion("sums of conditions", ANY_OF, _add_in_float, where=_counts),
+    Fusion(
+        "axes of constants",
+        op(ELEMENTWISE, var("left"), var("right")),
+        _give_axes,
+        where=lambda match, facts: _slow_scalar(match.root) is not None,
+    ),
+)
