@@ -4,7 +4,7 @@ import dataclasses
 import itertools
 import math
 from collections import Counter
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from fnmatch import fnmatchcase
 
 import numpy as np
@@ -13,7 +13,6 @@ import onnx_ir as ir
 from me2e_compress.base.display import plural
 from me2e_compress.base.errors import PreconditionError
 from me2e_compress.calibration.calibrator import Calibrator
-from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.graph import (
     array_of,
     has_subgraph,
@@ -31,14 +30,13 @@ from me2e_compress.graph.nodes import (
     producer_of,
 )
 from me2e_compress.passes.base import Context, Pass, PassResult
-from me2e_compress.passes.convert_float16.element_types import (
+from me2e_compress.passes.convert_float32 import (
     FLOAT,
     HALF,
     ElementTypes,
     Retyping,
 )
 from me2e_compress.quantization.geometry import position_arithmetic
-from me2e_compress.runtime.providers import CPU, Provider
 from me2e_compress.targets.quantized import (
     DEQUANTIZE,
     QUANTIZE,
@@ -46,57 +44,6 @@ from me2e_compress.targets.quantized import (
     pairs_of,
 )
 from me2e_compress.targets.weights import requantized, scales_in
-
-__all__ = ["ConvertFloat16", "raise_scales"]
-
-
-def raise_scales(model: ir.Model, narrow: set[ir.Node]) -> None:
-    """Raise int8 scales too small for float16, and round their stored integers again.
-
-    Given:   y = DequantizeLinear(q, s)              s float32 [channels], some 1e-9
-    Result:  y = DequantizeLinear(q', s')            s' at least 6e-8, q' for s'
-
-    A channel whose weights are nearly 0 has such scales; TensorRT refuses a scale of 0.
-    Both nodes of a pair get the same scales, if one of them is ``narrow``. Nodes are
-    changed in place; scales that fit float16 stay as they are.
-    """
-    names = rewrite.value_names(model.graph)
-    fresh: dict[ir.Value, ir.Value] = {}
-    for node in list(pairs_of(model)):
-        scale, stored = node.inputs[1], array_of(node.inputs[1])
-        if scale is None or stored is None or stored.dtype != np.float32:
-            continue
-        # The other nodes of its pair
-        if node.op_type == QUANTIZE:
-            readers = node.outputs[0].consumers()
-            partners = [reader for reader in readers if reader.op_type == DEQUANTIZE]
-        else:
-            partners = list(filter(None, [producer_of(node.inputs[0])]))
-        if narrow.isdisjoint((node, *partners)):
-            continue
-        exact = stored.astype(np.float32)
-        raised = scales_in(exact, np.float16).astype(np.float32)
-        # Rounding to 11 bits moves no integer
-        few = exact < np.finfo(np.float16).smallest_normal
-        raised = np.where(few & (exact > 0), raised, exact)
-        if np.array_equal(raised, exact):
-            continue
-        if scale not in fresh:
-            name = f"{scale.name}_held"
-            fresh[scale] = rewrite.add_constant(model.graph, raised, name, names)
-        # Integers that are stored are rounded again
-        value = node.inputs[0]
-        integers = array_of(value)
-        if node.op_type == DEQUANTIZE and integers is not None and value is not None:
-            axis = node.attributes.get_int("axis", 1) if exact.size > 1 else None
-            zero = array_of(input_at(node, 2))
-            again = requantized(integers, exact, raised, axis, zero)
-            name = f"{value.name}_held"
-            rounded = rewrite.add_constant(model.graph, again, name, names)
-            node.replace_input_with(0, rounded)
-        node.replace_input_with(1, fresh[scale])
-    rewrite.sweep(model)
-
 
 SCALES_SINCE = 19
 """The first opset whose QuantizeLinear takes float16 and float16 scales."""
@@ -138,15 +85,15 @@ class ConvertFloat16(Pass):
                 f" {SCALES_SINCE}, export the model so"
             )
         # Collect the nodes that must stay in float32
-        types, frames = ElementTypes(model, FLOAT, HALF), context.frames
-        wide = wide_nodes(model, types, frames, provider=context.provider)
+        types = ElementTypes(FLOAT, HALF, opset_of(model))
+        wide = _float32_nodes(model, types, context)
         for pattern in self.keep:
             wide |= dict.fromkeys(_matches(model, pattern), "the option keeps it")
         # Everything else that can be float16 becomes float16
         narrow = [n for n in model.graph if n not in wide and types.inputs(n)]
-        raise_scales(model, set(narrow))
-        retyping = Retyping(model, types, self.name)
-        retyping.run(narrow)
+        _raise_scales(model, set(narrow))
+        changes = Retyping(model, types, self.name).retype(narrow)
+        # Report why the others stay
         reasons = Counter(
             reason
             for node, reason in wide.items()
@@ -157,23 +104,27 @@ class ConvertFloat16(Pass):
         if reasons:
             listed = ", ".join(f"{why} {n}" for why, n in reasons.most_common())
             notes.append(f"float32: {listed}")
-        if frames is None:
+        if context.frames is None:
             notes.append(
                 "no frames (--frames): whether all numbers fit float16 was not measured"
             )
-        return PassResult(model, retyping.changed, tuple(notes))
+        return PassResult(model, changes, tuple(notes))
 
 
 def _matches(model: ir.Model, pattern: str) -> list[ir.Node]:
     """Return the nodes whose name, operator or module a glob matches; at least one."""
-
-    def words(node: ir.Node) -> list[str]:
-        return [node.name or "", node.op_type, provenance.module_of(node)]
-
-    nodes = [n for n in model.graph if any(fnmatchcase(w, pattern) for w in words(n))]
+    nodes = [
+        node
+        for node in model.graph
+        for words in [(node.name or "", node.op_type, provenance.module_of(node))]
+        if any(fnmatchcase(word, pattern) for word in words)
+    ]
     if not nodes:
         raise PreconditionError(f"keep: no node, operator or module is {pattern!r}")
     return nodes
+
+
+# Choose the nodes that stay in float32.
 
 
 LARGEST = float(np.finfo(np.float16).max)
@@ -186,23 +137,23 @@ that adds up a softmax in half is right to 1e-3 up to half of that."""
 _RESOLUTION = 2.0**-10
 """Relative error of a constant that still is the same constant."""
 
-_SUMS = frozenset(
-    {
+_POSITIONS = "positions: a half is right to 1/2048"
+_OPERATORS = {
+    # Sums of many elements, squares and exponentials leave float16 on their way
+    "sums, squares and exponentials": {
         "CumSum", "Exp", "Log", "Mean", "MeanVarianceNormalization", "Pow", "ReduceL1",
         "ReduceL2", "ReduceLogSum", "ReduceLogSumExp", "ReduceMean", "ReduceProd",
         "ReduceSum", "ReduceSumSquare", "Softplus", "Sum",
-    }
-)  # fmt: skip
-"""Sums of many elements, squares and exponentials: they leave float16 on their way."""
-_CHOICES = frozenset(
-    {
+    },
+    # Nearly equal numbers would become equal
+    "choices between nearly equal numbers": {
         "ArgMax", "ArgMin", "Equal", "Greater", "GreaterOrEqual", "Less", "LessOrEqual",
         "NonMaxSuppression", "NonZero", "TopK", "Ceil", "Floor", "Round",
-    }
-)  # fmt: skip
-"""Operators that choose between numbers: nearly equal ones would become equal."""
-_PLACES = frozenset({"DeformConv", "Det", "GridSample", "Range", "RoiAlign"})
-"""Operators that take coordinates beside their data."""
+    },
+    # These take coordinates beside their data
+    _POSITIONS: {"DeformConv", "Det", "GridSample", "Range", "RoiAlign"},
+}  # fmt: skip
+"""Operators that stay in float32 whatever they read, by the reason."""
 _MOVES = LAYOUT_OPERATORS | {
     "Concat", "Expand", "Gather", "GatherElements", "GatherND", "Pad",
     "ScatterElements", "ScatterND", "Slice", "Split", "Tile",
@@ -210,15 +161,12 @@ _MOVES = LAYOUT_OPERATORS | {
 """What only moves elements: it is as exact in either type."""
 
 
-def wide_nodes(
-    model: ir.Model,
-    types: ElementTypes,
-    frames: CalibrationSet | None,
-    provider: Provider = CPU,
+def _float32_nodes(
+    model: ir.Model, types: ElementTypes, context: Context
 ) -> dict[ir.Node, str]:
     """Map the nodes of the main graph that must stay in float32 to the reason.
 
-    Shapes and types must be inferred; without ``frames`` no ranges are measured.
+    Shapes and types must be inferred; without frames no ranges are measured.
     """
     # Operators, constants and positions decide without running the graph
     places = position_arithmetic(model, constant_values(model))
@@ -226,12 +174,12 @@ def wide_nodes(
     for node in model.graph:
         reason = _by_operator(node, opset) or _by_constants(node, types)
         if reason is None and node in places:
-            reason = "positions: a half is right to 1/2048"
+            reason = _POSITIONS
         if reason is not None:
             reasons[node] = reason
     # Measured ranges and the nodes in between come last
-    if frames is not None:
-        reasons |= _by_ranges(model, types, reasons, frames, provider)
+    if context.frames is not None:
+        reasons |= _by_ranges(model, types, reasons, context)
     return reasons | _between(model, reasons)
 
 
@@ -241,12 +189,9 @@ def _by_operator(node: ir.Node, opset: int) -> str | None:
         return "not an operator of ONNX"
     if has_subgraph(node):
         return "has a body"
-    if node.op_type in _SUMS:
-        return "sums, squares and exponentials"
-    if node.op_type in _CHOICES:
-        return "choices between nearly equal numbers"
-    if node.op_type in _PLACES:
-        return "positions: a half is right to 1/2048"
+    for reason, op_types in _OPERATORS.items():
+        if node.op_type in op_types:
+            return reason
     if node.op_type in ("LogSoftmax", "Softmax"):
         shape = static_shape(node.inputs[0])
         if shape is None:
@@ -286,10 +231,9 @@ def _by_ranges(
     model: ir.Model,
     types: ElementTypes,
     known: Collection[ir.Node],
-    frames: CalibrationSet,
-    provider: Provider,
+    context: Context,
 ) -> dict[ir.Node, str]:
-    # Map the measured values to the nodes that touch them
+    """Map the nodes that read or make too large numbers on the frames to the size."""
     touched, constants = dict[str, list[ir.Node]](), constant_values(model)
     for node in model.graph:
         if node in known:
@@ -299,9 +243,10 @@ def _by_ranges(
         for value in (*read, *made):
             if value is not None and value not in constants:
                 touched.setdefault(str(value.name), []).append(node)
-    if not touched:
+    if not touched or context.frames is None:
         return {}
-    ranges = Calibrator(provider=provider).run(model, tuple(touched), frames).tensors
+    calibrator = Calibrator(provider=context.provider)
+    ranges = calibrator.run(model, tuple(touched), context.frames).tensors
     # Keep a factor of headroom for frames that were not measured
     reaches = {name: max(-low, high) for name, (low, high) in ranges.items()}
     return {
@@ -316,14 +261,15 @@ def _between(model: ir.Model, wide: Mapping[ir.Node, str]) -> dict[ir.Node, str]
     """Find nodes that only move elements between float32 nodes, inputs and outputs."""
     moves = {node: None for node in model.graph if node.op_type in _MOVES}
 
+    def stays(neighbours: Iterable[ir.Node | None]) -> bool:
+        return all(n is None or n in wide or n in moves for n in neighbours)
+
     def from_wide(node: ir.Node) -> bool:
         data = node.inputs if node.op_type == "Concat" else node.inputs[:1]
-        makers = [None if value is None else value.producer() for value in data]
-        return all(maker is None or maker in wide or maker in moves for maker in makers)
+        return stays(producer_of(value) for value in data)
 
     def to_wide(node: ir.Node) -> bool:
-        readers = itertools.chain(*(value.consumers() for value in node.outputs))
-        return all(reader in wide or reader in moves for reader in readers)
+        return stays(itertools.chain(*(v.consumers() for v in node.outputs)))
 
     # Strike out moves next to float16 nodes until nothing changes
     before = -1
@@ -336,3 +282,49 @@ def _between(model: ir.Model, wide: Mapping[ir.Node, str]) -> dict[ir.Node, str]
             if not to_wide(node):
                 del moves[node]
     return dict.fromkeys(moves, "moves numbers between nodes in float32")
+
+
+def _raise_scales(model: ir.Model, narrow: set[ir.Node]) -> None:
+    """Raise int8 scales too small for float16, and round their stored integers again.
+
+    Given:   y = DequantizeLinear(q, s)              s float32 [channels], some 1e-9
+    Result:  y = DequantizeLinear(q', s')            s' at least 6e-8, q' for s'
+
+    A channel whose weights are nearly 0 has such scales; TensorRT refuses a scale of 0.
+    Both nodes of a pair get the same scales, if one of them is ``narrow``. Nodes are
+    changed in place; scales that fit float16 stay as they are.
+    """
+    names = rewrite.value_names(model.graph)
+    fresh: dict[ir.Value, ir.Value] = {}
+    for node in list(pairs_of(model)):
+        scale, stored = node.inputs[1], array_of(node.inputs[1])
+        if scale is None or stored is None or stored.dtype != np.float32:
+            continue
+        # Skip pairs of which neither node becomes float16
+        partners: Sequence[ir.Node | None] = [producer_of(node.inputs[0])]
+        if node.op_type == QUANTIZE:
+            readers = node.outputs[0].consumers()
+            partners = [reader for reader in readers if reader.op_type == DEQUANTIZE]
+        if narrow.isdisjoint((node, *partners)):
+            continue
+        # Raise only subnormal scales: rounding others to 11 bits moves no integer
+        exact = stored.astype(np.float32)
+        few = (exact < np.finfo(np.float16).smallest_normal) & (exact > 0)
+        raised = np.where(few, scales_in(exact, np.float16).astype(np.float32), exact)
+        if np.array_equal(raised, exact):
+            continue
+        if scale not in fresh:
+            name = f"{scale.name}_held"
+            fresh[scale] = rewrite.add_constant(model.graph, raised, name, names)
+        # Integers that are stored are rounded again
+        value = node.inputs[0]
+        integers = array_of(value)
+        if node.op_type == DEQUANTIZE and integers is not None and value is not None:
+            axis = node.attributes.get_int("axis", 1) if exact.size > 1 else None
+            zero = array_of(input_at(node, 2))
+            again = requantized(integers, exact, raised, axis, zero)
+            name = f"{value.name}_held"
+            rounded = rewrite.add_constant(model.graph, again, name, names)
+            node.replace_input_with(0, rounded)
+        node.replace_input_with(1, fresh[scale])
+    rewrite.sweep(model)
