@@ -2,6 +2,8 @@
 
 import dataclasses
 import itertools
+import math
+import re
 from collections import defaultdict
 from collections.abc import Iterator
 
@@ -9,24 +11,29 @@ import numpy as np
 import onnx_ir as ir
 
 from me2e_compress.base.display import plural
-from me2e_compress.graph import graphs_of, provenance
+from me2e_compress.graph import (
+    array_of,
+    graphs_of,
+    input_at,
+    is_standard,
+    opset_of,
+    provenance,
+    static_shape,
+)
 from me2e_compress.graph.modules.assign import assign
 from me2e_compress.graph.nodes import (
-    array_of,
+    FLOATS,
     bodies,
+    integers_of,
     is_plugin,
     nodes_in,
     nodes_of,
-    opset_of,
 )
-from me2e_compress.graph.rewrite import add_constant, lift_constants
+from me2e_compress.graph.rewrite import lift_constants, put, remove_node, value_names
 from me2e_compress.graph.rewrite.raise_opset import OLDEST_OPSET, raise_opset
-from me2e_compress.graph.shapes import static_shape
 from me2e_compress.graph.validity import ORIGINAL_DOMAIN, PLUGIN_DOMAIN
+from me2e_compress.operators import FusedCall
 from me2e_compress.passes.base import Context, Pass, PassResult
-from me2e_compress.passes.einsum_products import write_products
-from me2e_compress.passes.sequences import unpack_sequences
-from me2e_compress.targets.quantized import PAIR
 
 _TYPE_ATTRIBUTES = ("to", "dtype", "output_datatype")
 """Attributes of standard operators that name an element type: Cast; EyeLike, Random*,
@@ -154,11 +161,9 @@ class ImportNormalize(Pass):
     6. Constant nodes become initializers.
     7. A model with functions declares at least IR version 8, and all used domains are
        imported.
-    8. An Einsum that is a product becomes a MatMul, and a weight in front of its
-       columns a Conv of kernel 1: layers, which become int8.
-    9. Scales by channel that have dimensions of 1 beside become vectors: no runtime
-       takes ``[64, 1, 1]``.
-    10. A sequence that is only taken apart again becomes its tensors.
+    8. An Einsum that is a product becomes a MatMul: a layer, which becomes int8.
+    9. A tensor that is split into a sequence, of which only parts are read, is split
+       into these.
 
     Subgraphs and function bodies are included. Unknown operators are left alone.
 
@@ -174,6 +179,7 @@ class ImportNormalize(Pass):
 
     def run(self, model: ir.Model, context: Context) -> PassResult:
         """Rewrite the model in place."""
+        # Stamp names, modules and origins before anything renames a node
         changes = _name_nodes(model, self.name)
         if provenance.missing(model):
             for node, place in assign(model, context.modules).placements.items():
@@ -181,6 +187,7 @@ class ImportNormalize(Pass):
                     past = provenance.Provenance(place.module, (node.name or "",))
                     provenance.stamp(node, past)
                     changes += 1
+        # Normalize domains, opset, element types and constants
         changes += _isolate_plugins(model, self.name)
         raised, raise_note = _raise(model, self.name)
         demoted, note = demote(model, self.name)
@@ -194,31 +201,11 @@ class ImportNormalize(Pass):
                 if node.domain not in body.opset_imports:
                     body.opset_imports[node.domain] = 1
                     changes += 1
-        changes += write_products(model, self.name) + _flatten_scales(model, self.name)
+        # Products and parts of tensors in their plain forms
+        changes += _write_einsums(model, self.name)
         if opset_of(model) >= OLDEST_OPSET:
-            changes += unpack_sequences(model, self.name)
+            changes += _unpack_sequences(model, self.name)
         return PassResult(model, changes, tuple(filter(None, (raise_note, note))))
-
-
-def _flatten_scales(model: ir.Model, by: str) -> int:
-    """Write stored scales and zero points by channel as vectors, and count them."""
-    count = 0
-    for node in model.graph:
-        shape = static_shape(node.inputs[0]) if node.op_type in PAIR else None
-        axis = node.attributes.get_int("axis", 1)
-        if not shape or axis >= len(shape) or "block_size" in node.attributes:
-            continue
-        for index, value in enumerate(node.inputs[:3]):
-            array = array_of(value)
-            if array is None or not index or array.ndim < 2:
-                continue
-            if array.size == max(array.shape) == shape[axis]:
-                name = f"{node.name}_vector_{index}"
-                vector = add_constant(model.graph, array.reshape(-1), name)
-                node.replace_input_with(index, vector)
-                provenance.inherit(node, [node], by=by)
-                count += 1
-    return count
 
 
 def needs_import(model: ir.Model) -> bool:
@@ -305,3 +292,134 @@ def _plugins_without_domain(
         and is_plugin(node)
         and node.op_identifier() not in model.functions
     ]
+
+
+_TWO_OPERANDS = re.compile(r"([A-Za-z]+),([A-Za-z]+)->([A-Za-z]+)")
+
+
+def _write_einsums(model: ir.Model, by: str) -> int:
+    """Write Einsums that are products of two matrices as MatMul, and count them.
+
+    Given:   y = Einsum<"bnd,ed->bne">(x, w)
+
+    Result:  y = MatMul(x, Transpose(w))
+    """
+    names, opset = value_names(model.graph), opset_of(model)
+    return sum(
+        _write_einsum(FusedCall(node, opset=opset, by=by, names=names))
+        for body in graphs_of(model.graph)
+        for node in list(body)
+        if node.op_type == "Einsum" and is_standard(node)
+        if node.outputs[0].dtype in FLOATS and None not in node.inputs
+    )
+
+
+def _write_einsum(call: FusedCall) -> bool:
+    """Write one Einsum; False where it is no product of two matrices."""
+    equation = call.node.attributes.get_string("equation", "").replace(" ", "")
+    match = _TWO_OPERANDS.fullmatch(equation)
+    terms = () if match is None else match.groups()
+    if not terms or any(len(set(labels)) < len(labels) for labels in terms):
+        return False
+    # Batch labels are in all three terms, those of rows, columns and sums in two
+    one, two, out = terms
+    batch = "".join(x for x in out if x in one and x in two)
+    rows = "".join(x for x in out if x in one and x not in two)
+    columns = "".join(x for x in out if x in two and x not in one)
+    summed = "".join(x for x in one if x in two and x not in out)
+    labels = {*batch, *rows, *columns, *summed}
+    if not (rows and columns and summed) or labels != {*one, *two, *out}:
+        return False
+    # Several rows need no reshaping without a batch: MatMul broadcasts them
+    left, right = filter(None, call.node.inputs)
+    shapes = static_shape(left), static_shape(right)
+    sizes = dict(zip(one + two, (shapes[0] or ()) + (shapes[1] or ()), strict=False))
+    groups = (columns, summed, rows if batch else "")
+    reshapes = any(len(group) > 1 for group in groups)
+    if reshapes and None in shapes:
+        return False
+    # Bring both operands to [*batch, rows, summed] and [*batch, summed, columns]
+    left = _transposed(call, left, one, batch + rows + summed)
+    right = _transposed(call, right, two, batch + summed + columns)
+    if reshapes:
+        lead = [sizes[x] for x in batch]
+        count, depth, width = (
+            math.prod(sizes[x] for x in group) for group in (rows, summed, columns)
+        )
+        left = call.reshape(left, [*lead, count, depth])
+        right = call.reshape(right, [*lead, depth, width])
+    # Multiply, and restore the axes
+    result = call.add("MatMul", [left, right])
+    if reshapes:
+        result = call.reshape(result, [sizes[x] for x in batch + rows + columns])
+    call.put(_transposed(call, result, batch + rows + columns, out))
+    return True
+
+
+def _transposed(call: FusedCall, value: ir.Value, have: str, want: str) -> ir.Value:
+    """Transpose a value from one order of labelled axes to another, if they differ."""
+    if have == want:
+        return value
+    return call.transpose(value, [have.index(label) for label in want])
+
+
+def _unpack_sequences(model: ir.Model, by: str) -> int:
+    """Split tensors instead of making sequences of parts; return how many nodes change.
+
+    All readers must take a part at a constant place. TensorRT's parser supports no
+    sequences.
+
+    Given:   s = SplitToSequence(x, [2, 4])  ;  y = SequenceAt(s, 1)
+
+    Result:  a, b = Split(x, [2, 4])         ;  y = Identity(b)
+    """
+    count, names, opset = 0, value_names(model.graph), opset_of(model)
+    for body in graphs_of(model.graph):
+        for node in list(body):
+            if node.op_type != "SplitToSequence" or not is_standard(node):
+                continue
+            # Lengths and places of all parts must be known
+            sequence, lengths = node.outputs[0], _lengths(node)
+            readers = list(sequence.consumers())
+            if lengths is None or not readers or sequence.is_graph_output():
+                continue
+            places = [_place(reader, len(lengths)) for reader in readers]
+            if None in places:
+                continue
+            # Split the tensor, and read its parts
+            source, axis = node.inputs[0], node.attributes.get_int("axis", 0)
+            call = FusedCall(node, opset=opset, by=by, names=names)
+            inputs, options = [source, call.integers(lengths)], {"axis": axis}
+            split = call.add("Split", inputs, options, outputs=len(lengths)).producer()
+            assert source is not None
+            assert split is not None
+            for part in split.outputs:
+                part.type = source.type
+            for reader, place in zip(readers, places, strict=True):
+                put(reader, "Identity", [split.outputs[place or 0]], by=by)
+            remove_node(node)
+            count += 1 + len(readers)
+    return count
+
+
+def _lengths(node: ir.Node) -> list[int] | None:
+    """Return the lengths of a sequence's tensors along its axis; None if unknown."""
+    if array_of(node.inputs[0]) is not None:  # fold-constants splits weights
+        return None
+    split = input_at(node, 1)
+    lengths, array = integers_of(split), array_of(split)
+    if lengths is None or array is None or array.ndim:
+        return lengths
+    # One number is the length of each part but the last
+    (most,) = lengths
+    shape = static_shape(node.inputs[0])
+    if shape is None or most < 1:
+        return None
+    size = shape[node.attributes.get_int("axis", 0)]
+    return [min(most, size - at) for at in range(0, size, most)]
+
+
+def _place(reader: ir.Node, count: int) -> int | None:
+    """Return which of ``count`` tensors a SequenceAt takes; None of other readers."""
+    places = integers_of(reader.inputs[1]) if reader.op_type == "SequenceAt" else None
+    return places[0] if places and -count <= places[0] < count else None
