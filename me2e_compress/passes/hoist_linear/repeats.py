@@ -258,8 +258,7 @@ def _plan(node: ir.Node, opset: int) -> _Plan | None:
     value = node.inputs[0] if node.inputs else None
     if node.op_type == "Transpose" and value is not None:
         return _turned(node, value)
-    layer = node.op_type != "Gemm" and is_product(node)
-    if value is None or not (layer or is_row_wise(node, opset)):
+    if value is None or not (is_product(node) or is_row_wise(node, opset)):
         return None
     if node.op_type in BINARY:
         return _combined(node, shape)

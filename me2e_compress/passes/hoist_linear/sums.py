@@ -16,7 +16,7 @@ import dataclasses
 import math
 from collections.abc import Callable
 from functools import partial
-from typing import TypeAlias
+from typing import Self, TypeAlias
 
 import numpy as np
 import onnx_ir as ir
@@ -43,65 +43,41 @@ DEEPEST = 32
 
 @dataclasses.dataclass(frozen=True)
 class LinearLayer:
-    """``source @ weight + bias``: a MatMul or Gemm, and the Add of a separate bias."""
+    """``source @ weight + bias``: a MatMul, and the Add of a constant vector.
+
+    ``source`` [..., K] are the rows, ``weight`` [K, N] is a constant matrix.
+    """
 
     product: ir.Node
     sum: ir.Node | None
+    source: ir.Value
+    weight: ir.Value
 
-    @property
-    def source(self) -> ir.Value:
-        """The rows, [..., K]."""
-        value = self.product.inputs[0]
-        assert value is not None
-        return value
-
-    @property
-    def weight(self) -> ir.Value:
-        """The constant matrix, [K, N], or [N, K] where the Gemm transposes it."""
-        value = self.product.inputs[1]
-        assert value is not None
-        return value
+    @classmethod
+    def of(cls, product: ir.Node, total: ir.Node | None = None) -> Self:
+        """Return the layer of a product (:func:`is_product`), and of its bias."""
+        source, weight = product.inputs
+        assert source is not None
+        assert weight is not None
+        return cls(product, total, source, weight)
 
     @property
     def result(self) -> ir.Value:
         """The output, [..., N]."""
-        return (self.sum or self.product).outputs[0]
+        return self.nodes[-1].outputs[0]
 
     @property
     def nodes(self) -> tuple[ir.Node, ...]:
         """Its nodes, the product first."""
         return (self.product,) if self.sum is None else (self.product, self.sum)
 
-    @property
-    def is_plain(self) -> bool:
-        """Whether the stored weight is exactly the matrix."""
-        return self.product.op_type == "MatMul" or (
-            not self.product.attributes.get_int("transB", 0)
-            and self.product.attributes.get_float("alpha", 1.0) == 1.0
-        )
-
-    def matrix(self) -> Numbers:
-        """Return the matrix, [K, N]."""
-        numbers = _known(self.weight)
-        if self.product.op_type == "MatMul":
-            return numbers
-        if self.product.attributes.get_int("transB", 0):
-            numbers = numbers.T
-        return numbers * self.product.attributes.get_float("alpha", 1.0)
-
-    def bias(self) -> Numbers | None:
-        """Return the added vector, [N]; None if there is none."""
-        total: Numbers | None = None
+    def bias(self) -> list[Numbers]:
+        """Return the added vector, [N], if there is one."""
+        if self.sum is None:
+            return []
         columns = (static_shape(self.result) or ())[-1:]
-        # A Gemm has its own bias
-        if len(self.product.inputs) > 2 and self.product.inputs[2] is not None:
-            beta = self.product.attributes.get_float("beta", 1.0)
-            total = _vector(self.product.inputs[2], columns) * beta
-        if self.sum is not None:
-            added = next(value for value in self.sum.inputs if holds_numbers(value))
-            more = _vector(added, columns)
-            total = more if total is None else total + more
-        return total
+        added = next(value for value in self.sum.inputs if holds_numbers(value))
+        return [np.array(np.broadcast_to(_known(added).reshape(-1), columns))]
 
 
 def layer_at(product: ir.Node) -> LinearLayer | None:
@@ -110,27 +86,25 @@ def layer_at(product: ir.Node) -> LinearLayer | None:
         return None
     reader = sole_reader(product.outputs[0])
     if reader is not None and reader.op_type == "Add" and _adds_bias(reader, product):
-        return LinearLayer(product, reader)
-    return LinearLayer(product, None)
+        return LinearLayer.of(product, reader)
+    return LinearLayer.of(product)
 
 
 def layer_behind(value: ir.Value) -> LinearLayer | None:
     """Return the layer that computes a value."""
-    node = maker(value, "MatMul", "Gemm", "Add")
+    node = maker(value, "MatMul", "Add")
     if node is None or node.op_type != "Add":
-        return None if node is None or not is_product(node) else LinearLayer(node, None)
+        return None if node is None or not is_product(node) else LinearLayer.of(node)
     for operand in node.inputs:
-        product = maker(operand, "MatMul", "Gemm")
+        product = maker(operand, "MatMul")
         if product is not None and is_product(product) and _adds_bias(node, product):
-            return LinearLayer(product, node)
+            return LinearLayer.of(product, node)
     return None
 
 
 def is_product(node: ir.Node) -> bool:
     """Return whether a node multiplies rows by a constant matrix."""
-    if node.op_type not in ("MatMul", "Gemm") or not is_standard(node):
-        return False
-    if node.attributes.get_int("transA", 0):
+    if node.op_type != "MatMul" or not is_standard(node):
         return False
     rows, result = static_shape(node.inputs[0]), static_shape(node.outputs[0])
     if not rows or not result or 0 in rows or node.outputs[0].dtype not in FLOATS:
@@ -138,29 +112,19 @@ def is_product(node: ir.Node) -> bool:
     weight = node.inputs[1]
     if len(static_shape(weight) or ()) != 2 or not holds_numbers(weight):
         return False
-    if array_of(node.inputs[0]) is not None:
-        return False
-    bias = node.inputs[2] if len(node.inputs) > 2 else None
-    return bias is None or _is_vector(bias, result)
+    return array_of(node.inputs[0]) is None
 
 
 def _adds_bias(node: ir.Node, product: ir.Node) -> bool:
-    value, shape = product.outputs[0], static_shape(product.outputs[0])
+    """Return whether an Add adds a constant vector to a product, and nothing else."""
+    value, result = product.outputs[0], static_shape(product.outputs[0])
     others = [operand for operand in node.inputs if operand is not value]
-    if shape is None or len(others) != 1 or static_shape(node.outputs[0]) != shape:
+    if result is None or len(others) != 1 or static_shape(node.outputs[0]) != result:
         return False
-    return _is_vector(others[0], shape)
-
-
-def _is_vector(value: ir.Value | None, result: tuple[int, ...]) -> bool:
-    shape = static_shape(value)
-    if shape is None or not holds_numbers(value) or len(shape) > len(result):
+    shape = static_shape(others[0])
+    if shape is None or not holds_numbers(others[0]) or len(shape) > len(result):
         return False
     return math.prod(shape[:-1]) == 1 and (not shape or shape[-1] in (1, result[-1]))
-
-
-def _vector(value: ir.Value | None, columns: tuple[int, ...]) -> Numbers:
-    return np.array(np.broadcast_to(_known(value).reshape(-1), columns))
 
 
 def _known(value: ir.Value | None) -> Numbers:
@@ -199,11 +163,10 @@ def multiply_earlier(layer: LinearLayer, call: FusedCall, bytes_per_node: int) -
     if now.cost - best.cost < 1.0 or best.macs >= now.macs:
         return False
     # Write it, unless a product of two matrices is too large for its type
-    matrix, bias = layer.matrix(), layer.bias()
-    if layer.is_plain:
-        search.stored[id(matrix)] = matrix, layer.weight
+    matrix = _known(layer.weight)
+    search.stored[id(matrix)] = matrix, layer.weight
     try:
-        terms = [*best.write(matrix), *([] if bias is None else [bias])]
+        terms = [*best.write(matrix), *layer.bias()]
         new = search.total(terms, static_shape(layer.result) or ())
     except OverflowError:
         remove_unread(reversed(search.written))
@@ -279,9 +242,8 @@ class _Search:
 
         def write(matrix: Numbers) -> Terms:
             self.call.sources += layer.nodes
-            bias = layer.bias()
-            terms = inner.write(layer.matrix() @ matrix)
-            return [*terms, *([] if bias is None else [bias @ matrix])]
+            terms = inner.write(_known(layer.weight) @ matrix)
+            return [*terms, *(bias @ matrix for bias in layer.bias())]
 
         return Form(inner.macs - gone, cost, write)
 
