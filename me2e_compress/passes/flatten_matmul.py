@@ -8,12 +8,12 @@ import onnx_ir as ir
 
 from me2e_compress.base.display import plural
 from me2e_compress.graph import is_standard, opset_of, static_shape
-from me2e_compress.graph.nodes import VIEWS, graphs_of
+from me2e_compress.graph.nodes import graphs_of
 from me2e_compress.graph.rewrite import remove_dead, remove_unread, value_names
 from me2e_compress.graph.summary import value_bytes
 from me2e_compress.operators import FusedCall
 from me2e_compress.passes.base import Context, Pass, PassResult
-from me2e_compress.passes.hoist_linear.repeats import broadcasts
+from me2e_compress.passes.hoist_linear.repeats import repeated_axes
 from me2e_compress.passes.hoist_linear.sums import replace
 from me2e_compress.passes.work import (
     MOVED_BYTES_PER_NODE,
@@ -216,38 +216,18 @@ def _read_unrepeated(call: FusedCall) -> int:
         shapes, value = _shapes(product), product.inputs[index]
         if shapes is None or value is None:
             continue
-        unrepeated = _before_repeats(value, shapes[index])
-        if unrepeated is None:
+        repeated = repeated_axes(value)
+        if repeated is None or repeated.large != shapes[index]:
             continue
-        source, small = unrepeated
+        small = repeated.small
         pair = (small, shapes[1]) if index == 0 else (shapes[0], small)
         batch = np.broadcast_shapes(*(shape[:-2] for shape in pair))
         same = batch == np.broadcast_shapes(*(shape[:-2] for shape in shapes))
         if small[-2:] == shapes[index][-2:] and same:
-            product.replace_input_with(index, _view(call, source, small))
+            product.replace_input_with(index, _view(call, repeated.source, small))
             remove_unread([value])
             count += 1
     return count
-
-
-def _before_repeats(value: ir.Value, shape: Shape) -> tuple[ir.Value, Shape] | None:
-    """Return the source of repeated axes, and its shape behind a view in between."""
-    node = value.producer()
-    if node is not None and node.op_type in VIEWS and is_standard(node):
-        node = None if node.inputs[0] is None else node.inputs[0].producer()
-    if node is None or not broadcasts(node) or node.graph is not value.graph:
-        return None
-    source, large = node.inputs[0], static_shape(node.outputs[0])
-    small = static_shape(source)
-    if source is None or small is None or large is None:
-        return None
-    # The view may only insert or drop axes of size 1
-    if [n for n in shape if n != 1] != [n for n in large if n != 1]:
-        return None
-    pairs = zip(_widened(small, len(large)), large, strict=True)
-    kept = iter([one for one, many in pairs if many != 1])
-    result = tuple(1 if size == 1 else next(kept) for size in shape)
-    return None if result == shape else (source, result)
 
 
 def _shapes(product: ir.Node) -> tuple[Shape, Shape] | None:

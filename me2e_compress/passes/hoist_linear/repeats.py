@@ -109,22 +109,6 @@ def repeated_axes(value: ir.Value) -> RepeatedAxes | None:
     return best
 
 
-def broadcasts(node: ir.Node) -> bool:
-    """Return whether a node repeats only axes of size 1, as an Add does by itself.
-
-    A Concat of the same value does so too: ``torch.stack([x] * 6)``.
-    """
-    if not is_standard(node) or node.op_type not in REPEATS:
-        return False
-    if node.op_type == "Concat" and len(set(node.inputs)) != 1:
-        return False
-    small, large = static_shape(node.inputs[0]), static_shape(node.outputs[0])
-    if small is None or large is None:
-        return False
-    ends = large[len(large) - len(small) :]
-    return all(one in (1, many) for one, many in zip(small, ends, strict=True))
-
-
 def _before_repeats(node: ir.Node, layout: Layout) -> Layout | None:
     """Return the layout of what a node moves or repeats; None if it does neither."""
     if not is_standard(node) or not node.inputs:
