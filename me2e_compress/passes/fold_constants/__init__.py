@@ -24,17 +24,18 @@ from me2e_compress.graph.digest import digest_of_tensor
 from me2e_compress.graph.nodes import Array, graphs_of
 from me2e_compress.graph.rewrite import (
     add_constant,
+    can_replace,
+    fresh_name,
     lift_constants,
     put,
     remove_dead,
+    remove_node,
     replace_value,
     value_names,
 )
 from me2e_compress.graph.summary import value_bytes
-from me2e_compress.operators import FusedCall
 from me2e_compress.passes.base import Context, Pass, PassResult
 from me2e_compress.passes.fold_constants import knowledge
-from me2e_compress.passes.fold_constants.branches import inline_branches
 from me2e_compress.passes.fold_constants.knowledge import (
     Expression,
     Knowledge,
@@ -170,23 +171,6 @@ LIMIT_BYTES = 4096
 """Bytes that a removed node may cost: at 2 us a node, 2 MB for 1 ms."""
 
 
-@dataclasses.dataclass
-class _Tally:
-    lifted: int = 0
-    reshaped: int = 0
-    dead: int = 0
-    folded: int = 0
-    inlined: int = 0
-    stored: int = 0
-    kept: int = 0
-    growth_bytes: int = 0
-    refused: Counter[str] = dataclasses.field(default_factory=Counter)
-
-    @property
-    def changes(self) -> int:
-        return self.lifted + self.reshaped + self.dead + self.folded + self.inlined
-
-
 @dataclasses.dataclass(frozen=True)
 class FoldConstants(Pass):
     """Replace values that depend only on weights and static shapes by constants.
@@ -210,44 +194,44 @@ class FoldConstants(Pass):
 
     def run(self, model: ir.Model, context: Context) -> PassResult:
         """Infer shapes, then fold every graph of the model, outermost first."""
-        # Normalize first: Constant nodes and bounds of Range
-        lifted = lift_constants(model)
-        tally = _Tally(lifted)
+        # Normalize first: Constant nodes and CastLike hide constants
+        tally, refusals = Counter(changes=lift_constants(model)), Counter[str]()
         declared = [value.shape for value in model.graph.outputs]
         opset = graphs.opset_of(model)
         for body in graphs_of(model.graph):
-            tally.reshaped += _write_casts(body, self.name)
-            tally.reshaped += _reshape_bounds(body, opset, self.name)
+            tally["changes"] += _write_casts(body, self.name)
         # Fold until nothing changes; a branch that is not taken is never looked into
         before, fresh = -1, set[ir.Value]()
-        while tally.changes > before:
-            before = tally.changes
+        while tally["changes"] > before:
+            before = tally["changes"]
             if model.functions:  # through which a sweep learns no shapes
                 graphs.infer_shapes(model)
-            tally.dead += remove_dead(model.graph)
-            tally.kept = 0
-            self._fold(model.graph, opset, tally, fresh, trust=True)
-            taken = inline_branches(model.graph, opset, self.name)
+            tally["changes"] += remove_dead(model.graph)
+            tally["kept"] = 0
+            self._fold(model.graph, opset, tally, refusals, fresh, trust=True)
+            taken = _inline_branches(model.graph, opset, self.name)
             fresh = {value for node in taken or () for value in node.inputs if value}
             if taken is not None:
-                tally.inlined += 1
+                tally.update(changes=1, inlined=1)
                 continue
             for body in list(graphs_of(model.graph))[1:]:
-                self._fold(body, opset, tally, set(), trust=False)
+                self._fold(body, opset, tally, refusals, set(), trust=False)
         # Shapes of graph outputs may have become known
         shapes = [value.shape for value in model.graph.outputs]
         refined = sum(a is not b for a, b in zip(declared, shapes, strict=True))
-        return PassResult(model, tally.changes + refined, _notes(tally))
+        return PassResult(model, tally["changes"] + refined, _notes(tally, refusals))
 
     def _fold(
         self,
         body: ir.Graph,
         opset: int,
-        tally: _Tally,
+        tally: Counter[str],
+        refusals: Counter[str],
         fresh: set[ir.Value],
         *,
         trust: bool,
     ) -> None:
+        """Fold one graph; ``fresh`` are values that shape inference has not seen."""
         refused: set[ir.Node] = set()
         while True:
             # Collect constant expressions and choose what to store
@@ -262,7 +246,7 @@ class FoldConstants(Pass):
             # Evaluate the choice; start over if it taught new shapes or failed
             asked = [value for value in values if value not in known.arrays]
             arrays, failed = knowledge.evaluate(asked, known, opset)
-            tally.refused.update(node.op_type for node in failed)
+            refusals.update(node.op_type for node in failed)
             refused.update(failed)
             unshaped = [
                 value
@@ -276,24 +260,30 @@ class FoldConstants(Pass):
             # Write the chosen values into the graph
             growth = int(sizes.growth(gone))
             if not gone:
-                tally.kept += sum(len(one.nodes) for one in known.expressions)
+                tally["kept"] += sum(len(one.nodes) for one in known.expressions)
                 return
             arrays = {**known.arrays, **arrays}
             fresh.update(_commit(body, gone, values, arrays, self.name))
-            tally.folded += sum(len(one.nodes) for one in gone)
-            tally.stored += len(values)
-            tally.growth_bytes += growth
+            folded = sum(len(one.nodes) for one in gone)
+            tally.update(changes=folded, folded=folded, stored=len(values))
+            tally["growth_bytes"] += growth
 
 
-def _notes(tally: _Tally) -> tuple[str, ...]:
-    nodes, weights = plural(tally.folded, "node"), plural(tally.stored, "initializer")
-    left = plural(tally.kept, "node")
-    refused = ", ".join(f"{count} {op}" for op, count in sorted(tally.refused.items()))
+def _notes(tally: Counter[str], refused: Counter[str]) -> tuple[str, ...]:
+    folded, kept = plural(tally["folded"], "node"), plural(tally["kept"], "node")
+    weights, growth = plural(tally["stored"], "initializer"), tally["growth_bytes"]
+    listed = ", ".join(f"{count} {op}" for op, count in sorted(refused.items()))
     notes = (
-        (tally.folded, f"{nodes} became {weights} ({tally.growth_bytes:+,} bytes)"),
-        (tally.inlined, "branches took the places of Ifs whose conditions are known"),
-        (tally.kept, f"{left} left to compute constants: smaller than their values"),
-        (refused, f"onnxruntime cannot evaluate {refused}: left as they are"),
+        (tally["folded"], f"{folded} became {weights} ({growth:+,} bytes)"),
+        (
+            tally["inlined"],
+            "branches took the places of Ifs whose conditions are known",
+        ),
+        (
+            tally["kept"],
+            f"{kept} left to compute constants: smaller than their values",
+        ),
+        (listed, f"onnxruntime cannot evaluate {listed}: left as they are"),
     )
     return tuple(note for condition, note in notes if condition)
 
@@ -310,8 +300,8 @@ def _commit(
     Not every runtime allows an initializer as a graph output: an Identity passes it on.
     """
     # Names of the removed nodes are free again
-    leave = {value.name for one in gone for n in one.nodes for value in n.outputs}
-    names = value_names(graph) - leave
+    names = value_names(graph)
+    names -= {str(v.name) for one in gone for node in one.nodes for v in node.outputs}
     stored: dict[bytes, ir.Value] = {}
     equals = {
         outputs[0]: outputs
@@ -326,33 +316,18 @@ def _commit(
         if key not in stored:
             stored[key] = add_constant(graph, arrays[value], label, names)
         for equal in equals[value]:
-            if equal.is_graph_output():
-                _keep_output(graph, equal, stored[key], name)
-            else:
-                equal.replace_all_uses_with(stored[key])
+            maker, weight = equal.producer(), stored[key]
+            if maker is None or not equal.is_graph_output():
+                equal.replace_all_uses_with(weight)
+                continue
+            # A branch may declare another shape than its result has
+            if graphs.static_shape(equal) is not None:
+                equal.shape = weight.shape
+            put(maker, "Identity", [weight], by=name)
     # Remove the nodes, readers first
     for one in reversed(gone):
         graph.remove([node for node in one.nodes if node.graph is graph], safe=True)
     return list(stored.values())
-
-
-def _keep_output(graph: ir.Graph, value: ir.Value, weight: ir.Value, name: str) -> None:
-    """Write an Identity that passes a weight on as a graph output."""
-    node = value.producer()
-    assert node is not None
-    # A branch may declare another shape than its result has
-    if graphs.static_shape(value) is not None:
-        value.shape = weight.shape
-    if len(node.outputs) == 1:
-        put(node, "Identity", [weight], by=name)
-        return
-    label = f"{node.name}_{node.outputs.index(value)}"
-    identity = ir.node("Identity", [weight], num_outputs=1, name=label)
-    graph.insert_after(node, identity)
-    provenance.inherit(identity, [node], by=name)
-    new = identity.outputs[0]
-    new.name, new.type, new.shape = value.name, value.type, value.shape
-    replace_value(value, new)
 
 
 def _write_casts(graph: ir.Graph, by: str) -> int:
@@ -372,32 +347,76 @@ def _write_casts(graph: ir.Graph, by: str) -> int:
     return count
 
 
-def _reshape_bounds(graph: ir.Graph, opset: int, by: str) -> int:
-    """Reshape vectors that an If passes to a Range to scalars, and count them.
+# Replace an If whose condition is known by the branch that it takes.
 
-    ONNX's own function bodies pass a vector of one element through an If to a Range,
-    which takes scalars. Runtimes accept it while the If hides the shape; folding
-    would reveal it.
 
-    Given:   If -> n of shape [1] -> Range(0, n, 1)
+def _inline_branches(graph: ir.Graph, opset: int, by: str) -> list[ir.Node] | None:
+    """Replace every If of known condition, in bodies too; None where there is none.
 
-    Result:  If -> n -> Reshape to a scalar -> Range(0, n, 1)
+    Returns:
+        The nodes of the branches, whose shapes the Ifs had hidden.
     """
-    count = 0
-    for choice in [node for node in graph if node.op_type == "If"]:
-        branches = [attribute.as_graph() for attribute in choice.attributes.values()]
-        if all(branch_fits(choice, branch, opset) for branch in branches):
-            continue
-        bounds = [
-            (use.node, use.idx, value)
-            for value in choice.outputs
-            for use in value.uses()
-            if use.node.op_type == "Range" and use.node.graph is graph
-        ]
-        for node, index, value in bounds:
-            scalar = FusedCall(node, opset=opset, by=by).reshape(value, ())
-            scalar.type = value.type
-            node.replace_input_with(index, scalar)
-            provenance.inherit(node, [node], by=by)
-        count += len(bounds)
-    return count
+    known = [
+        nodes
+        for body in list(graphs_of(graph))
+        for node in list(body)
+        if node.op_type == "If" and node.graph is body
+        if (nodes := _inline_branch(node, opset, by)) is not None
+    ]
+    return [node for nodes in known for node in nodes] if known else None
+
+
+def _inline_branch(node: ir.Node, opset: int, by: str) -> list[ir.Node] | None:
+    """Replace an If whose condition is known by the nodes of its branch.
+
+    It stays (None) where its branch passes an outer value on as a graph output, or
+    where a reader would refuse the branch's shape, which the If had hidden from it.
+    """
+    graph = node.graph
+    chosen = graphs.array_of(node.inputs[0]) if node.inputs else None
+    if node.op_type != "If" or chosen is None or not isinstance(graph, ir.Graph):
+        return None
+    # Choose the branch and check that it can take the place
+    branch = node.attributes[
+        "then_branch" if chosen.reshape(-1)[0] else "else_branch"
+    ].as_graph()
+    results = list(branch.outputs)
+    if len(set(results)) < len(results):
+        return None
+    for old, new in zip(node.outputs, results, strict=True):
+        if old.is_graph_output() and new.producer() is None:
+            return None
+        outside = new.producer() is not None and new.graph is not branch
+        if outside and not can_replace(old, new):
+            return None
+    if not branch_fits(node, branch, opset):
+        return None
+    # Move the nodes out and rewire their readers
+    nodes = list(branch)
+    _move_nodes(branch, node, graph, by)
+    for old, new in zip(node.outputs, results, strict=True):
+        replace_value(old, new)
+    remove_node(node)
+    return nodes
+
+
+def _move_nodes(branch: ir.Graph, node: ir.Node, graph: ir.Graph, by: str) -> None:
+    names = value_names(graph)
+    weights = list(branch.initializers.values())
+    nodes = list(branch)
+    # Detach everything before it enters the outer graph
+    branch.outputs.clear()
+    branch.initializers.clear()
+    branch.remove(nodes)
+    # Names must be unique in the whole model
+    for value in weights:
+        value.name = fresh_name(value.name or "weight", names)
+        if value.const_value is not None:
+            value.const_value.name = value.name
+        graph.register_initializer(value)
+    for inner in nodes:
+        for value in inner.outputs:
+            if value.name:
+                value.name = fresh_name(value.name, names)
+        provenance.inherit(inner, (inner, node), by=by)
+    graph.insert_before(node, nodes)

@@ -245,9 +245,8 @@ class Sweep:
         return self.known
 
     def _is_constant(self, node: ir.Node) -> bool:
-        if node in self.refused or node.op_type in NEVER or not is_standard(node):
-            return False
-        if draws(node):
+        never = node in self.refused or node.op_type in NEVER
+        if never or not is_standard(node) or draws(node):
             return False
         shown = self.trust_shapes and node.op_type in ("Shape", "Size")
         if shown and static_shape(node.inputs[0]) is not None:
@@ -256,6 +255,8 @@ class Sweep:
             return False
         # Bodies may read outer values; a weight that is an output needs its Identity
         if has_subgraph(node) or not node.inputs:
+            return False
+        if len(node.outputs) > 1 and any(v.is_graph_output() for v in node.outputs):
             return False
         passes_on = node.op_type == "Identity" and node.outputs[0].is_graph_output()
         source = node.inputs[0]
