@@ -34,6 +34,7 @@ from me2e_compress.graph.rewrite import (
     value_names,
 )
 from me2e_compress.graph.summary import value_bytes
+from me2e_compress.operators import FusedCall
 from me2e_compress.passes.base import Context, Pass, PassResult
 from me2e_compress.passes.fold_constants import knowledge
 from me2e_compress.passes.fold_constants.knowledge import (
@@ -194,12 +195,13 @@ class FoldConstants(Pass):
 
     def run(self, model: ir.Model, context: Context) -> PassResult:
         """Infer shapes, then fold every graph of the model, outermost first."""
-        # Normalize first: Constant nodes and CastLike hide constants
+        # Normalize first: Constant nodes, CastLike, and bounds of Range
         tally, refusals = Counter(changes=lift_constants(model)), Counter[str]()
         declared = [value.shape for value in model.graph.outputs]
         opset = graphs.opset_of(model)
         for body in graphs_of(model.graph):
             tally["changes"] += _write_casts(body, self.name)
+            tally["changes"] += _reshape_bounds(body, opset, self.name)
         # Fold until nothing changes; a branch that is not taken is never looked into
         before, fresh = -1, set[ir.Value]()
         while tally["changes"] > before:
@@ -344,6 +346,37 @@ def _write_casts(graph: ir.Graph, by: str) -> int:
         attributes["to"] = int(like.dtype)
         put(node, "Cast", node.inputs[:1], by=by, attributes=attributes)
         count += 1
+    return count
+
+
+def _reshape_bounds(graph: ir.Graph, opset: int, by: str) -> int:
+    """Reshape vectors that an If passes to a Range to scalars, and count them.
+
+    ONNX's own function bodies pass a vector of one element through an If to a Range,
+    which takes scalars. Runtimes accept it while the If hides the shape; folding
+    would reveal it.
+
+    Given:   If -> n of shape [1] -> Range(0, n, 1)
+
+    Result:  If -> n -> Reshape to a scalar -> Range(0, n, 1)
+    """
+    count = 0
+    for choice in [node for node in graph if node.op_type == "If"]:
+        branches = [attribute.as_graph() for attribute in choice.attributes.values()]
+        if all(branch_fits(choice, branch, opset) for branch in branches):
+            continue
+        bounds = [
+            (use.node, use.idx, value)
+            for value in choice.outputs
+            for use in value.uses()
+            if use.node.op_type == "Range" and use.node.graph is graph
+        ]
+        for node, index, value in bounds:
+            scalar = FusedCall(node, opset=opset, by=by).reshape(value, ())
+            scalar.type = value.type
+            node.replace_input_with(index, scalar)
+            provenance.inherit(node, [node], by=by)
+        count += len(bounds)
     return count
 
 
