@@ -15,7 +15,6 @@ MERGES: list[tuple[str, list[str] | None]] = [
     ("b = Unsqueeze(a, zero)  c = Squeeze(b, zero)", []),
     ("b = Cast<to = 11>(a)  c = Cast<to = 1>(b)", []),
     ("b = Cast<to = 10>(a)  c = Cast<to = 1>(b)", None),  # it loses digits
-    ("b = Neg(a)  c = Neg(b)", []),
     ("b = Reshape(a, flat)  k = Relu(b)  c = Reshape(k, s)", None),
 ]
 

@@ -18,9 +18,9 @@ import onnx_ir as ir
 from me2e_compress.graph import array_of, provenance, static_shape
 from me2e_compress.graph.nodes import (
     ELEMENTWISE,
+    NATIVE,
     VIEWS,
     Array,
-    attribute_values,
     draws,
     input_at,
     integers_at,
@@ -66,11 +66,10 @@ def _if_alone(node: ir.Node, opset: int) -> ir.Value | None:
 
 
 def _cast(node: ir.Node, opset: int) -> ir.Value | None:
-    source, like = node.inputs[0], input_at(node, 1)
+    source = node.inputs[0]
     if source is None or source.dtype is None:
         return None
-    wanted = node.attributes.get_int("to", 0) if like is None else like.dtype
-    return source if source.dtype == wanted else None
+    return source if source.dtype == node.attributes.get_int("to", 0) else None
 
 
 def _transpose(node: ir.Node, opset: int) -> ir.Value | None:
@@ -126,28 +125,6 @@ def _pad(node: ir.Node, opset: int) -> ir.Value | None:
     return node.inputs[0] if pads is not None and not any(pads) else None
 
 
-def _clip(node: ir.Node, opset: int) -> ir.Value | None:
-    inner = _repeats(node, opset)
-    if inner is not None or opset < 11:
-        return inner
-    return None if any(node.inputs[1:]) else node.inputs[0]
-
-
-def _repeats(node: ir.Node, opset: int) -> ir.Value | None:
-    """Relu of Relu, Abs of Abs, ...: idempotent operators."""
-    inner = maker(node.inputs[0], node.op_type)
-    if inner is None or tuple(inner.inputs[1:]) != tuple(node.inputs[1:]):
-        return None
-    same = attribute_values(inner) == attribute_values(node)
-    return node.inputs[0] if same else None
-
-
-def _undoes(node: ir.Node, opset: int) -> ir.Value | None:
-    """Not of Not, Neg of Neg: self-inverse operators."""
-    inner = maker(node.inputs[0], node.op_type)
-    return None if inner is None else inner.inputs[0]
-
-
 def _neutral(test: Callable[[Array], bool], *, either: bool) -> Identity:
     """Build the rule of a neutral constant; of ``either`` operand if they commute."""
 
@@ -181,55 +158,26 @@ def _one(array: Array) -> bool:
     return array.dtype.kind in "iuf" and bool(np.all(array == 1))
 
 
-def _where(node: ir.Node, opset: int) -> ir.Value | None:
-    chosen, (_, yes, no) = array_of(node.inputs[0]), node.inputs
-    if yes is no and same_shape(yes, node.outputs[0]):
-        return yes
-    if chosen is None or not chosen.size:
-        return None
-    if chosen.all() and same_shape(yes, node.outputs[0]):
-        return yes
-    return no if not chosen.any() and same_shape(no, node.outputs[0]) else None
-
-
 IDENTITIES: dict[str, Identity] = {
-    **dict.fromkeys(("Abs", "Ceil", "Floor", "Relu", "Round", "Sign"), _repeats),
     **dict.fromkeys(("Concat", "Max", "Mean", "Min", "Split", "Sum"), _if_alone),
     **dict.fromkeys(("Expand", "Flatten", "Reshape", "Squeeze"), _if_same_shape),
     **dict.fromkeys(("Tile", "Unsqueeze"), _if_same_shape),
-    **dict.fromkeys(("Neg", "Not"), _undoes),
-    **dict.fromkeys(("Div", "Pow"), _neutral(_one, either=False)),
     "Add": _neutral(functools.partial(_zero, negative=True), either=True),
-    "And": _neutral(lambda array: bool(array.all()), either=True),
-    **dict.fromkeys(("Cast", "CastLike"), _cast),
-    "Clip": _clip,
+    "Cast": _cast,
+    "Div": _neutral(_one, either=False),
     "Dropout": lambda node, opset: None if draws(node) else node.inputs[0],
     "Identity": lambda node, opset: node.inputs[0],
     "Mul": _neutral(_one, either=True),
-    "Or": _neutral(lambda array: not array.any(), either=True),
     "Pad": _pad,
     "Slice": _slice,
     "Sub": _neutral(functools.partial(_zero, negative=False), either=False),
     "Transpose": _transpose,
-    "Where": _where,
 }
 
 
 _RESHAPING = VIEWS - {"Identity"}
 
 BROADCASTING = frozenset({*ELEMENTWISE, "Where"})
-
-WIDENS: dict[ir.DataType, str] = {
-    ir.DataType.BOOL: "UINT8 INT8 INT16 INT32 INT64 FLOAT16 FLOAT DOUBLE",
-    ir.DataType.UINT8: "UINT16 UINT32 UINT64 INT16 INT32 INT64 FLOAT16 FLOAT DOUBLE",
-    ir.DataType.INT8: "INT16 INT32 INT64 FLOAT16 FLOAT DOUBLE",
-    ir.DataType.INT16: "INT32 INT64 FLOAT DOUBLE",
-    ir.DataType.INT32: "INT64 DOUBLE",
-    ir.DataType.UINT32: "INT64 UINT64 DOUBLE",
-    ir.DataType.FLOAT16: "FLOAT DOUBLE",
-    ir.DataType.FLOAT: "DOUBLE",
-}
-"""The types that hold every value of a type: a Cast there loses nothing."""
 
 
 @dataclasses.dataclass
@@ -318,8 +266,9 @@ def _casts(node: ir.Node, site: MergeSite) -> ir.Node | None:
     source, middle = inner.inputs[0].dtype, inner.outputs[0].dtype
     if source is None or middle is None:
         return None
-    # The first Cast must lose nothing
-    if middle.name not in WIDENS.get(source, "").split():
+    # The first Cast must lose nothing; of 64 bits, some do that numpy calls safe
+    known = {source, middle} <= NATIVE and source.itemsize < 8
+    if not known or not np.can_cast(source.numpy(), middle.numpy(), "safe"):
         return None
     if sole_reader(inner.outputs[0]) is None and source != node.outputs[0].dtype:
         return None
