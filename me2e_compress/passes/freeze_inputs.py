@@ -14,7 +14,7 @@ from me2e_compress.graph.recurrence import recurrent_inputs
 from me2e_compress.graph.shapes import static_shape
 from me2e_compress.passes.base import Context, Pass, PassResult
 from me2e_compress.quantization.geometry import MATRICES, MOST_MATRICES
-from me2e_compress.runtime.frames import Array, Frames
+from me2e_compress.runtime.frames import Array
 
 FLAGS = 16
 """Most numbers of an input that a branch hangs on: flags, a sample rate."""
@@ -57,12 +57,25 @@ class FreezeInputs(Pass):
         if not names:
             return PassResult(model, 0)
         ports = {str(value.name): value for value in model.graph.inputs}
-        there = ", ".join(ports) or "none"
         for name in names:
             if name not in ports or ports[name].is_graph_output():
                 line = f"no input is called {name!r}, or it is an output too"
+                there = ", ".join(ports) or "none"
                 raise PreconditionError(f"{self.name}: {line}; there is {there}")
-        for name, array in self._values(names, context.frames).items():
+        # All frames must hold the value of the first
+        arrays: dict[str, Array] = {}
+        for frame in context.frames or ():
+            where = f"{self.name}: frame {frame.index}"
+            for name in names:
+                if name not in frame.arrays:
+                    raise FramesError(f"{where}: {name} is missing")
+                array = frame.arrays[name]
+                if not np.array_equal(arrays.setdefault(name, array), array):
+                    raise FramesError(f"{where} has another {name} than the first")
+        if not arrays:
+            raise FramesError(f"{self.name} needs recorded frames (--frames)")
+        # The inputs become initializers of the same names
+        for name, array in arrays.items():
             value = ports[name]
             dataset.check_array(array, value, f"{self.name}: {name}")
             model.graph.inputs.remove(value)
@@ -74,33 +87,12 @@ class FreezeInputs(Pass):
         listed = ", ".join(names)
         return PassResult(model, len(names), (f"constant from now on: {listed}",))
 
-    def _values(self, names: list[str], frames: Frames | None) -> dict[str, Array]:
-        values: dict[str, Array] = {}
-        for frame in frames or ():
-            where = f"{self.name}: frame {frame.index}"
-            for name in names:
-                if name not in frame.arrays:
-                    raise FramesError(f"{where}: {name} is missing")
-                array = frame.arrays[name]
-                if not np.array_equal(values.setdefault(name, array), array):
-                    raise FramesError(f"{where} has another {name} than the first")
-        if not values:
-            raise FramesError(f"{self.name} needs recorded frames (--frames)")
-        return values
-
 
 def advice(model: ir.Model) -> str:
-    """Return a sentence that names inputs that may become constants, or ""."""
-    names = ",".join(deciding_inputs(model))
-    return names and (
-        f"branches or projections hang on {names}: where all frames have one value,"
-        " compress first with --passes"
-        f" import-normalize,freeze-inputs{{inputs=[{names}]}},fold-constants"
-    )
+    """Return a sentence that names inputs that may become constants, or "".
 
-
-def deciding_inputs(model: ir.Model) -> tuple[str, ...]:
-    """Name the inputs that alone decide a branch, or are matrices of a projection."""
+    They alone decide a branch, or are the matrices of a projection.
+    """
     names, states = dict[str, None](), recurrent_inputs(model)
     for node in nodes_of(model):
         if node.op_type not in ("If", "MatMul"):
@@ -110,10 +102,16 @@ def deciding_inputs(model: ir.Model) -> tuple[str, ...]:
         if node.op_type == "MatMul":
             roots = [v for v in roots if (static_shape(v) or ())[-2:] in MATRICES]
             largest = 16 * MOST_MATRICES
+        # Larger inputs are sensors, and states are no constants
         sizes = [static_shape(root) for root in roots]
         if all(size is not None and math.prod(size) <= largest for size in sizes):
             names |= dict.fromkeys(str(root.name) for root in roots)
-    return tuple(name for name in names if name not in states)
+    listed = ",".join(name for name in names if name not in states)
+    return listed and (
+        f"branches or projections hang on {listed}: where all frames have one value,"
+        " compress first with --passes"
+        f" import-normalize,freeze-inputs{{inputs=[{listed}]}},fold-constants"
+    )
 
 
 def _roots(model: ir.Model, value: ir.Value | None) -> list[ir.Value]:

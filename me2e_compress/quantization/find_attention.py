@@ -2,7 +2,7 @@
 
 import dataclasses
 import math
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from typing import TypeAlias
 
 import onnx_ir as ir
@@ -11,7 +11,6 @@ from me2e_compress.graph import (
     WEIGHTED,
     input_at,
     is_standard,
-    producer_of,
     static_shape,
 )
 from me2e_compress.graph.shapes import open_shape
@@ -114,9 +113,9 @@ def find_attention(
     One sweep over the graph remembers, for every value, which products lie behind it,
     another which lie ahead; scaling, masks, casts and changes of layout are looked
     through. A softmax with a product behind it is an attention: that product is queries
-    by keys, the one ahead weights by values. Products may be MatMul, Gemm or Einsum,
-    the softmax may be decomposed into ``Div(Exp(x), ReduceSum(Exp(x)))``. A mask's own
-    products are told from the scores by their size. The search is linear in the graph.
+    by keys, the one ahead weights by values. Products may be MatMul, Gemm or Einsum. A
+    mask's own products are told from the scores by their size. The search is linear in
+    the graph.
 
     Operators that are attention as a whole (:func:`is_fused`) are mapped too. Sampling
     weights of deformable attention come from a linear layer, not from such a product,
@@ -146,7 +145,11 @@ def find_attention(
             shapes = [open_shape(value) or () for value in node.inputs[:2]]
             tokens = [each[-2] if len(each) > 1 else None for each in shapes]
             attentions[node] = Attention(tokens[0], tokens[-1])
-    for weights, scores in _softmaxes(model.graph):
+    softmaxes = [node for node in model.graph if node.op_type == "Softmax"]
+    for node in softmaxes:
+        weights, scores = node.outputs[0], node.inputs[0]
+        if scores is None:
+            continue
         # a mask may have products of its own, of another size
         queries_by_keys = [
             node for _, node in scored.get(scores, ()) if _fits(node.outputs[0], scores)
@@ -191,19 +194,3 @@ def _fits(product: ir.Value, scores: ir.Value) -> bool:
 def is_fused(node: ir.Node) -> bool:
     """Return whether a node is attention as a whole, a library's plugin or not."""
     return node.op_type in _FUSED or node.op_type in op_types("multi-head-attention")
-
-
-def _softmaxes(nodes: Iterable[ir.Node]) -> Iterator[tuple[ir.Value, ir.Value]]:
-    """Yield (weights, scores) of every softmax, a decomposed one too."""
-    for node in nodes:
-        if node.op_type == "Softmax" and node.inputs[0] is not None:
-            yield node.outputs[0], node.inputs[0]
-        elif node.op_type == "Div":
-            above, below = node.inputs[:2]
-            power, total = producer_of(above), producer_of(below)
-            if power is None or total is None or total.inputs[0] is not above:
-                continue
-            scores = power.inputs[0]
-            kinds = (power.op_type, total.op_type)
-            if kinds == ("Exp", "ReduceSum") and scores is not None:
-                yield node.outputs[0], scores

@@ -202,28 +202,10 @@ def depth(product: ir.Node) -> int | None:
     """Return how many numbers a product sums over for each of its results."""
     if product.op_type in ("Gemm", "MatMul"):
         return extent(product, weight=False).depth
-    if product.op_type == "Einsum":
-        return _contracted(product)
     shape = open_shape(product.inputs[1])
-    return None if shape is None else shape[1 if product.op_type == "Conv" else 0]
-
-
-def _contracted(einsum: ir.Node) -> int | None:
-    """Return the product of the sizes of the labels that an Einsum sums over."""
-    equation = einsum.attributes.get_string("equation", "").replace(" ", "")
-    terms, _, result = equation.partition("->")
-    sizes: dict[str, int | None] = {}
-    # the size of every label, on either side of an ellipsis
-    for term, value in zip(terms.split(","), einsum.inputs, strict=False):
-        shape = open_shape(value) or ()
-        front, _, back = term.partition("...")
-        sizes.update(zip(front, shape, strict=False))
-        if back:
-            sizes.update(zip(reversed(back), reversed(shape), strict=False))
-    # labels that the result lacks
-    summed = [size for label, size in sizes.items() if label not in result]
-    known = [size for size in summed if size is not None]
-    return math.prod(known) if known and len(known) == len(summed) else None
+    if shape is None or product.op_type == "Einsum":  # imported as a MatMul, if it can
+        return None
+    return shape[1 if product.op_type == "Conv" else 0]
 
 
 # Find the layers that produce positions.

@@ -58,10 +58,6 @@ PROJECTIONS = {
         "float[6,4,4] lidar2img, float[4,200] points",
         "i = trt.InverseTRT(lidar2img) p = MatMul(i, points)",
     ),
-    "after an Einsum": (
-        "float[6,4,4] lidar2img, float[4,4] ego, float[4,200] points",
-        'e = Einsum<equation = "nij,jk->nik">(lidar2img, ego) p = MatMul(e, points)',
-    ),
 }
 
 
