@@ -25,8 +25,8 @@ class FixShapes(Pass):
              with dims={batch=1}
 
     Attributes:
-        dims: size by the name of the dimension, or by input and axis, as it must be
-            where it has no name (``?``): ``{batch=1, "image:2"=224}``.
+        dims: size by the name of the dimension, or by input and axis where it has no
+            name (``?``): ``{batch=1, "image:2"=224}``.
 
     Raises:
         RecipeError: a size is below 1, or none is given.
@@ -52,8 +52,7 @@ class FixShapes(Pass):
         with contextlib.suppress(json.JSONDecodeError):
             kept = json.loads(model.metadata_props.get(FIXED, "{}"))
             known = kept if isinstance(kept, dict) else {}
-        dims = _by_symbol(model, self.dims)
-        wanted = {k: size for k, size in dims.items() if known.get(k) != size}
+        wanted = {k: size for k, size in self.dims.items() if known.get(k) != size}
         if not wanted:
             return PassResult(model, 0)
         there = open_dimensions(model)
@@ -64,6 +63,7 @@ class FixShapes(Pass):
             )
         # Blame the sizes only if the graph was sound before
         sound = _refusal(model) is None
+        # Write the sizes in values of nodes, inputs of bodies, and inputs
         made = (value for node in model.graph.all_nodes() for value in node.outputs)
         stated = {value: value.shape for value in made}
         for value, shape in stated.items():
@@ -105,29 +105,6 @@ def open_dimensions(model: ir.Model) -> dict[str, int]:
                 for name in _symbols(dim) or (f"{value.name}:{axis}",):
                     names[name] = min(axis, names.get(name, axis))
     return names
-
-
-def _by_symbol(model: ir.Model, sizes: Mapping[str, int]) -> dict[str, int]:
-    """Return sizes by symbol; a place stands for the symbol that is written there.
-
-    Raises:
-        PreconditionError: two places of one symbol have two sizes.
-    """
-    symbols = {
-        f"{value.name}:{axis}": str(dim.value)
-        for value in model.graph.inputs
-        for axis, dim in enumerate(value.shape or ())
-        if isinstance(dim, ir.SymbolicDim) and _symbols(dim) == (dim.value,)
-    }
-    by_symbol = dict[str, int]()
-    for place, size in sizes.items():
-        name = symbols.get(place, place)
-        if by_symbol.setdefault(name, size) != size:
-            raise PreconditionError(
-                f"fix-shapes: {place}={size}: it is dimension {name!r}, which is"
-                f" {by_symbol[name]} already"
-            )
-    return by_symbol
 
 
 def sized_inputs(model: ir.Model, sizes: Mapping[str, int]) -> ir.Model:

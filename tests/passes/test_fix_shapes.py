@@ -62,13 +62,6 @@ def test_a_question_mark_is_no_name_and_each_place_has_its_size() -> None:
         fixed({"?": 3}, text)
 
 
-def test_a_place_stands_for_the_name_that_is_written_there() -> None:
-    model = fixed({"image:0": 2, "image:3": 4}).model
-    assert str(model.graph.outputs[0].shape) == "[2,48]"
-    with pytest.raises(PreconditionError, match="'side', which is 4 already"):
-        fixed({"image:2": 4, "image:3": 5})
-
-
 def test_sizes_belong_to_inputs_and_a_wrong_output_follows() -> None:
     """Runtimes take an output of another size, or rank, with a warning."""
     for stated in ("n", "n,2"):
