@@ -20,7 +20,6 @@ from me2e_compress.graph.nodes import (
     Array,
     Numbers,
     holds_numbers,
-    maker,
     numbers_of,
     overflow,
     sole_reader,
@@ -58,18 +57,7 @@ class FuseBasic(Pass):
     def run(self, model: ir.Model, context: Context) -> PassResult:
         """Try every fusion on every node until none applies."""
         fused = fuse(model, FUSIONS, by=self.name)
-        residual = sum(
-            node.op_type == "Add"
-            and any(maker(value, "Conv") for value in node.inputs)
-            and all(array_of(value) is None for value in node.inputs)
-            for node in model.graph
-        )
-        left = (
-            f"left {residual} residual Conv + Add as they are: TensorRT and onnxruntime"
-            " fuse them with the activation behind",
-        )
-        notes = (*fused.notes(), *(left if residual else ()))
-        return PassResult(model, fused.changes, notes)
+        return PassResult(model, fused.changes, fused.notes())
 
 
 # Fold scales and shifts around a layer into its weights: with y = k x + d per output
@@ -84,8 +72,7 @@ STATISTICS = tuple(constant() for _ in range(4))
 
 AFFINE = either(
     op("BatchNormalization", LAYER, *STATISTICS),
-    op(("Add", "Sub", "Mul", "Div"), LAYER, NUMBERS),
-    op("Sub", NUMBERS, LAYER),
+    op(("Add", "Mul"), LAYER, NUMBERS),
 )
 
 
@@ -111,14 +98,8 @@ def _affine(match: Match) -> tuple[Numbers, Numbers] | None:
     numbers, one, zero = match.numbers(NUMBERS).reshape(-1), np.ones(1), np.zeros(1)
     if node.op_type == "Add":
         return one, numbers
-    if node.op_type == "Sub":
-        first = match[LAYER] is node.inputs[0]
-        return (one, -numbers) if first else (-one, numbers)
-    if not numbers.all():
-        return None
-    factor = numbers if node.op_type == "Mul" else 1 / numbers
-    # zero times a sum would lose the sign of its zeros
-    return (factor, zero) if factor.all() else None
+    # Zero times a sum would lose the sign of its zeros
+    return (numbers, zero) if numbers.all() else None
 
 
 def _is_per_channel(match: Match) -> bool:

@@ -17,7 +17,6 @@ from me2e_compress.passes.base import PassResult
 from me2e_compress.passes.fuse_operators import FuseOperators, numeric_check
 from tests.passes.decomposed import FUSED, Sizes, decomposed, inferred, plain
 from tests.passes.small import NO_MODULES, apply, compute, fed, ops, read
-from tests.support.nets import stored
 from tests.support.profiles import scaled
 
 SEED = 3
@@ -185,18 +184,6 @@ g (float[6,8,4,5] features, float[1,2,9,6,3,2] grid, float[1,2,1,9,18] weights)
 
 def test_images_side_by_side_are_one_level() -> None:
     fused(read(APART))
-
-
-def test_operands_of_constants_are_computed() -> None:
-    model = decomposed(Sizes(n=1))
-    random = np.random.default_rng(SEED)
-    known = {
-        str(port.name): random.uniform(size=static_shape(port)).astype(np.float32)
-        for port in model.graph.inputs
-        if port.name in ("locations", "weights")
-    }
-    fused(stored(model, known))
-    assert ops(model) == [FUSED, "Reshape"]
 
 
 LEFT: dict[str, tuple[Any, str]] = {

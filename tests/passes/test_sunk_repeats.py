@@ -157,6 +157,3 @@ def test_what_differs_by_camera_is_computed_for_each(case: str) -> None:
 
     result = {kind: rows_of(model, kind) for kind in rows}
     assert result == {kind: {size} for kind, size in rows.items()}
-    if case == "few rows that others read, too":
-        note = "left 1 node behind what repeats: others read it too, or it is small"
-        assert apply(HoistLinear(), read(text, **GIVEN)).notes == (note,)

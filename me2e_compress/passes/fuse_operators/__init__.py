@@ -8,11 +8,10 @@ from collections.abc import Callable, Iterator, Sequence
 import onnx_ir as ir
 
 from me2e_compress.base.errors import GraphError, PreconditionError
-from me2e_compress.graph import array_of, graphs_of, is_standard, opset_of
+from me2e_compress.graph import graphs_of, is_standard, opset_of
 from me2e_compress.graph.nodes import is_read, nodes_in
 from me2e_compress.graph.provenance import inherit
 from me2e_compress.graph.rewrite import (
-    add_constant,
     remove_dead,
     replace_value,
     value_names,
@@ -25,8 +24,6 @@ from me2e_compress.passes.fuse_operators.numeric_check import (
     Proofs,
     draw_views,
     nodes_between,
-    piece_of,
-    run_piece,
     take_back,
 )
 
@@ -133,9 +130,8 @@ class _Run:
         inputs = [view.value for view in plan.inputs]
         write = functools.partial(fused_form.write, plan)
         draw = functools.partial(draw_views, plan.inputs)
-        new, error = self._replace(body, plan.result.value, inputs, write, draw)
+        error = self._replace(body, plan.result.value, inputs, write, draw)
         self.worst = max(self.worst, error)
-        self._fold(body, new, plan)
         self.fused += 1
         self.samplers += len(match.levels)
 
@@ -167,10 +163,11 @@ class _Run:
         write: Callable[[FusedCall], ir.Value],
         draw: Draw,
         least: int = 1,
-    ) -> tuple[ir.Value, float]:
-        """Write a replacement of a value, and keep it if both are proven equal.
+    ) -> float:
+        """Write a replacement of a value and keep it if it is proven; return its error.
 
-        Returns the new value, and its error.
+        Raises:
+            PreconditionError: both differ, or cannot be compared.
         """
         root, known = old.producer(), set(body.initializers)
         if root is None:
@@ -197,22 +194,4 @@ class _Run:
         for node in reversed(matched):
             if node.graph is not None and not any(map(is_read, node.outputs)):
                 node.graph.remove(node, safe=True)
-        return new, error
-
-    def _fold(self, body: ir.Graph, new: ir.Value, plan: fused_form.Plan) -> None:
-        """Store operands that are computed of constants alone."""
-        between = nodes_between(new, [view.value for view in plan.inputs])
-        node = next(made for made in between if made.domain == OWN_DOMAIN)
-        mask = () if plan.mask is None else (plan.mask,)
-        for index, read in (
-            (0, plan.value.views),
-            (3, plan.locations.views),
-            (4, (*plan.weights.views, *mask)),
-        ):
-            value = node.inputs[index]
-            constant = all(array_of(view.value) is not None for view in read)
-            if value is None or value.producer() is None or not constant:
-                continue
-            array = run_piece(piece_of(value, (), self.opset), ())
-            name = f"{value.name}_constant"
-            node.replace_input_with(index, add_constant(body, array, name, self.names))
+        return error

@@ -55,19 +55,17 @@ class HoistLinear(Pass):
             return PassResult(model, 0)
         unread = remove_dead(model.graph)  # it would hold on to what it reads
         names, macs_before = value_names(model.graph), _macs(model)
-        bodies, products, others, left = list(graphs_of(model.graph)), 0, 0, 0
+        bodies, products, others = list(graphs_of(model.graph)), 0, 0
         for _ in range(ROUNDS):
-            moved, left = products + others, 0  # those of the last round are left
+            moved = products + others
             for node in [node for body in bodies for node in body]:
                 if node.graph is None:
                     continue
                 layer, by = layer_at(node), self.name
-                before = before_repeat(FusedCall(node, opset=opset, by=by, names=names))
-                if before:
+                if before_repeat(FusedCall(node, opset=opset, by=by, names=names)):
                     products += layer is not None
                     others += layer is None
                     continue
-                left += before is False
                 if layer is not None:
                     last = layer.nodes[-1]
                     call = FusedCall(last, opset=opset, by=by, names=names)
@@ -79,11 +77,6 @@ class HoistLinear(Pass):
         notes = (
             (products, f"moved {plural(products, 'product')}: {less}"),
             (others, f"moved {plural(others, 'other node')} before repeated rows"),
-            (
-                left,
-                f"left {plural(left, 'node')} behind what repeats: others read it too,"
-                " or it is small",
-            ),
             (unread, f"removed what nothing reads: {unread}"),
         )
         changes = products + others + unread

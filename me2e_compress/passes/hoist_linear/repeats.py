@@ -219,15 +219,10 @@ class _Plan:
     large: tuple[int, ...]
 
 
-def before_repeat(call: FusedCall) -> bool | None:
-    """Compute a node before the repetition of what it reads.
-
-    Returns False where that does not pay, and None where nothing it reads repeats.
-    """
+def before_repeat(call: FusedCall) -> bool:
+    """Compute a node before the repetition of what it reads, where that pays."""
     plan = _plan(call.node, call.opset)
-    if plan is None:
-        return None
-    if not _pays(call.node, plan):
+    if plan is None or not _pays(call.node, plan):
         return False
     _rewrite(call, plan)
     return True
