@@ -39,6 +39,7 @@ ONE = {"c": np.float32(1)}
         ("Div(a, c)", ONE),
         ("Add(a, c)", {"c": np.float32(-0.0)}),
         ("Sub(a, c)", {"c": np.float32(0.0)}),
+        ("Where(c, a, a)", {"c": np.eye(2, 3) > 0}),
     ],
 )
 def test_identities_go(call: str, weights: dict[str, Any]) -> None:

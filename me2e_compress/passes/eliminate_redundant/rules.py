@@ -158,6 +158,12 @@ def _one(array: Array) -> bool:
     return array.dtype.kind in "iuf" and bool(np.all(array == 1))
 
 
+def _where(node: ir.Node, opset: int) -> ir.Value | None:
+    """A choice between a value and itself."""
+    yes, no = node.inputs[1:]
+    return yes if yes is no and same_shape(yes, node.outputs[0]) else None
+
+
 IDENTITIES: dict[str, Identity] = {
     **dict.fromkeys(("Concat", "Max", "Mean", "Min", "Split", "Sum"), _if_alone),
     **dict.fromkeys(("Expand", "Flatten", "Reshape", "Squeeze"), _if_same_shape),
@@ -172,6 +178,7 @@ IDENTITIES: dict[str, Identity] = {
     "Slice": _slice,
     "Sub": _neutral(functools.partial(_zero, negative=False), either=False),
     "Transpose": _transpose,
+    "Where": _where,
 }
 
 
