@@ -69,10 +69,11 @@ def evaluate(
     needed = [one for one in known.expressions if one in wanted]
     if not needed:
         return {}, []
+    # All of them in one session, or else each on its own
     try:
         return run(needed, list(values), known.arrays, opset), []
     except REFUSALS:
-        pass  # which of them, says each on its own
+        pass
     done: dict[ir.Value, Any] = dict(known.arrays)
     refused: list[ir.Node] = []
     for one in needed:
@@ -240,7 +241,8 @@ class Sweep:
             if self._is_constant(node):
                 self._infer(node)
                 self._add(node)
-            elif self._touched(node):
+            # What it reads has become known only now
+            elif any(v in self.learnt or v in self.known.maker for v in node.inputs):
                 self._infer(node)
         return self.known
 
@@ -265,6 +267,7 @@ class Sweep:
         return all(value is None or self._known(value) for value in node.inputs)
 
     def _known(self, value: ir.Value) -> bool:
+        """Return whether a value is constant, and keep the array of a small one."""
         if value in self.known.maker:
             return True
         if value.is_graph_input() or not value.is_initializer():
@@ -277,27 +280,19 @@ class Sweep:
                 self.known.arrays[value] = array
         return True
 
-    def _touched(self, node: ir.Node) -> bool:
-        if all(static_shape(value) is not None for value in node.outputs):
-            return False
-        return any(
-            value in self.learnt or value in self.known.maker
-            for value in node.inputs
-            if value is not None
-        )
-
     def _infer(self, node: ir.Node) -> None:
+        """Infer the shapes of a node that nobody could before."""
         outputs = node.outputs
         if all(static_shape(v) is not None and v.type is not None for v in outputs):
             return
-        for value in node.inputs:
-            if value is not None:
-                self._known(value)
+        for value in filter(None, node.inputs):
+            self._known(value)
         arrays, trust = self.known.arrays, self.trust_shapes
         if learn_shapes(node, arrays, self.opset, answers=trust):
             self.learnt.update(outputs)
 
     def _add(self, node: ir.Node) -> None:
+        """Enter a constant node, unless its values are too large or of odd types."""
         named = [value for value in node.outputs if value.name]
         if any(not _is_native(v) or (value_bytes(v) or 0) > LARGEST for v in named):
             return
@@ -322,14 +317,19 @@ class Sweep:
                     value.shape = ir.Shape(small.shape)
 
     def _evaluate(self, one: Expression) -> Array | None:
+        """Return the array of an expression's only output, if it is small."""
         node, arrays = one.nodes[0], self.known.arrays
         output = node.outputs[0]
         if len(node.outputs) != 1 or output in arrays:
             return arrays.get(output)
         # Shapes need no data
-        if node.op_type in ("Shape", "Size"):
-            shape = static_shape(node.inputs[0])
-            return None if shape is None else _shape(node, shape)
+        shape = static_shape(node.inputs[0])
+        if node.op_type == "Size" and shape is not None:
+            return np.array(math.prod(shape), dtype=np.int64)
+        if node.op_type == "Shape" and shape is not None:
+            start = node.attributes.get_int("start", 0)
+            end = node.attributes.get_int("end", len(shape))
+            return np.array(shape[start:end], dtype=np.int64)
         # Other nodes are computed if they are small and fully known
         expected = static_shape(output)
         if expected is None or math.prod(expected) > SMALL:
@@ -343,14 +343,6 @@ class Sweep:
         # It may be a sequence, or have another shape than the file claims
         is_array = isinstance(array, np.ndarray) and array.shape == expected
         return array if is_array else None
-
-
-def _shape(node: ir.Node, shape: tuple[int, ...]) -> Array:
-    if node.op_type == "Size":
-        return np.array(math.prod(shape), dtype=np.int64)
-    start = node.attributes.get_int("start", 0)
-    end = node.attributes.get_int("end", len(shape))
-    return np.array(shape[start:end], dtype=np.int64)
 
 
 def _is_native(value: ir.Value) -> bool:
