@@ -44,8 +44,7 @@ from me2e_compress.passes import Context, Pass
 from me2e_compress.passes.fix_shapes import with_sizes
 from me2e_compress.passes.freeze_inputs import advice
 from me2e_compress.passes.import_normalize import with_own_domains
-from me2e_compress.passes.quantize_int8 import QuantizeInt8
-from me2e_compress.passes.quantizer import Quantizer, quantizes_float
+from me2e_compress.passes.quantize_int8 import QuantizeInt8, Quantizer, quantizes_float
 from me2e_compress.quantization.decision import plan_of, save_plan
 from me2e_compress.runtime.frames import Frames
 from me2e_compress.runtime.latency_trace import cpu_seconds

@@ -11,8 +11,7 @@ from me2e_compress.base.display import format_mb, plural
 from me2e_compress.graph import WEIGHTED
 from me2e_compress.manager import Report
 from me2e_compress.passes import Context
-from me2e_compress.passes.quantize_int8 import QuantizeInt8
-from me2e_compress.passes.quantizer import quantizes_float
+from me2e_compress.passes.quantize_int8 import QuantizeInt8, quantizes_float
 from me2e_compress.quantization.decision import FLOAT, QuantPlan, plan_of
 from me2e_compress.runtime.providers import CPU
 

@@ -21,8 +21,7 @@ from me2e_compress.graph.recurrence import recurrent_inputs
 from me2e_compress.manager import Report
 from me2e_compress.passes import Pass
 from me2e_compress.passes.lower_int8 import LowerInt8
-from me2e_compress.passes.quantize_int8 import QuantizeInt8
-from me2e_compress.passes.quantizer import Quantizer
+from me2e_compress.passes.quantize_int8 import QuantizeInt8, Quantizer
 from me2e_compress.quantization.decision import plan_of
 from me2e_compress.runtime.frames import Frames
 from me2e_compress.runtime.latency_trace import cpu_seconds

@@ -26,8 +26,7 @@ from me2e_compress.graph.modules.module_map import ModuleMap
 from me2e_compress.manager import PassManager, recipe
 from me2e_compress.passes import Context, Pass
 from me2e_compress.passes.freeze_inputs import advice
-from me2e_compress.passes.quantize_int8 import QuantizeInt8, refuse_quantized
-from me2e_compress.passes.quantizer import Quantizer
+from me2e_compress.passes.quantize_int8 import QuantizeInt8, Quantizer, refuse_quantized
 from me2e_compress.quantization.decision import (
     METADATA,
     QuantPlan,

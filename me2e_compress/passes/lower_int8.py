@@ -10,7 +10,7 @@ from me2e_compress.base.display import plural
 from me2e_compress.calibration.observers import DEFAULT_METHOD
 from me2e_compress.graph import provenance
 from me2e_compress.passes.base import Context, PassResult
-from me2e_compress.passes.quantizer import Quantizer
+from me2e_compress.passes.quantize_int8 import Quantizer
 from me2e_compress.quantization.decision import plan_of, stamp_plan
 from me2e_compress.targets.onnxruntime.convert import convert, int8_layers, unranged
 
