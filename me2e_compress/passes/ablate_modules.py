@@ -27,11 +27,11 @@ from me2e_compress.passes.parts import (
     zeros_like,
 )
 
+# The module that makes the plan, in every preset.
 PLANNER = "planner"
-"""The module that makes the plan, in every preset."""
 
+# Operators that only change the layout or type of another node's result.
 _LAYOUT = LAYOUT_OPERATORS | {"Cast"}
-"""Operators that only change the layout or type of another node's result."""
 
 
 @dataclasses.dataclass(frozen=True)

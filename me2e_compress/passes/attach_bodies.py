@@ -15,11 +15,11 @@ from me2e_compress.graph.validity import ORIGINAL_DOMAIN
 from me2e_compress.operators.replace import FusedNode, write_constant_nodes
 from me2e_compress.passes.base import Context, Pass, PassResult
 
+# Largest constant operand, in elements, that a body may hold (feature-map sizes).
 LARGEST_TABLE = 256
-"""Largest constant operand, in elements, that a body may hold (feature-map sizes)."""
 
+# The first IR version whose functions may have overloads (onnx/onnx.proto).
 _OVERLOADS_SINCE_IR = 10
-"""The first IR version whose functions may have overloads (onnx/onnx.proto)."""
 
 
 @dataclasses.dataclass(frozen=True)

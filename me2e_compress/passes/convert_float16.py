@@ -45,8 +45,8 @@ from me2e_compress.targets.quantized import (
 )
 from me2e_compress.targets.weights import requantized, scales_in
 
+# The first opset whose QuantizeLinear takes float16 and float16 scales.
 SCALES_SINCE = 19
-"""The first opset whose QuantizeLinear takes float16 and float16 scales."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -127,17 +127,18 @@ def _matches(model: ir.Model, pattern: str) -> list[ir.Node]:
 # Choose the nodes that stay in float32.
 
 
+# 65504.
 LARGEST = float(np.finfo(np.float16).max)
-"""65504."""
+# Factor by which other frames may exceed the measured range.
 HEADROOM = 2.0
-"""Factor by which other frames may exceed the measured range."""
+# A half has 11 bits: a sum of more than 2,048 equal numbers stops growing. A kernel
+# that adds up a softmax in half is right to 1e-3 up to half of that.
 LONGEST_SUM = 1024
-"""A half has 11 bits: a sum of more than 2,048 equal numbers stops growing. A kernel
-that adds up a softmax in half is right to 1e-3 up to half of that."""
+# Relative error of a constant that still is the same constant.
 _RESOLUTION = 2.0**-10
-"""Relative error of a constant that still is the same constant."""
 
 _POSITIONS = "positions: a half is right to 1/2048"
+# Operators that stay in float32 whatever they read, by the reason.
 _OPERATORS = {
     # Sums of many elements, squares and exponentials leave float16 on their way
     "sums, squares and exponentials": {
@@ -153,12 +154,11 @@ _OPERATORS = {
     # These take coordinates beside their data
     _POSITIONS: {"DeformConv", "Det", "GridSample", "Range", "RoiAlign"},
 }  # fmt: skip
-"""Operators that stay in float32 whatever they read, by the reason."""
+# What only moves elements: it is as exact in either type.
 _MOVES = LAYOUT_OPERATORS | {
     "Concat", "Expand", "Gather", "GatherElements", "GatherND", "Pad",
     "ScatterElements", "ScatterND", "Slice", "Split", "Tile",
 }  # fmt: skip
-"""What only moves elements: it is as exact in either type."""
 
 
 def _float32_nodes(

@@ -53,16 +53,16 @@ class ConvertFloat32(Pass):
 
 
 _ONNX = {FLOAT: "tensor(float)", HALF: "tensor(float16)"}
+# How many inputs hold data, where later ones are scales and regions.
 _FIRST_ONLY = {"Resize": 1}
-"""How many inputs hold data, where later ones are scales and regions."""
+# Operators whose meaning depends on the type, or whose schema omits one: a random
+# tensor has the type of its input where no attribute names another.
 _BY_TYPE = frozenset(
     {
         "Bernoulli", "BitCast", "Cast", "CastLike", "EyeLike", "Optional",
         "OptionalGetElement", "RandomNormalLike", "RandomUniformLike",
     }
 )  # fmt: skip
-"""Operators whose meaning depends on the type, or whose schema omits one: a random
-tensor has the type of its input where no attribute names another."""
 
 
 @dataclasses.dataclass(frozen=True)

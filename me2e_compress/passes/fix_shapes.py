@@ -12,8 +12,8 @@ from me2e_compress import graph
 from me2e_compress.base.errors import PreconditionError, RecipeError
 from me2e_compress.passes.base import Context, Pass, PassResult
 
+# Metadata key of the sizes given to open dimensions, as JSON.
 FIXED = "me2e.fixed"
-"""Metadata key of the sizes given to open dimensions, as JSON."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -21,8 +21,8 @@ from me2e_compress.passes.work import (
     small_products,
 )
 
+# The first opset whose MatMul multiplies integers too, so that no type matters.
 OLDEST_OPSET = 9
-"""The first opset whose MatMul multiplies integers too, so that no type matters."""
 
 Shape = tuple[int, ...]
 

@@ -16,8 +16,8 @@ from me2e_compress.passes.base import Context, Pass, PassResult
 from me2e_compress.quantization.geometry import MATRICES, MOST_MATRICES
 from me2e_compress.runtime.frames import Array
 
+# Most numbers of an input that a branch hangs on: flags, a sample rate.
 FLAGS = 16
-"""Most numbers of an input that a branch hangs on: flags, a sample rate."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -67,8 +67,8 @@ class FuseBasic(Pass):
 SHARED = var("weight")
 LAYER = op(("Conv", "ConvTranspose", "Gemm"), var("x"), SHARED, more=True)
 NUMBERS = constant()
+# Gamma, beta, mean and variance.
 STATISTICS = tuple(constant() for _ in range(4))
-"""Gamma, beta, mean and variance."""
 
 AFFINE = either(
     op("BatchNormalization", LAYER, *STATISTICS),
@@ -175,8 +175,8 @@ def _scaled(layer: ir.Node, weight: Numbers, scale: Numbers) -> Numbers:
     return weight * rows.reshape(*rows.shape, *rest)
 
 
+# Constants that cancel more than three decimal digits are not added in advance.
 CANCELLATION = 1e3
-"""Constants that cancel more than three decimal digits are not added in advance."""
 
 # MatMul and bias of rank 2 as a Gemm. At rank 3 they stay: Reshape, Gemm, Reshape would
 # hide the product from attention patterns and misplace the quantizers.
@@ -253,8 +253,8 @@ def _add_in_float(match: Match, kit: Kit) -> None:
 # only if both operands have them, and computes one element at a time otherwise: a
 # comparison of 240,000 elements takes 1.39 ms, not 0.03.
 
+# Elements that take onnxruntime 6 us one at a time: three starts of a node.
 LEAST = 1000
-"""Elements that take onnxruntime 6 us one at a time: three starts of a node."""
 
 
 def _slow_scalar(node: ir.Node) -> tuple[int, Array] | None:

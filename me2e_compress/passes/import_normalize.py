@@ -35,12 +35,12 @@ from me2e_compress.graph.validity import ORIGINAL_DOMAIN, PLUGIN_DOMAIN
 from me2e_compress.operators import FusedCall
 from me2e_compress.passes.base import Context, Pass, PassResult
 
+# Attributes of standard operators that name an element type: Cast; EyeLike, Random*,
+# Bernoulli, Multinomial, SequenceEmpty; the window functions and MelWeightMatrix.
 _TYPE_ATTRIBUTES = ("to", "dtype", "output_datatype")
-"""Attributes of standard operators that name an element type: Cast; EyeLike, Random*,
-Bernoulli, Multinomial, SequenceEmpty; the window functions and MelWeightMatrix."""
 
+# Standard operators whose meaning depends on the width.
 _BY_WIDTH = ("BitCast",)
-"""Standard operators whose meaning depends on the width."""
 
 
 def demote(model: ir.Model, by: str) -> tuple[int, str]:
@@ -144,8 +144,8 @@ def _values(model: ir.Model) -> Iterator[ir.Value]:
         yield from node.outputs
 
 
+# The first ONNX IR version whose models may hold functions (onnx/docs/IR.md).
 _FUNCTIONS_SINCE_IR = 8
-"""The first ONNX IR version whose models may hold functions (onnx/docs/IR.md)."""
 
 
 @dataclasses.dataclass(frozen=True)

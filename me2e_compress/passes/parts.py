@@ -23,8 +23,8 @@ from me2e_compress.operators import FusedCall
 from me2e_compress.passes.base import Context
 from me2e_compress.runtime.frames import Array
 
+# Number of values that a message lists.
 _NAMED = 4
-"""Number of values that a message lists."""
 
 _INTEGERS = (ir.DataType.INT64, ir.DataType.INT32, ir.DataType.BOOL)
 

@@ -217,8 +217,8 @@ def plan_of(model: ir.Model) -> QuantPlan | None:
 # file that they stand for. Where two overrides match a node, the later counts.
 
 
+# Makes a name a pattern that matches only itself.
 _GLOB = str.maketrans({"[": "[[]", "?": "[?]", "*": "[*]"})
-"""Makes a name a pattern that matches only itself."""
 
 _UNSUPPORTED = "only int8 and float are supported (no int4, fp8 or mixed 16 bit)"
 

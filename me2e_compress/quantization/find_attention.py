@@ -16,12 +16,12 @@ from me2e_compress.graph import (
 from me2e_compress.graph.shapes import open_shape
 from me2e_compress.operators import op_types
 
+# How many products are remembered a value: more than the heads of an attention that
+# is written out head by head; a bound, so that sweeps stay linear.
 KEEP = 16
-"""How many products are remembered a value: more than the heads of an attention that
-is written out head by head; a bound, so that sweeps stay linear."""
 
+# (nodes in between, product), nearest first.
 Hits: TypeAlias = tuple[tuple[int, ir.Node], ...]
-"""(nodes in between, product), nearest first."""
 
 Nearest: TypeAlias = Mapping[ir.Value, Hits]
 Test: TypeAlias = Callable[[ir.Node], bool]
@@ -71,13 +71,13 @@ def _merged(sources: Iterable[Hits]) -> Hits:
     return tuple((step, node) for node, step in nearest[:KEEP])
 
 
+# Operators of ONNX and com.microsoft that are attention as a whole.
 _FUSED = frozenset(
     {
         "Attention", "GroupQueryAttention", "MultiHeadAttention", "PackedAttention",
         "PackedMultiHeadAttention", "QAttention",
     }
 )  # fmt: skip
-"""Operators of ONNX and com.microsoft that are attention as a whole."""
 
 _PRODUCTS = ("Einsum", "Gemm", "MatMul")
 
@@ -88,13 +88,13 @@ _LAYOUT = frozenset(
     }
 )  # fmt: skip
 
+# What may stand between the product of queries and keys and the softmax: scale,
+# masks (additive or boolean), relative positions, layout.
 _SCORES = _LAYOUT | {"Add", "Clip", "Max", "Min", "Neg", "Sub"}
-"""What may stand between the product of queries and keys and the softmax: scale,
-masks (additive or boolean), relative positions, layout."""
 
+# What may stand between the softmax and the product with the values: dropout, masks,
+# layout.
 _WEIGHTS = _LAYOUT
-"""What may stand between the softmax and the product with the values: dropout, masks,
-layout."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -19,18 +19,21 @@ MATRICES = frozenset({(3, 3), (3, 4), (4, 4)})
 MOST_MATRICES = 64
 """In one input: cameras times frames. An input of more is a feature map."""
 
+# Numbers that say a point: homogeneous coordinates in space.
 WIDEST = 4
-"""Numbers that say a point: homogeneous coordinates in space."""
 
+# What the inputs of driving stacks call matrices, poses and reference points, for
+# those whose shape is not known: lidar2img, ego_pose, l2g_r_mat, ref_pts.
 _NAMED = re.compile(
     r"2(img|image|cam|camera|ego|lidar|global|world)(?![a-z])"
     r"|(ego|cam|camera|lidar|sensor)_?pose|intrinsic|extrinsic|projection_mat"
     r"|l2g_|ref(erence)?_(pts|points)",
     re.IGNORECASE,
 )
-"""What the inputs of driving stacks call matrices, poses and reference points, for
-those whose shape is not known: lidar2img, ego_pose, l2g_r_mat, ref_pts."""
 
+# What points stay points through, besides the inverse of a matrix: no product, no
+# comparison, no sine or cosine (an embedding, as fine as its 8 bits), no softmax, no
+# sampler.
 _ARITHMETIC = frozenset(
     {
         "Abs", "Add", "BatchNormalization", "Cast", "Ceil", "Clip", "Concat", "Div",
@@ -43,10 +46,8 @@ _ARITHMETIC = frozenset(
         "Transpose", "Unsqueeze", "Where",
     }
 )  # fmt: skip
-"""What points stay points through, besides the inverse of a matrix: no product, no
-comparison, no sine or cosine (an embedding, as fine as its 8 bits), no softmax, no
-sampler."""
 
+# Inputs that hold data: the others are shapes, indices, bounds and conditions.
 _DATA: Mapping[str, tuple[int, ...]] = {
     "BatchNormalization": (0,), "Clip": (0,), "Expand": (0,), "Gather": (0,),
     "GatherElements": (0,), "GatherND": (0,), "InstanceNormalization": (0,),
@@ -55,7 +56,6 @@ _DATA: Mapping[str, tuple[int, ...]] = {
     "ScatterElements": (0, 2), "ScatterND": (0, 2), "Slice": (0,), "Split": (0,),
     "Squeeze": (0,), "Tile": (0,), "Unsqueeze": (0,), "Where": (1, 2),
 }  # fmt: skip
-"""Inputs that hold data: the others are shapes, indices, bounds and conditions."""
 
 _PRODUCTS = ("Conv", "ConvTranspose", "Einsum", "Gemm", "MatMul")
 
@@ -211,13 +211,14 @@ def depth(product: ir.Node) -> int | None:
 # Find the layers that produce positions.
 
 
+# Which inputs of standard operators say where to look.
 _POSITIONS: dict[str, tuple[int, ...]] = {
     "DeformConv": (2,),
     **dict.fromkeys(("Gather", "GatherElements", "GatherND", "GridSample"), (1,)),
     **dict.fromkeys(("ScatterElements", "ScatterND"), (1,)),
 }
-"""Which inputs of standard operators say where to look."""
 
+# What positions are computed with, after the last layer that gave them.
 _POSITION_ARITHMETIC = frozenset(
     {
         "Abs", "Add", "Cast", "Ceil", "Clip", "Concat", "Cos", "Div", "Dropout", "Exp",
@@ -227,7 +228,6 @@ _POSITION_ARITHMETIC = frozenset(
         "Squeeze", "Sub", "Tanh", "Tile", "Transpose", "Unsqueeze", "Where",
     }
 )  # fmt: skip
-"""What positions are computed with, after the last layer that gave them."""
 
 _LAYOUT = frozenset(
     {
@@ -235,8 +235,8 @@ _LAYOUT = frozenset(
         "Unsqueeze",
     }
 )  # fmt: skip
+# How many leading inputs hold data: the others are indices, looked at on their own.
 _DATA_ONLY = {"Gather": 1, "GatherElements": 1, "GatherND": 1, "Pad": 1, "Slice": 1}
-"""How many leading inputs hold data: the others are indices, looked at on their own."""
 
 
 def find_coordinates(

@@ -93,8 +93,8 @@ def find_groups(
     return tuple(groups)
 
 
+# Ranges that differ more share no scale: it would cost the smaller 2 of its 8 bits.
 APART = 4.0
-"""Ranges that differ more share no scale: it would cost the smaller 2 of its 8 bits."""
 
 
 def share_scales(plan: QuantPlan, ranges: Ranges) -> Ranges:
@@ -114,8 +114,8 @@ def share_scales(plan: QuantPlan, ranges: Ranges) -> Ranges:
     return dataclasses.replace(ranges, tensors=widened)
 
 
+# What the user decides of which nodes.
 Pins: TypeAlias = Mapping[ir.Node, Override]
-"""What the user decides of which nodes."""
 
 
 def make_plan(

@@ -72,8 +72,8 @@ def share_initializers(graph: ir.Graph) -> int:
 
 __all__ = ["EliminateRedundant"]
 
+# Each round works on what the last one changed; real graphs need three or four.
 ROUNDS = 32
-"""Each round works on what the last one changed; real graphs need three or four."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -333,6 +333,7 @@ def _drop_expand(node: ir.Node, site: MergeSite) -> ir.Node | None:
     return None
 
 
+# Rules by operator; of several, the first that applies.
 PAIRS: dict[str, tuple[Rule, ...]] = {
     **dict.fromkeys(BROADCASTING, (_drop_expand,)),
     **dict.fromkeys(_RESHAPING, (_views,)),
@@ -340,4 +341,3 @@ PAIRS: dict[str, tuple[Rule, ...]] = {
     "Concat": (_concats,),
     "Transpose": (_views, _transposes),
 }
-"""Rules by operator; of several, the first that applies."""

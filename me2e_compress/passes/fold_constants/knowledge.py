@@ -28,8 +28,8 @@ from me2e_compress.graph.shapes import refined
 from me2e_compress.graph.summary import value_bytes
 from me2e_compress.runtime.session import REFUSALS
 
+# onnxruntime's log level "fatal": the notes report what cannot be evaluated.
 SILENT = 4
-"""onnxruntime's log level "fatal": the notes report what cannot be evaluated."""
 
 
 @dataclasses.dataclass(eq=False)
@@ -197,19 +197,19 @@ def branch_fits(node: ir.Node, branch: ir.Graph, opset: int) -> bool:
     return True
 
 
+# Arrays of up to this many elements (shapes, indices) are computed immediately.
 SMALL = 1024
-"""Arrays of up to this many elements (shapes, indices) are computed immediately."""
 
+# Limit in bytes of a computed value: a chain of Concats may claim any size.
 LARGEST = 1 << 30
-"""Limit in bytes of a computed value: a chain of Concats may claim any size."""
 
+# Operators without an input, and those that tell the runtime to compute in int8.
 NEVER = ("Constant", "DequantizeLinear", "DynamicQuantizeLinear")
-"""Operators without an input, and those that tell the runtime to compute in int8."""
 
+# Operators through which folding turns a computation into a weight.
 COMPUTE = frozenset(
     {"Conv", "ConvTranspose", "Einsum", "Gemm", "GridSample", "MatMul", "Softmax"}
 )
-"""Operators through which folding turns a computation into a weight."""
 
 
 @dataclasses.dataclass

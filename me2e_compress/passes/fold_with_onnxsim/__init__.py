@@ -18,8 +18,8 @@ __all__ = ["FoldWithOnnxsim"]
 
 _OWN_METADATA = "onnxsim."
 
+# Not imported here: onnxsim imports torch where that is installed.
 _WORKER = Path(__file__).with_name("onnxsim_main.py")
-"""Not imported here: onnxsim imports torch where that is installed."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -23,13 +23,13 @@ from me2e_compress.passes.fuse_kernels.raw_attention import fuse_raw_attention
 
 __all__ = ["FuseKernels"]
 
+# Writes the fused node of a pattern that ends at a node, and returns its result.
+#
+# None where the node is no such pattern; a PreconditionError names what an almost
+# matching one lacks. Nothing may be written before the last check.
 Fuser = Callable[[ir.Node, FusedCall], ir.Value | None]
-"""Writes the fused node of a pattern that ends at a node, and returns its result.
 
-None where the node is no such pattern; a PreconditionError names what an almost
-matching one lacks. Nothing may be written before the last check.
-"""
-
+# Fusers by the type of the last node of their pattern.
 _FUSERS: Mapping[str, Fuser] = {
     "Conv": fuse_convolution,
     "GridSample": fuse_grid_sample,
@@ -37,7 +37,6 @@ _FUSERS: Mapping[str, Fuser] = {
     "MultiScaleDeformableAttention": fuse_raw_attention,
     "Relu": fuse_rectified_convolution,
 }
-"""Fusers by the type of the last node of their pattern."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -26,8 +26,8 @@ from me2e_compress.graph.nodes import (
 from me2e_compress.graph.rewrite import replace_value
 from me2e_compress.operators import OWN_DOMAIN, FusedCall
 
+# Fewer do not fill one vector of 512 bits of float32.
 LEAST_CHANNELS = 16
-"""Fewer do not fill one vector of 512 bits of float32."""
 
 _BILINEAR, _NEAREST = ("bilinear", "linear"), "nearest"
 

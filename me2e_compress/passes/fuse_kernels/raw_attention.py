@@ -24,11 +24,11 @@ from me2e_compress.passes.fuse_operators.fused_form import (
 from me2e_compress.passes.fuse_operators.views import View, aligned, sources, terms
 
 BATCH, QUERY, HEAD, LEVEL, POINT = "batch", "query", "head", "level", "point"
+# The axes of locations, which are in 0..1: not the ``xy`` of a grid's in -1..1.
 XY = "x, y"
-"""The axes of locations, which are in 0..1: not the ``xy`` of a grid's in -1..1."""
 
+# Before, Softmax was over all axes from one on.
 SOFTMAX_OPSET = 13
-"""Before, Softmax was over all axes from one on."""
 
 
 @dataclasses.dataclass(frozen=True)

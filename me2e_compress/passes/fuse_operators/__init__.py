@@ -29,9 +29,9 @@ from me2e_compress.passes.fuse_operators.numeric_check import (
 
 __all__ = ["FuseOperators"]
 
+# Largest difference, relative to the largest result: the cost of summing float32 in
+# another order, and of rounding positions on the way to -1..1 and back.
 TOLERANCE = 1e-4
-"""Largest difference, relative to the largest result: the cost of summing float32 in
-another order, and of rounding positions on the way to -1..1 and back."""
 
 
 @dataclasses.dataclass(frozen=True)

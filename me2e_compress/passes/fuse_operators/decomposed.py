@@ -22,8 +22,8 @@ from me2e_compress.passes.digits import Digit, Digits, flat, whole
 from me2e_compress.passes.fuse_operators.views import View, aligned, results
 
 BATCH, CHANNEL, LEVEL, PIXEL, XY = "batch", "channel", "level", "pixel", "xy"
+# The axes of the samples; rows and columns are those of GridSample's output.
 ROW, COLUMN = "row", "column"
-"""The axes of the samples; rows and columns are those of GridSample's output."""
 
 SAMPLING = {
     "mode": ("bilinear", "linear"),  # from opset 20 on it is called linear

@@ -30,19 +30,19 @@ from me2e_compress.passes.digits import Digit, flat, regrouped, sizes, whole
 from me2e_compress.passes.fuse_operators.fused_form import laid_out
 from me2e_compress.passes.fuse_operators.views import Selection, View, joined, sources
 
+# The axes: all positions of all images, x before y, and those of a feature map.
 AT, PAIR, CHANNEL, ROW, COLUMN = "at", "pair", "channel", "row", "column"
-"""The axes: all positions of all images, x before y, and those of a feature map."""
 
 _INDEX = LAYOUT_OPERATORS | {*ELEMENTWISE, "Cast", "Clip", "Concat", "Expand", "Where"}
 _INDEX |= {"Gather", "Slice", "Split", "Tile"}
 _SUMS = ("Add", "ReduceSum", "Sum")
 _AFTER = LAYOUT_OPERATORS | {*_SUMS, "Concat", "Mul", "Where"}
 
+# How many pixels beyond a feature map's edges positions are drawn.
 BEYOND = 3.0
-"""How many pixels beyond a feature map's edges positions are drawn."""
 
+# Fewer are not of all kinds: more than one draw is compared.
 LEAST_POSITIONS = 60
-"""Fewer are not of all kinds: more than one draw is compared."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -15,11 +15,11 @@ from me2e_compress.passes.fuse_operators.decomposed import XY
 from me2e_compress.passes.fuse_operators.views import View
 from me2e_compress.runtime.session import Session
 
+# How far beyond a feature map's edges positions are drawn, relative to its size.
 OUTSIDE = 0.25
-"""How far beyond a feature map's edges positions are drawn, relative to its size."""
 
+# The IR version of pieces: that of the first onnxruntime with GridSample.
 IR_VERSION = 8
-"""The IR version of pieces: that of the first onnxruntime with GridSample."""
 
 
 def nodes_between(output: ir.Value, inputs: Sequence[ir.Value]) -> list[ir.Node]:
@@ -84,9 +84,9 @@ def take_back(body: ir.Graph, made: Sequence[ir.Node], known: set[str]) -> None:
         del body.initializers[name]
 
 
+# Number of draws until a result is not zero: a single position lies outside the
+# feature map in a third of all draws.
 DRAWS = 8
-"""Number of draws until a result is not zero: a single position lies outside the
-feature map in a third of all draws."""
 
 
 Draw: TypeAlias = Callable[[np.random.Generator], Mapping[ir.Value, Array]]

@@ -57,10 +57,10 @@ from me2e_compress.passes.work import (
 # the indices (:mod:`me2e_compress.passes.digits`): those that a Tile, Expand or Concat
 # adds make no difference to what the value holds.
 
+# Operators that may repeat axes.
 REPEATS = frozenset({"Concat", "Expand", "Tile"})
-"""Operators that may repeat axes."""
+# Largest number of nodes between the source and the repeated value.
 LONGEST = 16
-"""Largest number of nodes between the source and the repeated value."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -156,6 +156,7 @@ def _sizes(
 # Operators that compute every element, or every row of the last axis, by itself.
 
 
+# Operators that map every element by itself.
 UNARY = frozenset(
     {
         *("Abs", "Celu", "Clip", "Cos", "Elu", "Erf", "Exp", "Gelu", "HardSigmoid"),
@@ -163,13 +164,12 @@ UNARY = frozenset(
         *("Relu", "Selu", "Sigmoid", "Sin", "Softplus", "Softsign", "Sqrt", "Tanh"),
     }
 )
-"""Operators that map every element by itself."""
 
+# Element-wise operators of two operands, which broadcast.
 BINARY = frozenset({"Add", "Div", "Max", "Min", "Mul", "Pow", "Sub"})
-"""Element-wise operators of two operands, which broadcast."""
 
+# Operators that map every row by itself where their axis is the last.
 ALONG_AXIS = frozenset({"LayerNormalization", "LogSoftmax", "Softmax"})
-"""Operators that map every row by itself where their axis is the last."""
 
 SOFTMAX_OPSET = 13
 """Before, the axis of a softmax was the second by default."""

@@ -37,8 +37,8 @@ from me2e_compress.graph.rewrite import remove_unread
 from me2e_compress.operators import FusedCall
 from me2e_compress.passes.work import MACS_PER_NODE, item_bytes
 
+# Largest number of consecutive nodes examined before a product.
 DEEPEST = 32
-"""Largest number of consecutive nodes examined before a product."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -133,8 +133,8 @@ def _known(value: ir.Value | None) -> Numbers:
     return numbers
 
 
+# What adds up to a product: values of the graph, and constant rows [.., N].
 Terms: TypeAlias = list[ir.Value | Numbers]
-"""What adds up to a product: values of the graph, and constant rows [.., N]."""
 
 
 @dataclasses.dataclass(frozen=True)

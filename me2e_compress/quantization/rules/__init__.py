@@ -36,11 +36,11 @@ __all__ = ["DEFAULT_RULES", "RULES", "RULE_SETS", "Rule", "RuleFacts", "RuleSet"
 # Find the small encoders of the ego car's own status.
 
 
+# In a status: speed, acceleration, steering, pose, command; ``can_bus`` has 18.
 MOST_NUMBERS = 64
-"""In a status: speed, acceleration, steering, pose, command; ``can_bus`` has 18."""
 
+# Elements of the largest input, where a graph has sensors beside a status.
 LEAST_SENSED = 1024
-"""Elements of the largest input, where a graph has sensors beside a status."""
 
 LARGEST = 4096
 """Elements of what still is a status, encoded: more is a map that it was added to."""

@@ -159,8 +159,8 @@ class AttentionLength(Rule):
         return f"attention of {queries} queries and {keys} keys, more than {self.limit}"
 
 
+# Weights of a product of one row that int8 reads no faster: overheads are as long.
 LEAST_READ = 2**16
-"""Weights of a product of one row that int8 reads no faster: overheads are as long."""
 
 
 @dataclasses.dataclass(frozen=True)
