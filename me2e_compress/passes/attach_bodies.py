@@ -103,9 +103,9 @@ def _has_domain(node: ir.Node) -> bool:
 def _group_alike(calls: Sequence[FusedNode]) -> list[list[FusedNode]]:
     """Group calls that agree in attributes and number of inputs."""
     groups: dict[tuple[object, ...], list[FusedNode]] = {}
-    for each in calls:
-        options = sorted((n, str(a.value)) for n, a in each.node.attributes.items())
-        groups.setdefault((len(each.node.inputs), *options), []).append(each)
+    for call in calls:
+        options = sorted((n, str(a.value)) for n, a in call.node.attributes.items())
+        groups.setdefault((len(call.node.inputs), *options), []).append(call)
     return list(groups.values())
 
 
@@ -115,8 +115,8 @@ def _set_overload(calls: Sequence[FusedNode], model: ir.Model) -> None:
     numbers = itertools.count(2)
     while (domain, op_type, overload) in model.functions:
         overload = str(next(numbers))
-    for each in calls:
-        each.node.overload = overload
+    for call in calls:
+        call.node.overload = overload
     if overload:
         model.ir_version = max(model.ir_version, _OVERLOADS_SINCE_IR)
 

@@ -50,12 +50,12 @@ class Border:
     def paid_s(self, int8: Collection[ir.Node]) -> float:
         """Return its conversion seconds if exactly these layers are int8."""
         if _some(self.makers, int8):
-            readers = sum(each not in int8 for each in self.readers)
-            joins = sum(not _some(each.readers, int8) for each in self.joins)
+            readers = sum(layer not in int8 for layer in self.readers)
+            joins = sum(not _some(join.readers, int8) for join in self.joins)
             return (self.float_readers + readers + joins) * self.dequantize_s
         read = _some(self.readers, int8) or any(
-            _some(each.makers, int8) and _some(each.readers, int8)
-            for each in self.joins
+            _some(join.makers, int8) and _some(join.readers, int8)
+            for join in self.joins
         )
         return self.quantize_s if read else 0.0
 
@@ -105,14 +105,14 @@ class Costs:
         does not pay as a whole. Not always the best choice, but near it, and linear.
         """
         kept, saved_s = dict.fromkeys(int8), self.saved_s
-        touching: dict[ir.Node, list[Border]] = {each: [] for each in kept}
+        touching: dict[ir.Node, list[Border]] = {layer: [] for layer in kept}
         for border in self.borders:
-            for each in dict.fromkeys(border.layers()):
-                if each in touching:
-                    touching[each].append(border)
+            for layer in dict.fromkeys(border.layers()):
+                if layer in touching:
+                    touching[layer].append(border)
         # one by one: a layer that goes changes its neighbours' costs, which queue again
         losses: dict[ir.Node, Loss] = {}
-        waiting = deque(each for each in kept if each in saved_s)
+        waiting = deque(layer for layer in kept if layer in saved_s)
         while waiting:
             layer = waiting.popleft()
             if layer not in kept:
@@ -128,11 +128,11 @@ class Costs:
             waiting += [n for n in dict.fromkeys(near) if n in saved_s]
         # region by region: what one pays at all its borders, and saves
         for island in _islands(kept, touching):
-            if any(each not in saved_s for each in island):
+            if any(layer not in saved_s for layer in island):
                 continue
-            borders = dict.fromkeys(b for each in island for b in touching[each])
+            borders = dict.fromkeys(b for layer in island for b in touching[layer])
             paid = sum(border.paid_s(kept) for border in borders)
-            saved = sum(saved_s[each] for each in island)
+            saved = sum(saved_s[layer] for layer in island)
             if saved + self.margin_s < paid:
                 losses.update(dict.fromkeys(island, Loss(saved, paid, len(island))))
         return losses
@@ -143,7 +143,7 @@ CostsOf: TypeAlias = Callable[[ir.Model, Collection[ir.Node]], Costs | None]
 
 
 def _some(layers: Iterable[ir.Node], int8: Collection[ir.Node]) -> bool:
-    return any(each in int8 for each in layers)
+    return any(layer in int8 for layer in layers)
 
 
 def _islands(

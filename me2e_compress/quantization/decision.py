@@ -122,20 +122,20 @@ class QuantPlan:
     @property
     def chosen(self) -> tuple[Decision, ...]:
         """The nodes that read int8: layers, attention products, residual Adds."""
-        return tuple(each for each in self.decisions if each.dtype == INT8)
+        return tuple(decision for decision in self.decisions if decision.dtype == INT8)
 
     @property
     def placed(self) -> tuple[Decision, ...]:
         """Those of the chosen nodes that are int8 in the graph for the target."""
-        left = {each.output for each in self.kept_float}
-        return tuple(each for each in self.chosen if each.output not in left)
+        left = {node.output for node in self.kept_float}
+        return tuple(node for node in self.chosen if node.output not in left)
 
     @property
     def headline(self) -> str:
         """Count int8, by rule."""
         counts = ", ".join(f"{rule} {count}" for rule, count in self.counts().items())
         kept = len(self.kept_float)
-        why = "; ".join(dict.fromkeys(each.reason for each in self.kept_float))
+        why = "; ".join(dict.fromkeys(node.reason for node in self.kept_float))
         return (
             f"scheme {self.scheme.name}, rules {self.rules}"
             + (f", for {self.target}" if self.target else "")
@@ -146,11 +146,11 @@ class QuantPlan:
 
     def tables(self) -> tuple[Table, ...]:
         """Return how many nodes of a module are int8 or float; nodes as in `counts`."""
-        could = [each for each in self.decisions if each.could_be_int8]
+        could = [decision for decision in self.decisions if decision.could_be_int8]
         rows = list[tuple[str, ...]]()
-        for module in dict.fromkeys(each.module for each in could):
-            theirs = [each for each in could if each.module == module]
-            left = Counter(each.rule for each in theirs if each.dtype != INT8)
+        for module in dict.fromkeys(decision.module for decision in could):
+            theirs = [decision for decision in could if decision.module == module]
+            left = Counter(node.rule for node in theirs if node.dtype != INT8)
             rules = ", ".join(f"{rule} {left[rule]}" for rule in sorted(left))
             counts = len(theirs) - left.total(), left.total()
             rows.append((module, rules, *map(str, counts)))
@@ -159,7 +159,7 @@ class QuantPlan:
 
     def counts(self) -> dict[str, int]:
         """Count the decisions by rule, over the nodes that could be int8 at all."""
-        rules = Counter(each.rule for each in self.decisions if each.could_be_int8)
+        rules = Counter(node.rule for node in self.decisions if node.could_be_int8)
         return dict(sorted(rules.items()))
 
 
@@ -279,9 +279,9 @@ def keep_readers(tensor: str, reason: str) -> Override:
 def overrides_text(overrides: Iterable[Override]) -> str:
     """Write overrides as the TOML that ``--overrides`` reads."""
     entries = []
-    for each in overrides:
+    for override in overrides:
         keys = ("nodes", "module", "op", "reads", "dtype", "reason")
-        given = {key: text for key in keys if (text := getattr(each, key))}
+        given = {key: text for key in keys if (text := getattr(override, key))}
         lines = (f"{key} = {toml_string(text)}\n" for key, text in given.items())
         entries.append("[[override]]\n" + "".join(lines))
     return "\n".join(entries)
@@ -325,11 +325,13 @@ class Overrides(_Strict):
             origins = () if past is None else past.origins
             main[node] = (node.name or "", *origins)
         pinned: dict[ir.Node, Override] = {}
-        for each in self.override:
-            nodes = [node for node, names in main.items() if each.matches(node, names)]
+        for override in self.override:
+            nodes = [n for n, names in main.items() if override.matches(n, names)]
             if not nodes:
-                raise RecipeError(f"override {each} matches none of {len(main)} nodes")
-            pinned.update(dict.fromkeys(nodes, each))  # the last that matches wins
+                raise RecipeError(
+                    f"override {override} matches none of {len(main)} nodes"
+                )
+            pinned.update(dict.fromkeys(nodes, override))  # the last that matches wins
         return pinned
 
 

@@ -143,7 +143,7 @@ def find_attention(
     for node in model.graph:
         if is_fused(node):  # tokens of [batch, (heads,) tokens, width]
             shapes = [open_shape(value) or () for value in node.inputs[:2]]
-            tokens = [each[-2] if len(each) > 1 else None for each in shapes]
+            tokens = [shape[-2] if len(shape) > 1 else None for shape in shapes]
             attentions[node] = Attention(tokens[0], tokens[-1])
     softmaxes = [node for node in model.graph if node.op_type == "Softmax"]
     for node in softmaxes:
@@ -176,7 +176,7 @@ def find_attention_weights(
     softmaxes = behind(model.graph, _WEIGHTS, lambda node: node.op_type == "Softmax")
     for node in model.graph:
         reads = node.inputs[:2] if node.op_type in WEIGHTED else ()
-        if any(each in softmaxes for each in reads if each is not None):
+        if any(value in softmaxes for value in reads if value is not None):
             reasons.setdefault(node, "reads the weights that a softmax gives")
     return reasons
 

@@ -117,7 +117,7 @@ class _GeometryWalk:
         reads: Sequence[ir.Value | None] = node.inputs
         if not product and node.op_type in _DATA:
             reads = [input_at(node, index) for index in _DATA[node.op_type]]
-        met = [self.sources[each] for each in reads if each in self.sources]
+        met = [self.sources[value] for value in reads if value in self.sources]
         shape = open_shape(node.outputs[0])
         goes_on = False
         if met and product:
@@ -125,21 +125,21 @@ class _GeometryWalk:
             goes_on = self._passes(node)
         elif met and (node.op_type in _ARITHMETIC or node.op_type in self._inverses):
             # arithmetic with learned values: few numbers are still points
-            learned = any(each in self._learned for each in reads)
+            learned = any(value in self._learned for value in reads)
             goes_on = not learned or (
                 shape is not None and shape != () and is_few(shape[-1])
             )
         # mark the results as geometry, or else as learned
         if goes_on:
-            matrix = all(each.is_matrix for each in met) and all(
-                each is None or each in self.sources or each in self._constants
-                for each in reads
+            matrix = all(source.is_matrix for source in met) and all(
+                value is None or value in self.sources or value in self._constants
+                for value in reads
             )
             if product:
                 matrix = matrix and _is_small(node.outputs[0])
             source = _Source(met[0].name, matrix)
             self.sources.update(dict.fromkeys(node.outputs, source))
-        elif product or any(each in self._learned for each in node.inputs):
+        elif product or any(value in self._learned for value in node.inputs):
             self._learned.update(node.outputs)
 
     def _passes(self, product: ir.Node) -> bool:
@@ -317,7 +317,7 @@ def _behind_positions(
             data = node.inputs
         else:
             continue
-        queue.extend((each, reader) for each in data if each is not None)
+        queue.extend((value, reader) for value in data if value is not None)
 
 
 def _companions(

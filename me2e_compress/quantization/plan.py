@@ -154,7 +154,7 @@ def make_plan(
     }
     # what depends on other decisions
     for rule in in_order:
-        int8 = {node: None for node, each in decided.items() if each.dtype == INT8}
+        int8 = {n: None for n, choice in decided.items() if choice.dtype == INT8}
         for node, reason in rule.objections(int8, facts).items():
             if node in int8 and (rule.firm or pins.get(node) is None):
                 decided[node] = dataclasses.replace(
@@ -265,7 +265,7 @@ def _residuals(
     # the longest path to every value, in nodes
     depth: dict[ir.Value | None, int] = {}
     for node in graph:
-        below = 1 + max((depth.get(each, 0) for each in node.inputs), default=0)
+        below = 1 + max((depth.get(value, 0) for value in node.inputs), default=0)
         depth.update(dict.fromkeys(node.outputs, below))
     decisions: dict[ir.Node, Decision] = {}
     for node in graph:
@@ -273,9 +273,9 @@ def _residuals(
             continue
         # branches that end in an int8 convolution
         fused = [i for i in (0, 1) if _ends_convolution(node.inputs[i], decided)]
-        if not fused or any(each in facts.constants for each in node.inputs):
+        if not fused or any(value in facts.constants for value in node.inputs):
             continue
-        if any(maker(each, "DequantizeLinear") for each in node.inputs):
+        if any(maker(value, "DequantizeLinear") for value in node.inputs):
             continue  # a branch is read as int8 already
         if static_shape(node.inputs[0]) != static_shape(node.inputs[1]):
             continue
@@ -287,7 +287,7 @@ def _residuals(
                 decided[node], rule="override", reason=pin.why
             )
             continue
-        names = ["" if each is None else each.name for each in node.inputs]
+        names = ["" if value is None else value.name for value in node.inputs]
         decisions[node] = dataclasses.replace(
             decided[node],
             dtype=INT8,

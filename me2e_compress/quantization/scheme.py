@@ -48,7 +48,7 @@ class QuantScheme:
                 f" ({', '.join(modules.names())}) has no module of role {lacking[0]}:"
                 " name a map that has (--map), or take scheme full"
             )
-        chosen = (each.name for each in modules.modules if each.role in wanted)
+        chosen = (module.name for module in modules.modules if module.role in wanted)
         return cls(name, tuple(chosen))
 
     @classmethod

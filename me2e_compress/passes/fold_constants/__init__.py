@@ -342,7 +342,7 @@ def _write_casts(graph: ir.Graph, by: str) -> int:
         like = node.inputs[1] if node.op_type == "CastLike" else None
         if like is None or like.dtype is None or node.domain != "":
             continue
-        attributes = {name: each.value for name, each in node.attributes.items()}
+        attributes = {key: option.value for key, option in node.attributes.items()}
         attributes["to"] = int(like.dtype)
         put(node, "Cast", node.inputs[:1], by=by, attributes=attributes)
         count += 1

@@ -109,7 +109,7 @@ def _unscaled(value: ir.Value | None) -> tuple[ir.Value | None, float]:
 
 def _checked(attention: _Attention, softmax: ir.Node) -> _Shape:
     """Return the shape [.., Q, C] of the query; refuse what the kernel cannot do."""
-    shapes = [static_shape(each) for each in attention[:3]]
+    shapes = [static_shape(value) for value in attention[:3]]
     query, key, value = shapes
     if query is None or key is None or value is None:
         raise PreconditionError("its shapes are not known")
@@ -160,7 +160,8 @@ def _fused(call: FusedCall, attention: _Attention, shape: _Shape) -> ir.Value:
         key = turns[1].inputs[0]
     else:
         key = call.transpose(attention.turned_key, last)
-    rows = [_viewed(call, each, -1) for each in (attention.query, key, attention.value)]
+    operands = (attention.query, key, attention.value)
+    rows = [_viewed(call, value, -1) for value in operands]
     return call.reshape(_attention(call, rows, factor, 1), shape)
 
 

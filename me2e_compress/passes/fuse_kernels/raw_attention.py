@@ -138,8 +138,8 @@ def _match(node: ir.Node) -> _Match | None:
 
 
 def _cheapest(view: View, form: Callable[[View], Layout]) -> View:
-    def cost(each: View) -> float:
-        return cost_of(each, form(each)) + 4 * math.prod(sizes_of(form(each)))
+    def cost(source: View) -> float:
+        return cost_of(source, form(source)) + 4 * math.prod(sizes_of(form(source)))
 
     best = min(reversed(whole_views(view)), key=cost)
     if math.isinf(cost(best)):
@@ -208,9 +208,9 @@ def _product(view: View, plain: _Match) -> _Match | None:
         return None
     # One factor is the softmax, perhaps behind other products
     factors = [
-        View(each, aligned(last.layout, shape))
-        for each, shape in zip(node.inputs, shapes, strict=True)
-        if each is not None and shape is not None
+        View(value, aligned(last.layout, shape))
+        for value, shape in zip(node.inputs, shapes, strict=True)
+        if value is not None and shape is not None
     ]
     for one, other in itertools.permutations(factors):
         inner = _product(one, plain)

@@ -187,8 +187,8 @@ class _Run:
         except (PreconditionError, GraphError):
             take_back(body, made, known)
             raise
-        for each in made:
-            inherit(each, [root, *matched], by=self.by)
+        for new_node in made:
+            inherit(new_node, [root, *matched], by=self.by)
         replace_value(old, new)
         # Remove what is unread now, readers first
         for node in reversed(matched):

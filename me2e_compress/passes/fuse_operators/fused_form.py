@@ -204,7 +204,7 @@ def combined(
     groups: list[Digits] = []
     for dimension in form:
         split = split_like(dimension, digits)
-        by_owners = itertools.groupby(split, lambda d: [d in each for each in have])
+        by_owners = itertools.groupby(split, lambda d: [d in own for own in have])
         groups.extend(tuple(run) for _, run in by_owners)
     # Combine the views by broadcasting
     value: ir.Value | None = None
@@ -267,7 +267,7 @@ def plan(decomposed: Decomposed) -> Plan:
     value = options_of([level.image for level in decomposed.levels], join_pixels)
     plain = options_of([level.grid for level in decomposed.levels], join_levels)
     # of equals the last one is taken: sums are the last resort
-    locations = [*(each for option in plain for each in sums_of(option)), *plain]
+    locations = [*(source for option in plain for source in sums_of(option)), *plain]
     if decomposed.images:  # their levels lie image by image: there is nothing to join
         value = [option for option in value if len(option.views) == 1]
         locations = [
@@ -277,7 +277,7 @@ def plan(decomposed: Decomposed) -> Plan:
             raise PreconditionError("its levels are made apart")
     weights = [Source((view,)) for view in whole_views(decomposed.weights)]
     masks = [] if decomposed.mask is None else whole_views(decomposed.mask)
-    known = [view for each in (*value, *locations, *weights) for view in each.views]
+    known = [view for source in (*value, *locations, *weights) for view in source.views]
     # Price every number of heads with the best source of each operand
     plans = []
     for heads in _head_counts(decomposed, [*known, *masks, *decomposed.results]):
@@ -295,7 +295,7 @@ def plan(decomposed: Decomposed) -> Plan:
         plans.append(
             Plan(decomposed, heads, read[1], places[1], shares[1], mask, last, cost)
         )
-    best = min(plans, key=lambda each: each.cost)
+    best = min(plans, key=lambda option: option.cost)
     if best.cost == math.inf:
         raise PreconditionError("its operands have no layout in common")
     return best
@@ -335,7 +335,7 @@ class _Form:
 
     def value(self, level: int | None) -> Layout:
         levels = self.decomposed.levels
-        total = sum(each.pixels for each in levels)
+        total = sum(item.pixels for item in levels)
         pixels = whole(PIXEL, total if level is None else levels[level].pixels)
         outer = self._outer((*self.decomposed.images, *pixels))
         return (*outer, whole(CHANNEL, self.decomposed.channels))

@@ -78,8 +78,8 @@ class Sampling:
             axes = [2 if digit.axis == PAIR else 1 for digit in digits]
             part = slice(None) if 2 in axes else slice(place, place + 1)
             size, scale, shift = (
-                np.reshape(each[part], axes)
-                for each in (self.shape[:1:-1], self.scale, self.shift)
+                np.reshape(pair[part], axes)
+                for pair in (self.shape[:1:-1], self.scale, self.shift)
             )
             # Half of them anywhere, half at the edges, a tenth in the middle of pixels
             shape = [digit.size for digit in digits]
@@ -112,8 +112,8 @@ class Sampling:
         corners = int(np.allclose((scale, shift), size - 1) and size.min() > 1)
         size -= corners
         scale, shift = scale / size, (shift + 1 - corners) / size - 1
-        for op_type, each, nothing in (("Mul", scale, 1.0), ("Add", shift, 0.0)):
-            numbers = each.round(6) if np.allclose(each, each.round(6)) else each
+        for op_type, exact, nothing in (("Mul", scale, 1.0), ("Add", shift, 0.0)):
+            numbers = exact.round(6) if np.allclose(exact, exact.round(6)) else exact
             if (numbers != nothing).any():
                 number = numbers if np.ptp(numbers) else numbers[:1]
                 grid = call.add(op_type, [grid, call.numbers(number, grid)])

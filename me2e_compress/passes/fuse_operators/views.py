@@ -99,9 +99,9 @@ def terms(view: View) -> tuple[View, View] | None:
     if sole_reader(view.value) is None or None in shapes:
         return None
     first, second = (
-        dataclasses.replace(view, value=each, layout=aligned(view.layout, shape))
-        for each, shape in zip(node.inputs, shapes, strict=True)
-        if each is not None and shape is not None
+        dataclasses.replace(view, value=operand, layout=aligned(view.layout, shape))
+        for operand, shape in zip(node.inputs, shapes, strict=True)
+        if operand is not None and shape is not None
     )
     return first, second
 

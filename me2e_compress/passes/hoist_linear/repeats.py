@@ -350,7 +350,7 @@ def _rewrite(call: FusedCall, plan: _Plan) -> None:
     # Operands once; an operator along the last axis keeps to it
     inputs = [_written(call, operand) for operand in plan.operands]
     inputs.extend(node.inputs[len(inputs) :])
-    attributes = {name: each.value for name, each in node.attributes.items()}
+    attributes = {key: option.value for key, option in node.attributes.items()}
     call.sources = (node,)
     if node.op_type in ALONG_AXIS:
         attributes["axis"] = rank - 1

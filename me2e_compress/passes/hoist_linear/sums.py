@@ -232,7 +232,7 @@ class _Search:
         if layer is None:
             return None
         # V W is [rows[-1], columns]; the first layer goes if nothing else reads it
-        owned = owned and all(sole_reader(each.outputs[0]) for each in layer.nodes)
+        owned = owned and all(sole_reader(node.outputs[0]) for node in layer.nodes)
         inner = self.of(layer.source, owned=owned, depth=depth)
         rows = static_shape(layer.source) or (1,)
         width = (static_shape(value) or (1,))[-1]

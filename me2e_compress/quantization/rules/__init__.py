@@ -62,9 +62,9 @@ def find_ego_layers(
     sources = dict(_statuses(model))
     layers: dict[ir.Node, str] = {}
     for node in model.graph if sources else ():
-        reads = [each for each in node.inputs if each is not None]
-        changing = [each for each in reads if each not in constants]
-        if not changing or any(each not in sources for each in changing):
+        reads = [value for value in node.inputs if value is not None]
+        changing = [value for value in reads if value not in constants]
+        if not changing or any(value not in sources for value in changing):
             continue
         # its results are a status too, while they are small
         name = sources[changing[0]]

@@ -94,7 +94,7 @@ class WeightOperand(Rule):
             floats = left.dtype in (ir.DataType.FLOAT, None)
             return None if floats else "what it samples is not float32"
         # operands of floats, and not all constant
-        types = {each.dtype for each in (left, right) if each is not None}
+        types = {value.dtype for value in (left, right) if value is not None}
         if not types <= {ir.DataType.FLOAT, ir.DataType.FLOAT16, None}:
             return "neither float32 nor float16"
         if left in facts.constants and right in facts.constants:
@@ -128,7 +128,7 @@ def _integers(node: ir.Node, facts: RuleFacts) -> str:
             kind = made.inputs[0].dtype
             return "integers" if kind is None else kind.name.lower()
         if value in facts.constants or made.op_type in LAYOUT_OPERATORS:
-            waiting += [each for each in made.inputs if each not in waiting]
+            waiting += [value for value in made.inputs if value not in waiting]
     return ""
 
 
