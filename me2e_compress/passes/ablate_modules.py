@@ -14,9 +14,10 @@ from me2e_compress.graph.modules.module_map import ModuleMap, Substitute
 from me2e_compress.graph.nodes import LAYOUT_OPERATORS, makers_of, reads_of
 from me2e_compress.operators import FusedCall
 from me2e_compress.passes.base import Context, Pass, PassResult
-from me2e_compress.passes.edges import Edge, add_edge
 from me2e_compress.passes.parts import (
+    Edge,
     Part,
+    add_edge,
     means_of,
     module_of,
     replace_readers,

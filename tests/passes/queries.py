@@ -7,7 +7,7 @@ import onnx_ir as ir
 from me2e_compress import graph
 from me2e_compress.graph.modules.module_map import ModuleMap
 from me2e_compress.passes.base import Context
-from me2e_compress.passes.edges import Edge
+from me2e_compress.passes.parts import Edge
 from tests.support.nets import map_text, net
 
 Numbers = npt.NDArray[np.float32]

@@ -14,8 +14,7 @@ from me2e_compress.base.errors import ModuleMapError, PreconditionError, RecipeE
 from me2e_compress.manager import PassManager, recipe
 from me2e_compress.passes import PASSES
 from me2e_compress.passes.ablate_modules import AblateModules
-from me2e_compress.passes.edges import Edge, propagate_size
-from me2e_compress.passes.parts import stretched
+from me2e_compress.passes.parts import Edge, propagate_size, stretched
 from me2e_compress.runtime.session import run_once
 from tests.passes.hoisted import integers
 from tests.passes.queries import KEYS, Numbers, context, stack, weights
