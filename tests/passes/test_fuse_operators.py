@@ -13,8 +13,9 @@ from hypothesis import strategies as st
 from me2e_compress.graph import digest, infer_shapes, opset_of, provenance, static_shape
 from me2e_compress.operators import expand
 from me2e_compress.operators.deformable_attention import DeformableAttention
+from me2e_compress.passes import fuse_operators
 from me2e_compress.passes.base import PassResult
-from me2e_compress.passes.fuse_operators import FuseOperators, numeric_check
+from me2e_compress.passes.fuse_operators import FuseOperators
 from tests.passes.decomposed import FUSED, Sizes, decomposed, inferred, plain
 from tests.passes.small import NO_MODULES, apply, compute, fed, ops, read
 from tests.support.profiles import scaled
@@ -265,13 +266,13 @@ TWICE = """g (float[1,4,5,7] image, float[1,9,3,2] grid, float[3] weights)
 
 
 def test_pieces_that_are_alike_are_proven_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    runs, run = [], numeric_check.run_piece
+    runs, run = [], fuse_operators.run_piece
 
     def counted(piece: Any, given: Any) -> Any:
         runs.append(piece)
         return run(piece, given)
 
-    monkeypatch.setattr(numeric_check, "run_piece", counted)
+    monkeypatch.setattr(fuse_operators, "run_piece", counted)
     assert FuseOperators().run(inferred(read(TWICE)), NO_MODULES).changes == 2
     assert len(runs) == 2
 

@@ -3,35 +3,39 @@
 import contextlib
 import dataclasses
 import functools
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import TypeAlias
 
+import numpy as np
 import onnx_ir as ir
 
 from me2e_compress.base.errors import GraphError, PreconditionError
-from me2e_compress.graph import graphs_of, is_standard, opset_of
-from me2e_compress.graph.nodes import is_read, nodes_in
+from me2e_compress.graph import array_of, digest, graphs_of, is_standard, opset_of
+from me2e_compress.graph.nodes import Array, is_read, nodes_in
 from me2e_compress.graph.provenance import inherit
-from me2e_compress.graph.rewrite import (
-    remove_dead,
-    replace_value,
-    value_names,
-)
-from me2e_compress.operators import OWN_DOMAIN, FusedCall
+from me2e_compress.graph.rewrite import remove_dead, replace_value, value_names
+from me2e_compress.operators import OWN_DOMAIN, FusedCall, expand
 from me2e_compress.passes.base import Context, Pass, PassResult
+from me2e_compress.passes.digits import flat, sizes
 from me2e_compress.passes.fuse_operators import decomposed, fused_form, gathered
-from me2e_compress.passes.fuse_operators.numeric_check import (
-    Draw,
-    Proofs,
-    draw_views,
-    nodes_between,
-    take_back,
-)
+from me2e_compress.passes.fuse_operators.views import View
+from me2e_compress.runtime.session import Session
 
 __all__ = ["FuseOperators"]
 
 # Largest difference, relative to the largest result: the cost of summing float32 in
 # another order, and of rounding positions on the way to -1..1 and back.
 TOLERANCE = 1e-4
+
+# How far beyond a feature map's edges positions are drawn, relative to its size.
+OUTSIDE = 0.25
+
+# The IR version of pieces: that of the first onnxruntime with GridSample.
+IR_VERSION = 8
+
+# Number of draws until a result is not zero: a single position lies outside the
+# feature map in a third of all draws.
+DRAWS = 8
 
 
 @dataclasses.dataclass(frozen=True)
@@ -72,7 +76,7 @@ class FuseOperators(Pass):
         if not any(_is_sampler(node) or gathered.is_sampler(node) for node in nodes):
             return PassResult(model, 0)
         opset, unread = opset_of(model), remove_dead(model.graph)
-        names, proofs = value_names(model.graph), Proofs(opset, context.seed)
+        names, proofs = value_names(model.graph), _Proofs(opset, context.seed)
         run = _Run(self.name, opset, names, proofs)
         left: list[str] = []
         for body in graphs_of(model.graph):
@@ -96,10 +100,14 @@ def _is_sampler(node: ir.Node) -> bool:
     return node.op_type == "GridSample" and is_standard(node)
 
 
+# Draws the inputs of two pieces of a graph.
+_Draw: TypeAlias = Callable[[np.random.Generator], Mapping[ir.Value, Array]]
+
+
 class _Run:
     """Rewrites matches, counts them, and keeps the largest error."""
 
-    def __init__(self, by: str, opset: int, names: set[str], proofs: Proofs) -> None:
+    def __init__(self, by: str, opset: int, names: set[str], proofs: "_Proofs") -> None:
         self.by, self.opset, self.names, self.proofs = by, opset, names, proofs
         self.fused = self.samplers = self.sampled = 0
         self.worst = 0.0
@@ -129,7 +137,7 @@ class _Run:
         plan = fused_form.plan(match) if plan is None else plan
         inputs = [view.value for view in plan.inputs]
         write = functools.partial(fused_form.write, plan)
-        draw = functools.partial(draw_views, plan.inputs)
+        draw = functools.partial(_draw_views, plan.inputs)
         error = self._replace(body, plan.result.value, inputs, write, draw)
         self.worst = max(self.worst, error)
         self.fused += 1
@@ -161,7 +169,7 @@ class _Run:
         old: ir.Value,
         inputs: Sequence[ir.Value],
         write: Callable[[FusedCall], ir.Value],
-        draw: Draw,
+        draw: _Draw,
         least: int = 1,
     ) -> float:
         """Write a replacement of a value and keep it if it is proven; return its error.
@@ -185,7 +193,10 @@ class _Run:
                     f"as one node it differs by {error:.1e} (allowed {TOLERANCE:.0e})"
                 )
         except (PreconditionError, GraphError):
-            take_back(body, made, known)
+            # Take the new nodes and weights back
+            body.remove(reversed(made), safe=True)
+            for name in [name for name in body.initializers if name not in known]:
+                del body.initializers[name]
             raise
         for new_node in made:
             inherit(new_node, [root, *matched], by=self.by)
@@ -195,3 +206,113 @@ class _Run:
             if node.graph is not None and not any(map(is_read, node.outputs)):
                 node.graph.remove(node, safe=True)
         return error
+
+
+# Compare matched nodes with the fused node's body on random numbers.
+
+
+def nodes_between(output: ir.Value, inputs: Sequence[ir.Value]) -> list[ir.Node]:
+    """Return the nodes that compute a value from others and constants, in order."""
+    known: dict[ir.Node, None] = {}
+    stops, stack = set(inputs), [(output.producer(), False)]
+    while stack:
+        node, done = stack.pop()
+        if node is None or node in known:
+            continue
+        if done:
+            known[node] = None
+            continue
+        stack.append((node, True))
+        stack.extend(
+            (value.producer(), False)
+            for value in reversed(node.inputs)
+            if value is not None and value not in stops
+        )
+    return list(known)
+
+
+def piece_of(output: ir.Value, inputs: Sequence[ir.Value], opset: int) -> ir.Model:
+    """Copy the nodes between values as a model of its own, with numbered names."""
+    nodes = nodes_between(output, inputs)
+    known = {*inputs, *(value for node in nodes for value in node.outputs)}
+    read = dict.fromkeys(value for node in nodes for value in node.inputs if value)
+    weights = [value for value in read if value not in known]
+    for value in weights:
+        if array_of(value) is None:
+            raise PreconditionError(f"it reads {value.name} besides")
+    imports = {"": opset, OWN_DOMAIN: 1}
+    body = ir.GraphView(
+        inputs, [output], nodes=nodes, initializers=weights, opset_imports=imports
+    ).clone()
+    # Equal pieces have equal names
+    made = (value for node in body for value in node.outputs)
+    values = [*body.inputs, *body.initializers.values(), *made]
+    for index, value in enumerate(values):
+        value.name = f"piece{index}"
+    for index, node in enumerate(body):
+        node.name = f"node{index}"
+        node.metadata_props.clear()
+    return ir.Model(body, ir_version=IR_VERSION)
+
+
+def run_piece(piece: ir.Model, feeds: Sequence[Array]) -> Array:
+    """Run a piece of a graph; fused nodes are replaced by their bodies."""
+    for node in list(piece.graph):
+        if node.domain == OWN_DOMAIN:
+            expand(node, opset=opset_of(piece), by="check")
+    names = (str(value.name) for value in piece.graph.inputs)
+    named = dict(zip(names, feeds, strict=True))
+    (result,) = Session(piece, optimize=False).run(named).values()
+    return result
+
+
+class _Proofs:
+    """Compares pieces of a graph on fresh random numbers, and caches equal pairs."""
+
+    def __init__(self, opset: int, seed: int) -> None:
+        self._opset, self._seed = opset, seed
+        self._known: dict[tuple[str, str], float] = {}
+
+    def error(
+        self, before: ir.Value, after: ir.Value, draw: _Draw, least: int = 1
+    ) -> float:
+        """Return max|a-b|/max|a| of two values that are computed from drawn inputs.
+
+        At least ``least`` draws are compared, more while nothing but zeros comes out.
+
+        Raises:
+            PreconditionError: one of them reads another value too, or returns only
+                zeros.
+            GraphError: onnxruntime cannot run it.
+        """
+        random = np.random.default_rng(self._seed)
+        drawn, apart, largest = draw(random), 0.0, 0.0
+        pieces = [piece_of(value, [*drawn], self._opset) for value in (before, after)]
+        key = (digest(pieces[0]), digest(pieces[1]))
+        if key in self._known:
+            return self._known[key]
+        for count in range(1, DRAWS + least):
+            feeds = list(drawn.values())
+            a, b = (run_piece(piece, feeds).astype(np.float64) for piece in pieces)
+            apart = max(apart, float(np.abs(a - b).max()))
+            largest = max(largest, float(np.abs(a).max()))
+            if largest and count >= least:
+                self._known[key] = apart / largest
+                return self._known[key]
+            drawn = draw(random)
+        raise PreconditionError("nothing but zeros comes out of random numbers")
+
+
+def _draw_views(
+    views: Sequence[View], random: np.random.Generator
+) -> dict[ir.Value, Array]:
+    """Draw normal numbers; a third of the positions lie outside the feature maps."""
+    return {view.value: _draw(view, random) for view in views}
+
+
+def _draw(view: View, random: np.random.Generator) -> Array:
+    shape, kind = sizes(view.layout), (view.value.dtype or ir.DataType.FLOAT).numpy()
+    if not any(digit.axis == decomposed.XY for digit in flat(view.layout)):
+        return random.standard_normal(shape).astype(kind)
+    places = random.uniform(-1 - 2 * OUTSIDE, 1 + 2 * OUTSIDE, shape)
+    return ((places - view.shift) / view.scale).astype(kind)
