@@ -47,12 +47,16 @@ class AttachBodies(Pass):
         """Add a function for each kind of fused node that has none."""
         fused = [call.node for call in operators.fused_nodes(model)]
         bare = [node for node in fused if node.op_identifier() not in model.functions]
-        named = [node for node in bare if _has_domain(node)]
+        # Functions need a domain: plugins without one stay as they are
+        named = [
+            n for n in bare if n.domain and ORIGINAL_DOMAIN not in n.metadata_props
+        ]
         notes = list(operators.raise_for_bodies(model, named, self.name))
         kinds: dict[ir.OperatorIdentifier, list[FusedNode]] = {}
         for call in operators.fused_nodes(model):
             if call.node in bare:
                 kinds.setdefault(call.node.op_identifier(), []).append(call)
+        # Calls of a name that agree share a function
         count = 0
         for calls in kinds.values():
             what = f"for {len(calls)} {calls[0].node.op_type}"
@@ -94,10 +98,6 @@ class AttachBodies(Pass):
         operators.expand(node, opset=first.opset, by=self.name)
         write_constant_nodes(function)
         return function
-
-
-def _has_domain(node: ir.Node) -> bool:
-    return bool(node.domain) and ORIGINAL_DOMAIN not in node.metadata_props
 
 
 def _group_alike(calls: Sequence[FusedNode]) -> list[list[FusedNode]]:

@@ -1,6 +1,5 @@
 """Give open dimensions a size, so that shapes can be folded."""
 
-import contextlib
 import dataclasses
 import json
 from collections.abc import Mapping, Sequence
@@ -48,10 +47,7 @@ class FixShapes(Pass):
     def run(self, model: ir.Model, context: Context) -> PassResult:
         """Write the sizes wherever the dimensions occur, then infer shapes."""
         # Sizes that an earlier run wrote need no change
-        known: dict[str, object] = {}
-        with contextlib.suppress(json.JSONDecodeError):
-            kept = json.loads(model.metadata_props.get(FIXED, "{}"))
-            known = kept if isinstance(kept, dict) else {}
+        known = json.loads(model.metadata_props.get(FIXED, "{}"))
         wanted = {k: size for k, size in self.dims.items() if known.get(k) != size}
         if not wanted:
             return PassResult(model, 0)

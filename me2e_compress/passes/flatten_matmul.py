@@ -52,14 +52,13 @@ class FlattenMatmul(Pass):
         opset = opset_of(model)
         if opset < OLDEST_OPSET:
             return PassResult(model, 0)
-        repeats = flattened = open_shapes = 0
+        repeats = flattened = 0
         names = value_names(model.graph)
         for body in graphs_of(model.graph):
             for node in list(body):
                 if node.op_type != "MatMul" or not is_standard(node):
                     continue
                 product: ir.Node | None = node
-                open_shapes += _shapes(node) is None
                 while product is not None:
                     call = FusedCall(product, opset=opset, by=self.name, names=names)
                     repeats += _read_unrepeated(call)
@@ -70,7 +69,6 @@ class FlattenMatmul(Pass):
         notes = (
             (flattened, f"flattened {plural(flattened, 'product')}"),
             (repeats, f"{plural(repeats, 'repeated operand')} read unrepeated"),
-            (open_shapes, f"left {plural(open_shapes, 'product')} of unknown shape"),
         )
         remarks = tuple(note for count, note in notes if count)
         return PassResult(model, repeats + flattened, remarks)

@@ -49,12 +49,12 @@ class Border:
 
     def paid_s(self, int8: Collection[ir.Node]) -> float:
         """Return its conversion seconds if exactly these layers are int8."""
-        if _some(self.makers, int8):
+        if not self.makers.isdisjoint(int8):
             readers = sum(layer not in int8 for layer in self.readers)
-            joins = sum(not _some(join.readers, int8) for join in self.joins)
+            joins = sum(join.readers.isdisjoint(int8) for join in self.joins)
             return (self.float_readers + readers + joins) * self.dequantize_s
-        read = _some(self.readers, int8) or any(
-            _some(join.makers, int8) and _some(join.readers, int8)
+        read = not self.readers.isdisjoint(int8) or any(
+            not (join.makers.isdisjoint(int8) or join.readers.isdisjoint(int8))
             for join in self.joins
         )
         return self.quantize_s if read else 0.0
@@ -140,10 +140,6 @@ class Costs:
 
 CostsOf: TypeAlias = Callable[[ir.Model, Collection[ir.Node]], Costs | None]
 """Estimates what a target's int8 of some layers would save and cost in a graph."""
-
-
-def _some(layers: Iterable[ir.Node], int8: Collection[ir.Node]) -> bool:
-    return any(layer in int8 for layer in layers)
 
 
 def _islands(

@@ -247,11 +247,12 @@ class Override(_Strict):
 
     def matches(self, node: ir.Node, names: Sequence[str]) -> bool:
         """Return whether it applies to a node of these names: its own, its origins'."""
+        tensors = [str(value.name) for value in node.inputs if value is not None]
         return (
             (self.op is None or node.op_type == self.op)
             and (self.module is None or provenance.module_of(node) == self.module)
-            and (self.nodes is None or _named(names, self.nodes))
-            and (self.reads is None or _named(_tensors(node), self.reads))
+            and (self.nodes is None or _matches_any(names, self.nodes))
+            and (self.reads is None or _matches_any(tensors, self.reads))
         )
 
     @property
@@ -364,9 +365,5 @@ def check_followed(
             )
 
 
-def _tensors(node: ir.Node) -> list[str]:
-    return [str(value.name) for value in node.inputs if value is not None]
-
-
-def _named(names: Sequence[str], glob: str) -> bool:
+def _matches_any(names: Sequence[str], glob: str) -> bool:
     return any(fnmatch.fnmatchcase(name, glob) for name in names)

@@ -146,13 +146,13 @@ def test_what_is_left_alone(left: tuple[int, ...], right: tuple[int, ...]) -> No
     assert (result.changes, result.notes) == (0, ())
 
 
-def test_unknown_sizes_are_left_alone_and_named() -> None:
+def test_unknown_sizes_are_left_alone() -> None:
     text = graph_of(
         "(double[c,1,4,4] a, double[1,n,4,1] b) => (double[c,n,4,1] y)",
         "y = MatMul(a, b)",
     )
     result = apply(FlattenMatmul(), read(text))
-    assert (result.changes, result.notes) == (0, ("left 1 product of unknown shape",))
+    assert result.changes == 0
 
 
 def test_a_wide_matrix_must_save_more_starts_than_it_moves_bytes() -> None:

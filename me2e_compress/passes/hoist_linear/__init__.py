@@ -12,7 +12,6 @@ from me2e_compress.operators import FusedCall
 from me2e_compress.passes.base import Context, Pass, PassResult
 from me2e_compress.passes.hoist_linear.repeats import before_repeat
 from me2e_compress.passes.hoist_linear.sums import layer_at, multiply_earlier
-from me2e_compress.passes.work import BYTES_PER_NODE
 
 __all__ = ["HoistLinear"]
 
@@ -39,14 +38,10 @@ class HoistLinear(Pass):
     fewer rows, or is a layer of few columns. Each is done where it needs fewer
     multiply-accumulates and is less work in total (:mod:`me2e_compress.passes.work`).
     Sizes must be known. Outputs are equal up to rounding.
-
-    Attributes:
-        bytes_per_node: how many bytes of new weights the work of one node may cost.
     """
 
     name = "hoist-linear"
     exact = True
-    bytes_per_node: int = BYTES_PER_NODE
 
     def run(self, model: ir.Model, context: Context) -> PassResult:
         """Rewrite every node that has a cheaper form, until none has."""
@@ -69,7 +64,7 @@ class HoistLinear(Pass):
                 if layer is not None:
                     last = layer.nodes[-1]
                     call = FusedCall(last, opset=opset, by=by, names=names)
-                    products += multiply_earlier(layer, call, self.bytes_per_node)
+                    products += multiply_earlier(layer, call)
             remove_dead(model.graph)
             if products + others == moved:
                 break

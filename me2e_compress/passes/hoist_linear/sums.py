@@ -35,7 +35,7 @@ from me2e_compress.graph.nodes import (
 )
 from me2e_compress.graph.rewrite import remove_unread
 from me2e_compress.operators import FusedCall
-from me2e_compress.passes.work import MACS_PER_NODE, item_bytes
+from me2e_compress.passes.work import BYTES_PER_NODE, MACS_PER_NODE, item_bytes
 
 # Largest number of consecutive nodes examined before a product.
 DEEPEST = 32
@@ -152,12 +152,12 @@ class Form:
     write: Callable[[Numbers], Terms]
 
 
-def multiply_earlier(layer: LinearLayer, call: FusedCall, bytes_per_node: int) -> bool:
+def multiply_earlier(layer: LinearLayer, call: FusedCall) -> bool:
     """Write a layer in its cheapest form; False if it has that.
 
     ``call`` is of the last node of the layer.
     """
-    search = _Search(layer, call, bytes_per_node)
+    search = _Search(layer, call)
     source = layer.source
     now, best = search.direct(source), search.of(source, owned=True, depth=DEEPEST)
     if now.cost - best.cost < 1.0 or best.macs >= now.macs:
@@ -185,13 +185,11 @@ def replace(call: FusedCall, new: ir.Value) -> None:
 class _Search:
     """Finds and writes the forms of one layer's product."""
 
-    def __init__(
-        self, layer: LinearLayer, call: FusedCall, bytes_per_node: int
-    ) -> None:
+    def __init__(self, layer: LinearLayer, call: FusedCall) -> None:
         self.result, self.call = layer.result, call
         call.sources = layer.nodes
         self.columns = (static_shape(layer.result) or (0,))[-1]
-        self.item_cost = item_bytes(layer.result) / max(bytes_per_node, 1e-9)
+        self.item_cost = item_bytes(layer.result) / BYTES_PER_NODE
         self.known: dict[ir.Value, Form] = {}
         self.stored: dict[int, tuple[Numbers, ir.Value]] = {}
         self.written: list[ir.Value] = []

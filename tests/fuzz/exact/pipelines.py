@@ -37,7 +37,7 @@ PREFIX = "dear work: "
 """What a pipeline begins with that is run where rewriting pays nearly always."""
 DEAR = (
     "hoist-linear",
-    "hoist-linear{bytes_per_node=1000000}",
+    "hoist-linear",
     "fold-constants{bytes_per_node=1000000}, hoist-linear{bytes_per_node=1000000},"
     " fuse-basic, eliminate-redundant",
     "hoist-linear, flatten-matmul, eliminate-redundant",
