@@ -37,9 +37,8 @@ PREFIX = "dear work: "
 """What a pipeline begins with that is run where rewriting pays nearly always."""
 DEAR = (
     "hoist-linear",
-    "hoist-linear",
-    "fold-constants{bytes_per_node=1000000}, hoist-linear{bytes_per_node=1000000},"
-    " fuse-basic, eliminate-redundant",
+    "fold-constants{bytes_per_node=1000000}, hoist-linear, fuse-basic,"
+    " eliminate-redundant",
     "hoist-linear, flatten-matmul, eliminate-redundant",
 )
 PRICES = ("MACS_PER_NODE", "MOVED_BYTES_PER_NODE", "SMALL_PRODUCTS_PER_NODE")
