@@ -154,6 +154,7 @@ class AblateModules(Pass):
         return not any(within(node, pattern) for pattern in self.keep)
 
     def _fill(self, model: ir.Model, context: Context) -> list[str]:
+        # Values of dropped modules that nodes which stay read
         exits = [
             value
             for node in model.graph
@@ -165,6 +166,7 @@ class AblateModules(Pass):
             for value in exits:
                 replace_readers(value, zeros_like(self._writer(model, value), value))
             return [f"{value.name} reads as zeros" for value in exits]
+        # Means come from the frames, value by value
         means, how = means_of(model, exits, context)
         for value in exits:
             array, name = means[str(value.name)], f"{value.name}_mean"
@@ -181,6 +183,7 @@ class AblateModules(Pass):
         owned = [value for value in outputs if self._is_dropped(value.producer())]
         names = [str(value.name) for value in owned]
         who, what = ", ".join(self.drop), ", ".join(names)
+        # A graph keeps at least one output, and the plan
         if owned and len(owned) == len(outputs) and self.drop_outputs:
             raise PreconditionError(f"{who} makes every output: {what}")
         for value in owned:

@@ -234,6 +234,7 @@ def _by_ranges(
     context: Context,
 ) -> dict[ir.Node, str]:
     """Map the nodes that read or make too large numbers on the frames to the size."""
+    # Map the measured values to the nodes that touch them
     touched, constants = dict[str, list[ir.Node]](), constant_values(model)
     for node in model.graph:
         if node in known:
@@ -259,6 +260,7 @@ def _by_ranges(
 
 def _between(model: ir.Model, wide: Mapping[ir.Node, str]) -> dict[ir.Node, str]:
     """Find nodes that only move elements between float32 nodes, inputs and outputs."""
+    # Begin with all of them: a chain of moves stays as a whole
     moves = {node: None for node in model.graph if node.op_type in _MOVES}
 
     def stays(neighbours: Iterable[ir.Node | None]) -> bool:

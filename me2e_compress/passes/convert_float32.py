@@ -97,6 +97,7 @@ class ElementTypes:
         """Return the outputs that change type when those inputs do."""
         if node.op_type == "Cast" and node.outputs[0].dtype == self.source:
             return (0,)
+        # Outputs share the type variables of the inputs that change
         schema = self._schema(node)
         bound = {self._variable(node, index) for index in self.inputs(node)}
         if schema is None or not bound:
@@ -229,6 +230,7 @@ class Retyping:
         """Return a value in a type: a constant, or a Cast that its readers share."""
         if (value, kind) in self._casts:
             return self._casts[value, kind]
+        # A constant is stored once more in the other type
         name, names = f"{value.name}_{kind.name.lower()}", self._names
         if _is_constant(value):
             array = _converted(value, kind)

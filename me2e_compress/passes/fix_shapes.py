@@ -136,6 +136,7 @@ def _sized(
     """Return a shape with symbols replaced by sizes; the same object if unchanged."""
     if shape is None:
         return None
+    # A dimension has no name, a name, or is an expression of names
     dims: list[int | ir.SymbolicDim] = []
     for axis, dim in enumerate(shape):
         size: object = dim

@@ -52,6 +52,7 @@ class FlattenMatmul(Pass):
         opset = opset_of(model)
         if opset < OLDEST_OPSET:
             return PassResult(model, 0)
+        # A rewritten product may have a cheaper form again
         repeats = flattened = 0
         names = value_names(model.graph)
         for body in graphs_of(model.graph):
@@ -159,12 +160,14 @@ def _form(
 
     None where no batch axis can become rows.
     """
+    # Pair the batch axes of both operands: [*lead, R, K] and [*shared, K, C]
     rank = max(len(rows_shape), len(matrix_shape))
     *lead, count, width = _widened(rows_shape, rank)
     shared = _widened(matrix_shape, rank)[:-2]
     pairs = [pair for pair in zip(lead, shared, strict=True) if max(pair) > 1]
     last = next((n for n, (_, size) in enumerate(reversed(pairs)) if size > 1), None)
     end = 0 if last is None else len(pairs) - last
+    # Axes that the matrix has stay a batch; the others become rows
     kept = [n for n, (_, m) in enumerate(pairs) if m > 1 or (n < end and not all_axes)]
     if len(kept) == len(pairs):
         return None
@@ -217,6 +220,7 @@ def _read_unrepeated(call: FusedCall) -> int:
         repeated = repeated_axes(value)
         if repeated is None or repeated.large != shapes[index]:
             continue
+        # The product must broadcast the small operand to the same batch
         small = repeated.small
         pair = (small, shapes[1]) if index == 0 else (shapes[0], small)
         batch = np.broadcast_shapes(*(shape[:-2] for shape in pair))

@@ -51,6 +51,7 @@ class TranslatePlugins(Pass):
         Raises:
             PreconditionError: the library lacks an operator or cannot express a call.
         """
+        # The library must have the operator; nodes in its dialect stay
         counts: Counter[str] = Counter()
         for fused in operators.fused_nodes(model):
             node, operator = fused.node, fused.operator

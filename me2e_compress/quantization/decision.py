@@ -320,6 +320,7 @@ class Overrides(_Strict):
         Raises:
             RecipeError: an override matches nothing.
         """
+        # A node goes by its own name and by those of its origins
         main: dict[ir.Node, tuple[str, ...]] = {}
         for node in model.graph:
             past = provenance.read(node)

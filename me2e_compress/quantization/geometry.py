@@ -295,6 +295,7 @@ def _behind_positions(
     The walk goes on through arithmetic, and through the layers that the test names; it
     ends at ``known`` values.
     """
+    # Start at every operand that says where to look
     positions = {**position_inputs(), **_POSITIONS}
     queue = deque(
         (value, node.op_type)
@@ -324,6 +325,7 @@ def _companions(
     model: ir.Model, products: dict[ir.Node, str], constants: Collection[ir.Value]
 ) -> dict[ir.Node, str]:
     """Find layers of sampling weights beside layers of offsets."""
+    # Layers that read the same tensor as a layer of offsets
     shared = {node.inputs[0] for node in products}
 
     def is_beside(node: ir.Node) -> bool:

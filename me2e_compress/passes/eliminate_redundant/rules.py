@@ -98,6 +98,7 @@ def _slice(node: ir.Node, opset: int) -> ir.Value | None:
 
 def _sliced_part(node: ir.Node) -> ir.Value | None:
     """Return the operand of a Concat that a Slice takes out again, if it is one."""
+    # Bounds of the Slice along one axis, that of the Concat
     inner, shape = maker(node.inputs[0], "Concat"), static_shape(node.inputs[0])
     starts, ends = integers_at(node, "starts", 1), integers_at(node, "ends", 2)
     axes = integers_at(node, "axes", 3)
@@ -108,6 +109,7 @@ def _sliced_part(node: ir.Node) -> ir.Value | None:
     axis = axes[0] % len(shape)
     if inner.attributes.get_int("axis", 0) % len(shape) != axis:
         return None
+    # Walk over the operands up to the one between these bounds
     first, last, _ = slice(starts[0], ends[0]).indices(shape[axis])
     at = 0
     for part in inner.inputs:
@@ -240,6 +242,7 @@ def _views(node: ir.Node, site: MergeSite) -> ir.Node | None:
     source = inner.inputs[0]
     if source is None:
         return None
+    # Back to the shape before, or one Reshape in place of both
     if static_shape(source) == sizes and bypass(node.outputs[0], source):
         return node
     if sole_reader(inner.outputs[0]) is None:
@@ -302,6 +305,7 @@ def _concats(node: ir.Node, site: MergeSite) -> ir.Node | None:
             inputs.append(value)
     if not sources:
         return None
+    # One Concat reads all operands
     by, options = site.by, {"axis": axis}
     return put(node, "Concat", inputs, by=by, sources=sources, attributes=options)
 
@@ -311,6 +315,7 @@ def _drop_expand(node: ir.Node, site: MergeSite) -> ir.Node | None:
     target = static_shape(node.outputs[0])
     if target is None or site.opset < 8:
         return None
+    # Look for an operand that only repeats axes of size 1
     for index, value in enumerate(node.inputs):
         inner = _before(node, index)
         if inner is None or inner.op_type not in ("Expand", "Tile"):

@@ -365,6 +365,7 @@ def _reshape_bounds(graph: ir.Graph, opset: int, by: str) -> int:
         branches = [attribute.as_graph() for attribute in choice.attributes.values()]
         if all(branch_fits(choice, branch, opset) for branch in branches):
             continue
+        # A branch of shape [1] in front of a Range: reshape what reads the If
         bounds = [
             (use.node, use.idx, value)
             for value in choice.outputs

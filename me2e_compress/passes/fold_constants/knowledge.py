@@ -131,6 +131,7 @@ def _node(
     feeds: dict[str, Any],
     arrays: Mapping[ir.Value, Any],
 ) -> onnx.NodeProto:
+    # Copy the node under short names: v0, v1, ...
     proto = ir.serde.serialize_node(one.nodes[0])
     del proto.input[:], proto.output[:], proto.metadata_props[:]
     for value in one.inputs:

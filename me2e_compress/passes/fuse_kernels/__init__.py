@@ -61,6 +61,7 @@ class FuseKernels(Pass):
 
     def run(self, model: ir.Model, context: Context) -> PassResult:
         """Try every node of the graph and of its bodies."""
+        # Try the fuser of every operator; an almost matching one says why it stays
         opset, names = opset_of(model), value_names(model.graph)
         done: collections.Counter[str] = collections.Counter()
         left: list[str] = []

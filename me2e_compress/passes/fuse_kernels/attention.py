@@ -109,12 +109,14 @@ def _unscaled(value: ir.Value | None) -> tuple[ir.Value | None, float]:
 
 def _checked(attention: _Attention, softmax: ir.Node) -> _Shape:
     """Return the shape [.., Q, C] of the query; refuse what the kernel cannot do."""
+    # query [.., Q, C], key [.., C, K] and value [.., K, C] must be matrices
     shapes = [static_shape(value) for value in attention[:3]]
     query, key, value = shapes
     if query is None or key is None or value is None:
         raise PreconditionError("its shapes are not known")
     if min(map(len, (query, key, value))) < 2:
         raise PreconditionError("one of its operands is a vector")
+    # All that the kernel requires, with what to say of a node that lacks it
     operands, (*batch, count, width), keys = attention[:3], query, key[-1]
     like = key == (*batch, width, keys) and value == (*batch, keys, width)
     axis = softmax.attributes.get_int("axis", -1)
@@ -136,6 +138,7 @@ def _checked(attention: _Attention, softmax: ir.Node) -> _Shape:
 
 def _fused(call: FusedCall, attention: _Attention, shape: _Shape) -> ir.Value:
     """Write attention of the rows that Transposes read, or of heads in the batch."""
+    # softmax(s q k) = softmax(f q k / sqrt(C)) with f = s sqrt(C)
     rank, width = len(shape), shape[-1]
     factor = attention.scale * math.sqrt(width)
     turns = [maker(value, "Transpose") for value in attention[:3]]
@@ -155,6 +158,7 @@ def _fused(call: FusedCall, attention: _Attention, shape: _Shape) -> ir.Value:
             if maker(back, "Transpose") and permutation_of(reader) == _ROWS[rank]:
                 bypass(back, split)
         return call.transpose(split, _ROWS[rank])
+    # Heads are in the batch already: only the keys are turned, [.., K, C]
     last = [*range(rank - 2), rank - 1, rank - 2]
     if turns[1] is not None and permutation_of(turns[1]) == last:
         key = turns[1].inputs[0]

@@ -48,6 +48,7 @@ def fuse_rectified_convolution(node: ir.Node, call: FusedCall) -> ir.Value | Non
 
 def _fused(node: ir.Node, call: FusedCall, *, relu: int) -> ir.Value | None:
     image, weight = node.inputs[0], node.inputs[1]
+    # Only kernels of 3x3 float32 at stride 1, of one group
     pads = _pads(node)
     filters = array_of(weight)
     if image is None or weight is None or filters is None or pads is None:
@@ -59,6 +60,7 @@ def _fused(node: ir.Node, call: FusedCall, *, relu: int) -> ir.Value | None:
         raise PreconditionError("the size of its image is not known")
     if not _pays(shape, made, shortcut=_shortcut(node)):
         return None
+    # Write the fused node; its kernel always adds a bias
     bias = input_at(node, 2)
     if bias is None:
         bias = call.constant(np.zeros(filters.shape[0], np.float32), "bias")

@@ -81,6 +81,7 @@ def fuse_grid_sample(node: ir.Node, call: FusedCall) -> ir.Value | None:
 
 def _checked(node: ir.Node, image: ir.Value, grid: ir.Value) -> tuple[str, _Sizes]:
     """Return how it samples, and its sizes; refuse what the kernel cannot do."""
+    # Attributes that deformable attention has, too
     mode = node.attributes.get_string("mode", "bilinear")
     padding = node.attributes.get_string("padding_mode", "zeros")
     problems = {
@@ -91,6 +92,7 @@ def _checked(node: ir.Node, image: ir.Value, grid: ir.Value) -> tuple[str, _Size
     for problem, is_there in problems.items():
         if is_there:
             raise PreconditionError(problem)
+    # Image [N, C, H, W] and grid [N, F, G, 2]
     map_, places = static_shape(image), static_shape(grid)
     if map_ is None or places is None or len(map_) != 4 or 0 in (*map_, *places):
         raise PreconditionError("sizes are unknown, or it samples a volume")
@@ -116,6 +118,7 @@ def _source_rows(image: ir.Value, sizes: _Sizes) -> ir.Value | None:
 
 def _turned_readers(value: ir.Value, sizes: _Sizes) -> list[ir.Node]:
     """Return the Transposes, behind views, that put the channels last."""
+    # Follow views of the result to the Transposes that read them
     readers, waiting = [], [use.node for use in value.uses()]
     while waiting:
         node = waiting.pop()

@@ -58,10 +58,12 @@ class _Sizes:
         def ends(axis: str) -> int:
             return max((d.end for d in digits if d.axis == axis), default=1)
 
+        # Batch, queries and heads are there as a whole, or not at all
         outer = (
             full if ends(axis) > 1 else ()
             for axis, full in zip((BATCH, QUERY, HEAD), self.weights, strict=False)
         )
+        # Levels of one camera are the inner digits, cameras the outer
         strides = [digit.stride for digit in digits if digit.axis == LEVEL]
         least = min(strides, default=self.levels)
         levels = whole(LEVEL, ends(LEVEL))
@@ -195,6 +197,7 @@ def _axes(view: View) -> set[str]:
 
 def _product(view: View, plain: _Match) -> _Match | None:
     """Return the factors of weights, if one of them is a softmax over points."""
+    # Walk back to where the weights are made: a Softmax, or a Mul of factors
     *_, last = (source for source in sources(view) if isinstance(source, View))
     node = producer_of(last.value)
     if node is None or not is_standard(node) or last.shift != 0.0:

@@ -75,6 +75,7 @@ class FuseOperators(Pass):
         nodes = nodes_in(model.graph)
         if not any(_is_sampler(node) or gathered.is_sampler(node) for node in nodes):
             return PassResult(model, 0)
+        # Samplings by Gather become GridSample first, then both are fused
         opset, unread = opset_of(model), remove_dead(model.graph)
         names, proofs = value_names(model.graph), _Proofs(opset, context.seed)
         run = _Run(self.name, opset, names, proofs)
@@ -150,6 +151,7 @@ class _Run:
             return
         self._failed.add(floors)
         reason: Exception = PreconditionError("it is not a sum of four corners")
+        # The first guess that is proven counts
         for guess in gathered.guesses(node, self.opset):
             inputs = [view.value for view in (guess.image, *guess.at)]
             sampling = guess.result.value, inputs, guess.write, guess.draw
@@ -213,6 +215,7 @@ class _Run:
 
 def nodes_between(output: ir.Value, inputs: Sequence[ir.Value]) -> list[ir.Node]:
     """Return the nodes that compute a value from others and constants, in order."""
+    # Depth first: a node is listed after all that it reads
     known: dict[ir.Node, None] = {}
     stops, stack = set(inputs), [(output.producer(), False)]
     while stack:
@@ -233,6 +236,7 @@ def nodes_between(output: ir.Value, inputs: Sequence[ir.Value]) -> list[ir.Node]
 
 def piece_of(output: ir.Value, inputs: Sequence[ir.Value], opset: int) -> ir.Model:
     """Copy the nodes between values as a model of its own, with numbered names."""
+    # What else the nodes read must be constant
     nodes = nodes_between(output, inputs)
     known = {*inputs, *(value for node in nodes for value in node.outputs)}
     read = dict.fromkeys(value for node in nodes for value in node.inputs if value)
@@ -285,12 +289,14 @@ class _Proofs:
                 zeros.
             GraphError: onnxruntime cannot run it.
         """
+        # Equal pieces were compared before
         random = np.random.default_rng(self._seed)
         drawn, apart, largest = draw(random), 0.0, 0.0
         pieces = [piece_of(value, [*drawn], self._opset) for value in (before, after)]
         key = (digest(pieces[0]), digest(pieces[1]))
         if key in self._known:
             return self._known[key]
+        # Draw until enough results are not zero
         for count in range(1, DRAWS + least):
             feeds = list(drawn.values())
             a, b = (run_piece(piece, feeds).astype(np.float64) for piece in pieces)

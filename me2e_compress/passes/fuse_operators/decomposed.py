@@ -182,6 +182,7 @@ def _levels(node: ir.Node) -> tuple[tuple[Level, ...], View]:
                 "the levels have different numbers of points or heads"
             )
         levels.append(level)
+    # The axis of the Concat gets the level as its outer digit
     layout = list(end.layout)
     axis = concat.attributes.get_int("axis", 0) % len(layout)
     layout[axis] = (*whole(LEVEL, len(levels)), *layout[axis])
@@ -216,6 +217,7 @@ def _total(product: View, kinds: tuple[str, ...]) -> tuple[View, bool]:
     node = sole_reader(product.value)
     if node is None or node.op_type not in kinds or not is_standard(node):
         raise PreconditionError("the weighted samples are not summed")
+    # Digits of the axes that are summed over are gone
     axes = integers_at(node, "axes", 1)
     if not axes:
         raise PreconditionError("the sum is over all axes, or over computed ones")

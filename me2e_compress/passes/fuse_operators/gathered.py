@@ -71,6 +71,7 @@ class Sampling:
 
     def draw(self, random: np.random.Generator) -> dict[ir.Value, Array]:
         """Draw normal numbers for the image, and positions inside and around it."""
+        # Positions are pixels, taken back through scale and shift
         image = random.standard_normal(sizes(self.image.layout))
         drawn: dict[ir.Value, Array] = {self.image.value: image.astype(np.float32)}
         for place, view in enumerate(self.at):
@@ -94,6 +95,7 @@ class Sampling:
 
     def write(self, call: FusedCall) -> ir.Value:
         """Write the GridSample, and what brings its operands and result in shape."""
+        # Positions as a grid [N, F, G, 2]: G is as long as the last axis allows
         batch, channels, rows, columns = self.shape
         layout = self.result.layout
         places = tuple(digits for digits in layout if digits and digits[-1].axis == AT)
@@ -103,6 +105,7 @@ class Sampling:
         assert form is not None
         first, second = form[0], whole(CHANNEL, channels)
         maps = (first, second, whole(ROW, rows), whole(COLUMN, columns))
+        # Image [N, C, H, W], and x and y beside each other
         image = laid_out(call, self.image, maps)
         pair = whole(PAIR, 2) if len(self.at) == 1 else ()
         grid = call.concat([laid_out(call, v, (*form, pair)) for v in self.at], 3)

@@ -183,6 +183,7 @@ def _selected(node: ir.Node, view: View) -> Selection | None:
     shape = static_shape(source)
     if source is None or shape is None:
         return None
+    # One index of a Gather, the range of a Slice, one part of a Split
     axis, size = node.attributes.get_int("axis", 0) % len(shape), 1
     if node.op_type == "Gather":
         index = integers_of(input_at(node, 1))

@@ -48,6 +48,7 @@ class HoistLinear(Pass):
         opset = opset_of(model)
         if opset < OLDEST_OPSET:
             return PassResult(model, 0)
+        # Nodes that nothing reads would hold on to what they read
         unread = remove_dead(model.graph)  # it would hold on to what it reads
         names, macs_before = value_names(model.graph), _macs(model)
         bodies, products, others = list(graphs_of(model.graph)), 0, 0
@@ -56,6 +57,7 @@ class HoistLinear(Pass):
             for node in [node for body in bodies for node in body]:
                 if node.graph is None:
                     continue
+                # Before a repetition first, then by the algebra of layers and sums
                 layer, by = layer_at(node), self.name
                 if before_repeat(FusedCall(node, opset=opset, by=by, names=names)):
                     products += layer is not None
@@ -68,6 +70,7 @@ class HoistLinear(Pass):
             remove_dead(model.graph)
             if products + others == moved:
                 break
+        # Report products, other nodes and multiply-accumulates
         less = f"{(macs_before - _macs(model)) / 1e6:,.1f} MMACs fewer"
         notes = (
             (products, f"moved {plural(products, 'product')}: {less}"),

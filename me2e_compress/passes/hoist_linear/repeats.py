@@ -88,6 +88,7 @@ def repeated_axes(value: ir.Value) -> RepeatedAxes | None:
     shape = static_shape(value)
     if not shape or 0 in shape:
         return None
+    # Every axis of the value is an index of its own
     layout: Layout = tuple(whole(str(axis), size) for axis, size in enumerate(shape))
     # Go back as far as digits can be followed; remember where the fewest elements are
     best, least = None, math.prod(shape)
@@ -239,6 +240,7 @@ def _plan(node: ir.Node, opset: int) -> _Plan | None:
         return _turned(node, value)
     if value is None or not (is_product(node) or is_row_wise(node, opset)):
         return None
+    # Two operands broadcast; one operand is mapped as it is
     if node.op_type in BINARY:
         return _combined(node, shape)
     # An operator along the last axis needs it whole
@@ -266,6 +268,7 @@ def _turned(node: ir.Node, value: ir.Value) -> _Plan | None:
 
 def _combined(node: ir.Node, shape: tuple[int, ...]) -> _Plan | None:
     """Plan an element-wise operator of two operands, each of which may repeat."""
+    # The smaller operand is repeated by the operator itself
     operands: list[_Operand] = []
     for value in node.inputs:
         given = static_shape(value)

@@ -272,6 +272,7 @@ class _Search:
         self, value: ir.Value, node: ir.Node, owned: bool, depth: int
     ) -> Form | None:
         """Multiply in front of a view of the same rows: view(x) W = view(x W)."""
+        # A view of the same rows: the last axis must stay the last
         source, shape = node.inputs[0] if node.inputs else None, static_shape(value)
         inner = static_shape(source)
         if not shape or not inner or source is None or inner[-1] != shape[-1]:
@@ -281,6 +282,7 @@ class _Search:
         order = permutation_of(node) if node.op_type == "Transpose" else None
         if node.op_type == "Transpose" and (not order or order[-1] != len(order) - 1):
             return None
+        # The same view of the product, [.., columns]
         source_form = self.of(source, owned=owned, depth=depth)
 
         def write(matrix: Numbers) -> Terms:

@@ -303,6 +303,7 @@ class FileSize(Rule):
             ]
             others.update(dict.fromkeys(readers))
             stored += 0 if readers else value.const_value.nbytes
+        # Integers are a byte each: no more than the floats that go
         if stored >= math.prod(shape):
             return None
         if others:
@@ -359,6 +360,7 @@ class NarrowConvolution(Rule):
         shape = static_shape(node.inputs[1])
         if node.op_type not in CONVOLUTIONS or shape is None:
             return None
+        # Channels on either side, those of an input within its group
         group = node.attributes.get_int("group", 1)
         inputs, outputs = shape[1], shape[0]
         if node.op_type == "ConvTranspose":
@@ -366,6 +368,7 @@ class NarrowConvolution(Rule):
         if min(inputs, outputs) >= self.minimum:
             return None
         kernel = shape[2:]
+        # Kernels of grouped and of plain convolutions
         if group > 1:
             fits = outputs % self.packing == 0 and min(kernel, default=1) >= 3
         else:
