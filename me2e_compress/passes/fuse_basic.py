@@ -1,23 +1,18 @@
 """Fuse patterns that one standard operator can express."""
 
 import dataclasses
-import itertools
 import math
 
 import numpy as np
 import onnx_ir as ir
 
 from me2e_compress.graph import (
-    array_of,
     bias_of,
     channel_axis,
-    provenance,
     static_shape,
 )
 from me2e_compress.graph.nodes import (
-    ELEMENTWISE,
     FLOATS,
-    Array,
     Numbers,
     holds_numbers,
     numbers_of,
@@ -223,60 +218,6 @@ def _chain(match: Match, kit: Kit) -> str | None:
     return None
 
 
-# Whether any condition is true: torch writes ``count_nonzero(x) > 0`` in this form. A
-# sum of ones is above 0 in either type, and onnxruntime's CPU (1.31) adds 2.56 million
-# float32 in 0.2 ms, int64 in 5.
-
-CONDITIONS = var("conditions")
-ZERO = constant(floating=False, scalar=True)
-SUM = op("ReduceSum", op("Cast", CONDITIONS), more=True)
-ANY_OF = op("Greater", SUM, ZERO)
-
-
-def _counts(match: Match, facts: Facts) -> bool:
-    zero = match.array(ZERO)
-    integers = zero.dtype.kind in "iu" and not zero.any()
-    return integers and match[CONDITIONS].dtype == ir.DataType.BOOL
-
-
-def _add_in_float(match: Match, kit: Kit) -> None:
-    total, zero = match.node(SUM), match.array(ZERO)
-    real = kit.add("Cast", [match[CONDITIONS]], {"to": int(ir.DataType.FLOAT)})
-    options = {name: attr.value for name, attr in total.attributes.items()}
-    added = kit.add("ReduceSum", [real, *total.inputs[1:]], options)
-    name = f"{match[ZERO].name}_float"
-    kit.put("Greater", [added, kit.constant(zero.astype(np.float32), name)])
-
-
-# A constant of one number gets the rank of the other operand if the last axes of that
-# have size 1; the result is the same. onnxruntime's CPU (1.31) merges axes of size 1
-# only if both operands have them, and computes one element at a time otherwise: a
-# comparison of 240,000 elements takes 1.39 ms, not 0.03.
-
-# Elements that take onnxruntime 6 us one at a time: three starts of a node.
-LEAST = 1000
-
-
-def _slow_scalar(node: ir.Node) -> tuple[int, Array] | None:
-    """Return the index of a constant of one number, and that with the other's rank."""
-    for index in (0, 1):
-        array = array_of(node.inputs[index])
-        shape = static_shape(node.inputs[1 - index])
-        if array is None or array.size != 1 or shape is None:
-            continue
-        ones = sum(1 for _ in itertools.takewhile(lambda n: n == 1, reversed(shape)))
-        if ones and array.ndim <= ones and math.prod(shape) >= LEAST:
-            return index, array.reshape((1,) * len(shape))
-    return None
-
-
-def _give_axes(match: Match, kit: Kit) -> None:
-    node, slow = match.root, _slow_scalar(match.root)
-    assert slow is not None
-    kit.refill(node, *slow, f"{node.outputs[0].name}_scalar")
-    provenance.inherit(node, (node,), by=kit.by)
-
-
 FUSIONS = (
     Fusion("layers with what follows them", AFFINE, _fold_affine, where=_is_affine),
     Fusion(
@@ -288,12 +229,5 @@ FUSIONS = (
     *(
         Fusion("constant chains", op(kind, op(kind, SOURCE, FIRST), SECOND), _chain)
         for kind in ("Add", "Mul")
-    ),
-    Fusion("sums of conditions", ANY_OF, _add_in_float, where=_counts),
-    Fusion(
-        "axes of constants",
-        op(ELEMENTWISE, var("left"), var("right")),
-        _give_axes,
-        where=lambda match, facts: _slow_scalar(match.root) is not None,
     ),
 )
