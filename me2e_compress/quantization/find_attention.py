@@ -81,6 +81,8 @@ _FUSED = frozenset(
 
 _PRODUCTS = ("Einsum", "Gemm", "MatMul")
 
+# What may stand between the softmax and the product with the values: dropout, masks,
+# layout.
 _LAYOUT = frozenset(
     {
         "Cast", "Div", "Dropout", "Expand", "Flatten", "Identity", "Mul", "Reshape",
@@ -91,10 +93,6 @@ _LAYOUT = frozenset(
 # What may stand between the product of queries and keys and the softmax: scale,
 # masks (additive or boolean), relative positions, layout.
 _SCORES = _LAYOUT | {"Add", "Clip", "Max", "Min", "Neg", "Sub"}
-
-# What may stand between the softmax and the product with the values: dropout, masks,
-# layout.
-_WEIGHTS = _LAYOUT
 
 
 @dataclasses.dataclass(frozen=True)
@@ -138,7 +136,7 @@ def find_attention(
 
     # products behind the scores, and ahead of the weights, of every softmax
     scored = behind(model.graph, _SCORES, is_product)
-    weighed = ahead(model.graph, _WEIGHTS, is_product)
+    weighed = ahead(model.graph, _LAYOUT, is_product)
     attentions: dict[ir.Node, Attention] = {}
     for node in model.graph:
         if is_fused(node):  # tokens of [batch, (heads,) tokens, width]
@@ -173,7 +171,7 @@ def find_attention_weights(
     mean position over bins does.
     """
     reasons = dict.fromkeys(attention, "gives or reads attention weights")
-    softmaxes = behind(model.graph, _WEIGHTS, lambda node: node.op_type == "Softmax")
+    softmaxes = behind(model.graph, _LAYOUT, lambda node: node.op_type == "Softmax")
     for node in model.graph:
         reads = node.inputs[:2] if node.op_type in WEIGHTED else ()
         if any(value in softmaxes for value in reads if value is not None):

@@ -31,21 +31,25 @@ _NAMED = re.compile(
     re.IGNORECASE,
 )
 
+# What positions are computed with, after the last layer that gave them.
+_POSITION_ARITHMETIC = frozenset(
+    {
+        "Abs", "Add", "Cast", "Ceil", "Clip", "Concat", "Cos", "Div", "Dropout", "Exp",
+        "Expand", "Flatten", "Floor", "Gather", "GatherElements", "GatherND",
+        "Identity", "Log", "Max", "Min", "Mod", "Mul", "Neg", "Pad", "Pow",
+        "Reciprocal", "Reshape", "Round", "Sigmoid", "Sin", "Slice", "Split", "Sqrt",
+        "Squeeze", "Sub", "Tanh", "Tile", "Transpose", "Unsqueeze", "Where",
+    }
+)  # fmt: skip
+
 # What points stay points through, besides the inverse of a matrix: no product, no
 # comparison, no sine or cosine (an embedding, as fine as its 8 bits), no softmax, no
 # sampler.
-_ARITHMETIC = frozenset(
-    {
-        "Abs", "Add", "BatchNormalization", "Cast", "Ceil", "Clip", "Concat", "Div",
-        "Dropout", "Exp", "Expand", "Flatten", "Floor", "Gather", "GatherElements",
-        "GatherND", "Identity", "InstanceNormalization", "LayerNormalization", "Log",
-        "Max", "Min", "Mod", "Mul", "Neg",
-        "Pad", "Pow", "Reciprocal", "ReduceL2", "ReduceMax", "ReduceMean", "ReduceMin",
-        "ReduceSum", "Relu", "Reshape", "Round", "ScatterElements", "ScatterND",
-        "Sigmoid", "Slice", "Split", "Sqrt", "Squeeze", "Sub", "Tanh", "Tile",
-        "Transpose", "Unsqueeze", "Where",
-    }
-)  # fmt: skip
+_ARITHMETIC = _POSITION_ARITHMETIC - {"Cos", "Sin"} | {
+    "BatchNormalization", "InstanceNormalization", "LayerNormalization", "ReduceL2",
+    "ReduceMax", "ReduceMean", "ReduceMin", "ReduceSum", "Relu", "ScatterElements",
+    "ScatterND",
+}  # fmt: skip
 
 # Inputs that hold data: the others are shapes, indices, bounds and conditions.
 _DATA: Mapping[str, tuple[int, ...]] = {
@@ -217,17 +221,6 @@ _POSITIONS: dict[str, tuple[int, ...]] = {
     **dict.fromkeys(("Gather", "GatherElements", "GatherND", "GridSample"), (1,)),
     **dict.fromkeys(("ScatterElements", "ScatterND"), (1,)),
 }
-
-# What positions are computed with, after the last layer that gave them.
-_POSITION_ARITHMETIC = frozenset(
-    {
-        "Abs", "Add", "Cast", "Ceil", "Clip", "Concat", "Cos", "Div", "Dropout", "Exp",
-        "Expand", "Flatten", "Floor", "Gather", "GatherElements", "GatherND",
-        "Identity", "Log", "Max", "Min", "Mod", "Mul", "Neg", "Pad", "Pow",
-        "Reciprocal", "Reshape", "Round", "Sigmoid", "Sin", "Slice", "Split", "Sqrt",
-        "Squeeze", "Sub", "Tanh", "Tile", "Transpose", "Unsqueeze", "Where",
-    }
-)  # fmt: skip
 
 _LAYOUT = frozenset(
     {
