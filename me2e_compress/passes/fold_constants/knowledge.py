@@ -215,25 +215,16 @@ COMPUTE = frozenset(
 
 @dataclasses.dataclass
 class Sweep:
-    """Walks one graph in order and collects its constant expressions.
-
-    Attributes:
-        opset: of the graph.
-        refused: nodes that failed in onnxruntime.
-        learnt: values whose shape or data ONNX's shape inference did not know.
-        through_compute: whether products and convolutions are constant expressions.
-        trust_shapes: False inside loops, where shapes may change.
-        known: what the walk knows so far.
-        keys: the expressions by operator, inputs and attributes.
-    """
+    """Walks one graph in order and collects its constant expressions."""
 
     opset: int
-    refused: set[ir.Node]
-    learnt: set[ir.Value]
+    refused: set[ir.Node]  # failed in onnxruntime
+    learnt: set[ir.Value]  # ONNX's shape inference did not know their shape or data
     _: dataclasses.KW_ONLY
-    through_compute: bool
-    trust_shapes: bool
+    through_compute: bool  # whether products and convolutions are constant expressions
+    trust_shapes: bool  # False inside loops, where shapes may change
     known: Knowledge = dataclasses.field(default_factory=Knowledge)
+    # Expressions by operator, inputs and attributes
     keys: dict[object, Expression] = dataclasses.field(default_factory=dict)
 
     def visit_nodes(self, graph: ir.Graph) -> Knowledge:

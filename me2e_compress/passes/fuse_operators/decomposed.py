@@ -33,16 +33,12 @@ SAMPLING = {
 
 @dataclasses.dataclass(frozen=True)
 class Level:
-    """One feature map and where it is sampled.
-
-    ``image`` is [batch * heads, channels, height, width], ``grid`` [batch * heads,
-    rows, columns, 2], where -1 and 1 are the edges; ``size`` is height and width.
-    """
+    """One feature map and where it is sampled."""
 
     node: ir.Node
-    image: View
-    grid: View
-    size: tuple[int, int]
+    image: View  # [batch * heads, channels, height, width]
+    grid: View  # [batch * heads, rows, columns, 2], where -1 and 1 are the edges
+    size: tuple[int, int]  # height and width
 
     @property
     def pixels(self) -> int:
@@ -52,30 +48,18 @@ class Level:
 
 @dataclasses.dataclass(frozen=True)
 class Decomposed:
-    """A deformable attention in standard operators.
+    """A deformable attention in standard operators."""
 
-    Attributes:
-        levels: its feature maps, in the order in which they are joined.
-        results: the sum, and results of layout operators after it; each may be
-            replaced.
-        queries: the digits of rows and columns that remain after the sum.
-        points: the digits of rows and columns that are summed over, without the level.
-        batch: images times heads.
-        mask: factor of the results of each image before they are added, or None.
-        images: the digits of the batch that are then added up: cameras or frames.
-        scale: factor of that sum, 1 / count for a mean.
-    """
-
-    levels: tuple[Level, ...]
+    levels: tuple[Level, ...]  # feature maps, in the order in which they are joined
     weights: View
-    results: tuple[View, ...]
-    queries: Digits
-    points: Digits
-    batch: int
+    results: tuple[View, ...]  # the sum, and its layouts; each may be replaced
+    queries: Digits  # of rows and columns, those that remain after the sum
+    points: Digits  # those that are summed over, without the level
+    batch: int  # images times heads
     channels: int
-    mask: View | None = None
-    images: Digits = ()
-    scale: float = 1.0
+    mask: View | None = None  # factor of each image's results before they are added
+    images: Digits = ()  # of the batch, those then added up: cameras or frames
+    scale: float = 1.0  # factor of that sum, 1 / count for a mean
 
 
 def find(node: ir.Node) -> Decomposed:

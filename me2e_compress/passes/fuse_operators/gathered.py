@@ -47,22 +47,14 @@ LEAST_POSITIONS = 60
 
 @dataclasses.dataclass(frozen=True)
 class Sampling:
-    """A guess at what a sum of gathered corners samples, to be proven.
+    """A guess at what a sum of gathered corners samples, to be proven."""
 
-    Attributes:
-        result: the sum.
-        image: the feature map, of ``shape`` [batch, channels, rows, columns].
-        at: where: one value of both axes, or x and y.
-        scale: what takes that to pixels, for x and for y.
-        shift: what is then added; 0 is the middle of the first pixel.
-    """
-
-    result: View
-    image: View
-    shape: tuple[int, int, int, int]
-    at: tuple[View, ...]
-    scale: tuple[float, float]
-    shift: tuple[float, float]
+    result: View  # the sum
+    image: View  # the feature map
+    shape: tuple[int, int, int, int]  # its [batch, channels, rows, columns]
+    at: tuple[View, ...]  # positions: one value of both axes, or x and y
+    scale: tuple[float, float]  # takes these to pixels, for x and for y
+    shift: tuple[float, float]  # is then added; 0 is the middle of the first pixel
 
     @property
     def draws(self) -> int:

@@ -65,19 +65,12 @@ LONGEST = 16
 
 @dataclasses.dataclass(frozen=True)
 class RepeatedAxes:
-    """A value that is ``Expand(Reshape(source, small), large)``, reshaped.
+    """A value that is ``Expand(Reshape(source, small), large)``, reshaped."""
 
-    Attributes:
-        source: the value that holds every element once.
-        small: the sizes of ``large``, and 1 where the value repeats.
-        large: the shape of the value; axes that repeat in part are split.
-        nodes: the nodes between both, the last one first.
-    """
-
-    source: ir.Value
-    small: tuple[int, ...]
-    large: tuple[int, ...]
-    nodes: tuple[ir.Node, ...]
+    source: ir.Value  # holds every element once
+    small: tuple[int, ...]  # the sizes of ``large``, and 1 where the value repeats
+    large: tuple[int, ...]  # its shape; axes that repeat in part are split
+    nodes: tuple[ir.Node, ...]  # between both, the last one first
 
 
 def repeated_axes(value: ir.Value) -> RepeatedAxes | None:
@@ -196,19 +189,12 @@ def is_row_wise(node: ir.Node, opset: int) -> bool:
 
 @dataclasses.dataclass(frozen=True)
 class _Operand:
-    """An operand of the node that is computed once.
+    """An operand of the node that is computed once."""
 
-    Attributes:
-        value: the operand now, with its repetitions.
-        shape: the shape of the operand without them.
-        repeated: where it is read without them; None if it does not repeat.
-        numbers: the numbers of a constant, without them.
-    """
-
-    value: ir.Value
-    shape: tuple[int, ...]
-    repeated: RepeatedAxes | None = None
-    numbers: Array | None = None
+    value: ir.Value  # the operand now, with its repetitions
+    shape: tuple[int, ...]  # without them
+    repeated: RepeatedAxes | None = None  # where it is read without them
+    numbers: Array | None = None  # those of a constant, without repetitions
 
 
 @dataclasses.dataclass(frozen=True)

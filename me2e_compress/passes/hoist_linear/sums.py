@@ -139,17 +139,11 @@ Terms: TypeAlias = list[ir.Value | Numbers]
 
 @dataclasses.dataclass(frozen=True)
 class Form:
-    """A way to multiply a value by a matrix of so many columns.
+    """A way to multiply a value by a matrix of so many columns."""
 
-    Attributes:
-        macs: multiply-accumulates per frame, less those of layers that go with it.
-        cost: the same in node starts, with nodes and bytes that are new.
-        write: writes the nodes for a matrix.
-    """
-
-    macs: int
-    cost: float
-    write: Callable[[Numbers], Terms]
+    macs: int  # per frame, less those of layers that go with it
+    cost: float  # the same in node starts, with nodes and bytes that are new
+    write: Callable[[Numbers], Terms]  # writes the nodes for a matrix
 
 
 def multiply_earlier(layer: LinearLayer, call: FusedCall) -> bool:
