@@ -30,12 +30,7 @@ from me2e_compress.graph.nodes import (
     producer_of,
 )
 from me2e_compress.passes.base import Context, Pass, PassResult
-from me2e_compress.passes.convert_float32 import (
-    FLOAT,
-    HALF,
-    ElementTypes,
-    Retyping,
-)
+from me2e_compress.passes.convert_float32 import FLOAT, HALF, ElementTypes, Retyping
 from me2e_compress.quantization.geometry import position_arithmetic
 from me2e_compress.targets.quantized import (
     DEQUANTIZE,
@@ -228,10 +223,7 @@ def _fits(numbers: Numbers) -> bool:
 
 
 def _by_ranges(
-    model: ir.Model,
-    types: ElementTypes,
-    known: Collection[ir.Node],
-    context: Context,
+    model: ir.Model, types: ElementTypes, known: Collection[ir.Node], context: Context
 ) -> dict[ir.Node, str]:
     """Map the nodes that read or make too large numbers on the frames to the size."""
     # Map the measured values to the nodes that touch them

@@ -10,6 +10,7 @@ from me2e_compress.base.display import plural
 from me2e_compress.graph import is_standard, opset_of, static_shape
 from me2e_compress.graph.nodes import graphs_of
 from me2e_compress.graph.rewrite import remove_dead, remove_unread, value_names
+from me2e_compress.graph.rewrite.raise_opset import OLDEST_OPSET
 from me2e_compress.graph.summary import value_bytes
 from me2e_compress.operators import FusedCall
 from me2e_compress.passes.base import Context, Pass, PassResult
@@ -20,9 +21,6 @@ from me2e_compress.passes.work import (
     SMALL_PRODUCTS_PER_NODE,
     small_products,
 )
-
-# The first opset whose MatMul multiplies integers too, so that no type matters.
-OLDEST_OPSET = 9
 
 Shape = tuple[int, ...]
 

@@ -6,11 +6,7 @@ import math
 import numpy as np
 import onnx_ir as ir
 
-from me2e_compress.graph import (
-    bias_of,
-    channel_axis,
-    static_shape,
-)
+from me2e_compress.graph import bias_of, channel_axis, opset_of, static_shape
 from me2e_compress.graph.nodes import (
     FLOATS,
     Numbers,
@@ -30,6 +26,7 @@ from me2e_compress.graph.rewrite import (
     op,
     var,
 )
+from me2e_compress.graph.rewrite.raise_opset import OLDEST_OPSET
 from me2e_compress.passes.base import Context, Pass, PassResult
 
 
@@ -51,6 +48,8 @@ class FuseBasic(Pass):
 
     def run(self, model: ir.Model, context: Context) -> PassResult:
         """Try every fusion on every node until none applies."""
+        if opset_of(model) < OLDEST_OPSET:  # operators had other rules then
+            return PassResult(model, 0)
         fused = fuse(model, FUSIONS, by=self.name)
         return PassResult(model, fused.changes, fused.notes())
 
@@ -66,8 +65,7 @@ NUMBERS = constant()
 STATISTICS = tuple(constant() for _ in range(4))
 
 AFFINE = either(
-    op("BatchNormalization", LAYER, *STATISTICS),
-    op(("Add", "Mul"), LAYER, NUMBERS),
+    op("BatchNormalization", LAYER, *STATISTICS), op(("Add", "Mul"), LAYER, NUMBERS)
 )
 
 
@@ -77,7 +75,7 @@ def _is_affine(match: Match, facts: Facts) -> bool:
         return _affine(match) is not None
     training = node.attributes.get_int("training_mode", 0)
     outputs = [value for value in node.outputs[1:] if value.name]
-    return not training and not outputs and facts.opset >= 9
+    return not training and not outputs
 
 
 def _affine(match: Match) -> tuple[Numbers, Numbers] | None:
@@ -184,7 +182,7 @@ PLUS = op("Add", INNER, OFFSET)
 def _is_of_matrices(match: Match, facts: Facts) -> bool:
     """Return whether the product has rank 2 and the offset varies only by column."""
     inner = match.node(INNER)
-    if facts.opset < 7 or match.root.outputs[0].dtype not in FLOATS:
+    if match.root.outputs[0].dtype not in FLOATS:
         return False
     left, right, out = map(static_shape, (*inner.inputs, *inner.outputs))
     if left is None or right is None or out is None:

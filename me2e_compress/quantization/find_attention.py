@@ -7,12 +7,7 @@ from typing import TypeAlias
 
 import onnx_ir as ir
 
-from me2e_compress.graph import (
-    WEIGHTED,
-    input_at,
-    is_standard,
-    static_shape,
-)
+from me2e_compress.graph import WEIGHTED, input_at, is_standard, static_shape
 from me2e_compress.graph.shapes import open_shape
 from me2e_compress.operators import op_types
 

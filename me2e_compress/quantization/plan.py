@@ -187,11 +187,7 @@ def tensors_of(plan: QuantPlan, model: ir.Model) -> tuple[str, ...]:
 
 
 def _decide(
-    node: ir.Node,
-    facts: RuleFacts,
-    rules: Sequence[Rule],
-    pins: Pins,
-    main: ir.Graph,
+    node: ir.Node, facts: RuleFacts, rules: Sequence[Rule], pins: Pins, main: ir.Graph
 ) -> Decision:
     decision = functools.partial(
         Decision,
@@ -249,10 +245,7 @@ def _int8(
 
 
 def _residuals(
-    graph: ir.Graph,
-    decided: Mapping[ir.Node, Decision],
-    facts: RuleFacts,
-    pins: Pins,
+    graph: ir.Graph, decided: Mapping[ir.Node, Decision], facts: RuleFacts, pins: Pins
 ) -> dict[ir.Node, Decision]:
     """Decide the Adds that end a residual block: which branch is read as int8.
 

@@ -17,6 +17,7 @@ from me2e_compress.graph.nodes import (
     is_standard,
 )
 from me2e_compress.graph.rewrite import bypass, can_replace, remove_dead, remove_node
+from me2e_compress.graph.rewrite.raise_opset import OLDEST_OPSET
 from me2e_compress.passes.base import Context, Pass, PassResult
 from me2e_compress.passes.eliminate_redundant.rules import MergeSite, identity_of, merge
 
@@ -91,13 +92,15 @@ class EliminateRedundant(Pass):
 
     def run(self, model: ir.Model, context: Context) -> PassResult:
         """Apply the rules until none applies, then drop unread nodes."""
+        if opset_of(model) < OLDEST_OPSET:  # operators had other rules then
+            return PassResult(model, 0)
         tally: Counter[str] = Counter()
         tally["unread"] += remove_dead(model.graph)
         # Repeat: each round enables rules for the next
         for _ in range(ROUNDS):
             before = tally.total()
             for body in graphs_of(model.graph):
-                self._round(body, opset_of(model), tally)
+                self._round(body, tally)
             tally["unread"] += remove_dead(model.graph)
             if tally.total() == before:
                 break
@@ -115,8 +118,8 @@ class EliminateRedundant(Pass):
         notes = (f"removed: {removed}",) if removed else ()
         return PassResult(model, tally.total(), notes)
 
-    def _round(self, body: ir.Graph, opset: int, tally: Counter[str]) -> None:
-        site = MergeSite(body, opset, self.name)
+    def _round(self, body: ir.Graph, tally: Counter[str]) -> None:
+        site = MergeSite(body, self.name)
         tally["initializers"] += share_initializers(body)
         work = dict.fromkeys(reversed(list(body)))
         while work:
@@ -135,7 +138,7 @@ class EliminateRedundant(Pass):
             tally["unread"] += 1
             return makers
         # A node that repeats its input is bypassed
-        same = identity_of(node, site.opset)
+        same = identity_of(node)
         if same is not None and bypass(node.outputs[0], same):
             remove_node(node)
             tally["identities"] += 1

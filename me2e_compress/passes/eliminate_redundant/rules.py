@@ -33,20 +33,17 @@ from me2e_compress.graph.nodes import (
 )
 from me2e_compress.graph.rewrite import add_constant, bypass, put, value_names
 
-Identity = Callable[[ir.Node, int], ir.Value | None]
-
-OLDEST_OPSET = 7
-"""Broadcasting, Dropout and BatchNormalization followed other rules before."""
+Identity = Callable[[ir.Node], ir.Value | None]
 
 
-def identity_of(node: ir.Node, opset: int) -> ir.Value | None:
+def identity_of(node: ir.Node) -> ir.Value | None:
     """Return the value that a node only repeats; None if it does something."""
-    if not is_standard(node) or opset < OLDEST_OPSET or not node.outputs:
+    if not is_standard(node) or not node.outputs:
         return None
     rule = IDENTITIES.get(node.op_type)
     if rule is None or any(is_read(value) for value in node.outputs[1:]):
         return None
-    return rule(node, opset)
+    return rule(node)
 
 
 def same_shape(one: ir.Value | None, other: ir.Value | None) -> bool:
@@ -55,28 +52,28 @@ def same_shape(one: ir.Value | None, other: ir.Value | None) -> bool:
     return shape is not None and shape == static_shape(other)
 
 
-def _if_same_shape(node: ir.Node, opset: int) -> ir.Value | None:
+def _if_same_shape(node: ir.Node) -> ir.Value | None:
     return node.inputs[0] if same_shape(node.inputs[0], node.outputs[0]) else None
 
 
-def _if_alone(node: ir.Node, opset: int) -> ir.Value | None:
+def _if_alone(node: ir.Node) -> ir.Value | None:
     """One operand of a Concat or Max, one part of a Split."""
     values = node.outputs if node.op_type == "Split" else node.inputs
     return node.inputs[0] if len(values) == 1 else None
 
 
-def _cast(node: ir.Node, opset: int) -> ir.Value | None:
+def _cast(node: ir.Node) -> ir.Value | None:
     source = node.inputs[0]
     if source is None or source.dtype is None:
         return None
     return source if source.dtype == node.attributes.get_int("to", 0) else None
 
 
-def _transpose(node: ir.Node, opset: int) -> ir.Value | None:
+def _transpose(node: ir.Node) -> ir.Value | None:
     order = permutation_of(node)
     if order is not None and order == sorted(order):
         return node.inputs[0]
-    return _if_same_shape(node, opset) if moves_nothing(node) else None
+    return _if_same_shape(node) if moves_nothing(node) else None
 
 
 def moves_nothing(node: ir.Node) -> bool:
@@ -88,12 +85,12 @@ def moves_nothing(node: ir.Node) -> bool:
     return real == sorted(real)
 
 
-def _slice(node: ir.Node, opset: int) -> ir.Value | None:
+def _slice(node: ir.Node) -> ir.Value | None:
     steps = input_at(node, 4)
     known = [] if steps is None else integers_of(steps)
     if known is None or {*known} - {1}:
         return None
-    return _if_same_shape(node, opset) or _sliced_part(node)
+    return _if_same_shape(node) or _sliced_part(node)
 
 
 def _sliced_part(node: ir.Node) -> ir.Value | None:
@@ -122,7 +119,7 @@ def _sliced_part(node: ir.Node) -> ir.Value | None:
     return None
 
 
-def _pad(node: ir.Node, opset: int) -> ir.Value | None:
+def _pad(node: ir.Node) -> ir.Value | None:
     pads = integers_at(node, "pads", 1)
     return node.inputs[0] if pads is not None and not any(pads) else None
 
@@ -130,7 +127,7 @@ def _pad(node: ir.Node, opset: int) -> ir.Value | None:
 def _neutral(test: Callable[[Array], bool], *, either: bool) -> Identity:
     """Build the rule of a neutral constant; of ``either`` operand if they commute."""
 
-    def rule(node: ir.Node, opset: int) -> ir.Value | None:
+    def rule(node: ir.Node) -> ir.Value | None:
         for kept, other in ((0, 1), (1, 0))[: 2 if either else 1]:
             array, source = array_of(node.inputs[other]), node.inputs[kept]
             if array is None or source is None or not array.size or not test(array):
@@ -160,7 +157,7 @@ def _one(array: Array) -> bool:
     return array.dtype.kind in "iuf" and bool(np.all(array == 1))
 
 
-def _where(node: ir.Node, opset: int) -> ir.Value | None:
+def _where(node: ir.Node) -> ir.Value | None:
     """A choice between a value and itself."""
     yes, no = node.inputs[1:]
     return yes if yes is no and same_shape(yes, node.outputs[0]) else None
@@ -173,8 +170,8 @@ IDENTITIES: dict[str, Identity] = {
     "Add": _neutral(functools.partial(_zero, negative=True), either=True),
     "Cast": _cast,
     "Div": _neutral(_one, either=False),
-    "Dropout": lambda node, opset: None if draws(node) else node.inputs[0],
-    "Identity": lambda node, opset: node.inputs[0],
+    "Dropout": lambda node: None if draws(node) else node.inputs[0],
+    "Identity": lambda node: node.inputs[0],
     "Mul": _neutral(_one, either=True),
     "Pad": _pad,
     "Slice": _slice,
@@ -194,7 +191,6 @@ class MergeSite:
     """A graph that is being rewritten, and the constants made for it so far."""
 
     graph: ir.Graph
-    opset: int
     by: str
     shapes: dict[tuple[int, ...], ir.Value] = dataclasses.field(default_factory=dict)
     names: set[str] = dataclasses.field(default_factory=set)
@@ -235,7 +231,7 @@ def _is_view(node: ir.Node) -> bool:
 def _views(node: ir.Node, site: MergeSite) -> ir.Node | None:
     """Merge consecutive Reshape, Flatten, Squeeze and Unsqueeze into one or none."""
     inner, sizes = _before(node), static_shape(node.outputs[0])
-    if inner is None or sizes is None or 0 in sizes or site.opset < 5:
+    if inner is None or sizes is None or 0 in sizes:
         return None
     if not _is_view(node) or not _is_view(inner):
         return None
@@ -313,7 +309,7 @@ def _concats(node: ir.Node, site: MergeSite) -> ir.Node | None:
 def _drop_expand(node: ir.Node, site: MergeSite) -> ir.Node | None:
     """Drop an Expand, or a Tile that only repeats, before a broadcasting operator."""
     target = static_shape(node.outputs[0])
-    if target is None or site.opset < 8:
+    if target is None:
         return None
     # Look for an operand that only repeats axes of size 1
     for index, value in enumerate(node.inputs):

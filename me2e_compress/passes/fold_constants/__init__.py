@@ -281,10 +281,7 @@ def _notes(tally: Counter[str], refused: Counter[str]) -> tuple[str, ...]:
             tally["inlined"],
             "branches took the places of Ifs whose conditions are known",
         ),
-        (
-            tally["kept"],
-            f"{kept} left to compute constants: smaller than their values",
-        ),
+        (tally["kept"], f"{kept} left to compute constants: smaller than their values"),
         (listed, f"onnxruntime cannot evaluate {listed}: left as they are"),
     )
     return tuple(note for condition, note in notes if condition)

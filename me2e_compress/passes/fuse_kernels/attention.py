@@ -14,12 +14,10 @@ from me2e_compress.graph.nodes import (
     sole_reader,
 )
 from me2e_compress.graph.rewrite import bypass
+from me2e_compress.graph.rewrite.raise_opset import OLDEST_OPSET
 from me2e_compress.graph.shapes import static_shape
 from me2e_compress.operators import OWN_DOMAIN, FusedCall
 from me2e_compress.operators.kernels.kernel import ATTENTION
-
-# The first opset for which fused nodes have bodies.
-_OPSET = 13
 
 # How near to 1 / sqrt(C) a scale must be, relative, to need no product.
 _SAME = 1e-6
@@ -68,8 +66,8 @@ def fuse_attention(node: ir.Node, call: FusedCall) -> ir.Value | None:
     attention = None if softmax is None else _match(node, softmax)
     if attention is None or softmax is None:
         return None
-    if call.opset < _OPSET:
-        raise PreconditionError(f"fused nodes need opset {_OPSET} or later")
+    if call.opset < OLDEST_OPSET:
+        raise PreconditionError(f"fused nodes need opset {OLDEST_OPSET} or later")
     return _fused(call, attention, _checked(attention, softmax))
 
 

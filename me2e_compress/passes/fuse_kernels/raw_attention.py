@@ -11,6 +11,7 @@ import onnx_ir as ir
 from me2e_compress.base.errors import PreconditionError
 from me2e_compress.graph import array_of, is_standard, static_shape
 from me2e_compress.graph.nodes import producer_of, sole_reader
+from me2e_compress.graph.rewrite.raise_opset import OLDEST_OPSET
 from me2e_compress.operators import OWN_DOMAIN, FusedCall
 from me2e_compress.operators.deformable_attention import RAW_ATTENTION
 from me2e_compress.passes.digits import Digit, Layout, flat, merged, whole
@@ -26,9 +27,6 @@ from me2e_compress.passes.fuse_operators.views import View, aligned, sources, te
 BATCH, QUERY, HEAD, LEVEL, POINT = "batch", "query", "head", "level", "point"
 # The axes of locations, which are in 0..1: not the ``xy`` of a grid's in -1..1.
 XY = "x, y"
-
-# Before, Softmax was over all axes from one on.
-SOFTMAX_OPSET = 13
 
 
 @dataclasses.dataclass(frozen=True)
@@ -101,7 +99,7 @@ def fuse_raw_attention(node: ir.Node, call: FusedCall) -> ir.Value | None:
     Operands are read before they are repeated. An operand that is no such sum or
     softmax, or that other nodes read too, stays as it is.
     """
-    form = _match(node) if call.opset >= SOFTMAX_OPSET else None
+    form = _match(node) if call.opset >= OLDEST_OPSET else None
     if form is None:
         return None
     inputs = [*node.inputs[:3], *_written(call, form)]

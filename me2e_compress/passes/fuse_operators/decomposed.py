@@ -12,12 +12,7 @@ import onnx_ir as ir
 
 from me2e_compress.base.errors import PreconditionError
 from me2e_compress.graph import is_standard, static_shape
-from me2e_compress.graph.nodes import (
-    LAYOUT_OPERATORS,
-    integers_at,
-    maker,
-    sole_reader,
-)
+from me2e_compress.graph.nodes import LAYOUT_OPERATORS, integers_at, maker, sole_reader
 from me2e_compress.passes.digits import Digit, Digits, flat, whole
 from me2e_compress.passes.fuse_operators.views import View, aligned, results
 

@@ -8,15 +8,13 @@ from me2e_compress.base.display import plural
 from me2e_compress.graph import macs, nodes_of, opset_of
 from me2e_compress.graph.nodes import graphs_of
 from me2e_compress.graph.rewrite import remove_dead, value_names
+from me2e_compress.graph.rewrite.raise_opset import OLDEST_OPSET
 from me2e_compress.operators import FusedCall
 from me2e_compress.passes.base import Context, Pass, PassResult
 from me2e_compress.passes.hoist_linear.repeats import before_repeat
 from me2e_compress.passes.hoist_linear.sums import layer_at, multiply_earlier
 
 __all__ = ["HoistLinear"]
-
-OLDEST_OPSET = 8
-"""The first opset that has Expand and broadcasts as numpy does."""
 
 ROUNDS = 8
 """A round may move further what the last one moved: real graphs need two."""

@@ -165,11 +165,8 @@ BINARY = frozenset({"Add", "Div", "Max", "Min", "Mul", "Pow", "Sub"})
 # Operators that map every row by itself where their axis is the last.
 ALONG_AXIS = frozenset({"LayerNormalization", "LogSoftmax", "Softmax"})
 
-SOFTMAX_OPSET = 13
-"""Before, the axis of a softmax was the second by default."""
 
-
-def is_row_wise(node: ir.Node, opset: int) -> bool:
+def is_row_wise(node: ir.Node) -> bool:
     """Return whether a node maps every element, or every row of the last axis."""
     if not is_standard(node) or any(map(is_read, node.outputs[1:])):
         return False
@@ -180,11 +177,10 @@ def is_row_wise(node: ir.Node, opset: int) -> bool:
     # Normalizations must work along the last axis
     if node.op_type not in ALONG_AXIS:
         return False
-    rank, softmax = rank_of(node.outputs[0]) or 0, node.op_type != "LayerNormalization"
-    if not softmax and rank_of(node.inputs[1]) != 1:
+    if node.op_type == "LayerNormalization" and rank_of(node.inputs[1]) != 1:
         return False
-    default = 1 if softmax and opset < SOFTMAX_OPSET else -1
-    return node.attributes.get_int("axis", default) in (-1, rank - 1)
+    rank = rank_of(node.outputs[0]) or 0
+    return node.attributes.get_int("axis", -1) in (-1, rank - 1)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -208,14 +204,14 @@ class _Plan:
 
 def before_repeat(call: FusedCall) -> bool:
     """Compute a node before the repetition of what it reads, where that pays."""
-    plan = _plan(call.node, call.opset)
+    plan = _plan(call.node)
     if plan is None or not _pays(call.node, plan):
         return False
     _rewrite(call, plan)
     return True
 
 
-def _plan(node: ir.Node, opset: int) -> _Plan | None:
+def _plan(node: ir.Node) -> _Plan | None:
     shape = static_shape(node.outputs[0])
     if not shape or not is_standard(node):
         return None
@@ -224,7 +220,7 @@ def _plan(node: ir.Node, opset: int) -> _Plan | None:
     value = node.inputs[0] if node.inputs else None
     if node.op_type == "Transpose" and value is not None:
         return _turned(node, value)
-    if value is None or not (is_product(node) or is_row_wise(node, opset)):
+    if value is None or not (is_product(node) or is_row_wise(node)):
         return None
     # Two operands broadcast; one operand is mapped as it is
     if node.op_type in BINARY:
