@@ -89,7 +89,13 @@ def stretched(have: tuple[int, ...], want: tuple[int, ...]) -> tuple[int, ...] |
     padded = (1,) * (len(want) - len(have)) + have
     if all(one in (1, full) for one, full in zip(padded, want, strict=True)):
         return padded
-    places = _places(without_ones(have), want)
+    # All axes that have these sizes, in this order
+    sizes = without_ones(have)
+    places = [
+        axes
+        for axes in itertools.combinations(range(len(want)), len(sizes))
+        if tuple(want[axis] for axis in axes) == sizes
+    ]
     if len(places) != 1:  # none, or several
         return None
     return tuple(size if axis in places[0] else 1 for axis, size in enumerate(want))
@@ -107,20 +113,6 @@ def fit(value: ir.Value, like: ir.Value) -> int:
         return 0
     padded = stretched(have, want)
     return 0 if padded is None else 1 + (padded == want)
-
-
-def _places(
-    sizes: tuple[int, ...], want: tuple[int, ...], start: int = 0
-) -> list[tuple[int, ...]]:
-    """Return all axes of a shape that have these sizes, in this order."""
-    if not sizes:
-        return [()]
-    return [
-        (axis, *rest)
-        for axis in range(start, len(want))
-        if want[axis] == sizes[0]
-        for rest in _places(sizes[1:], want, axis + 1)
-    ]
 
 
 def module_of(value: ir.Value) -> str:
@@ -436,9 +428,10 @@ def _fit(edge: Edge, new: ir.Value, old: ir.Value) -> int:
     """Return how well two values can be joined; 0 means not at all."""
     if edge.how != "append":
         return fit(new, old)
-    have, want = _as_queries(new, old), graph.static_shape(old)
-    if have is None or want is None or new.dtype != old.dtype:
+    have, want = graph.static_shape(new), graph.static_shape(old)
+    if have is None or want is None or new.dtype != old.dtype or len(have) > len(want):
         return 0
+    have = (1,) * (len(want) - len(have)) + have
     # All other axes must agree
     axis = edge.axis
     if not -len(want) <= axis < len(want) or want[axis] < 2:
@@ -447,19 +440,11 @@ def _fit(edge: Edge, new: ir.Value, old: ir.Value) -> int:
     return int(all(have[at] == want[at] for at in others))
 
 
-def _as_queries(new: ir.Value, old: ir.Value) -> tuple[int, ...] | None:
-    have, want = graph.static_shape(new), graph.static_shape(old)
-    if have is None or want is None or len(have) > len(want):
-        return None
-    return (1,) * (len(want) - len(have)) + have
-
-
 def _join(call: FusedCall, edge: Edge, new: ir.Value, old: ir.Value) -> ir.Value:
     if edge.how == "replace":
         return shaped_like(call, new, old)
+    have, want = graph.static_shape(new) or (), graph.static_shape(old) or ()
     if edge.how == "add":
-        want = graph.static_shape(old) or ()
-        padded = stretched(graph.static_shape(new) or (), want) or want
-        return call.add("Add", [old, call.view(new, padded)])
-    padded = _as_queries(new, old) or ()
-    return call.add("Concat", [old, call.view(new, padded)], {"axis": edge.axis})
+        return call.add("Add", [old, call.view(new, stretched(have, want) or want)])
+    queries = call.view(new, (1,) * (len(want) - len(have)) + have)
+    return call.add("Concat", [old, queries], {"axis": edge.axis})
