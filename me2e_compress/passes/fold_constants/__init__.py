@@ -134,31 +134,21 @@ class _Sizes:
 
     def groups(self, expressions: Iterable[Expression]) -> list[list[Expression]]:
         """Group expressions that read each other, or a weight that only they read."""
-        parent = {one: one for one in expressions}
-
-        def root(one: Expression) -> Expression:
-            # Union-find with path halving
-            while parent[one] is not one:
-                parent[one] = parent[parent[one]]
-                one = parent[one]
-            return one
-
+        group_of = {one: [one] for one in expressions}
         # Join the readers of a value, and its maker
-        for value in dict.fromkeys(v for one in parent for v in one.inputs):
-            if value is None:
-                continue
-            linked = [one for one in self.readers[value] if one in parent]
+        for value in dict.fromkeys(v for one in group_of for v in one.inputs if v):
+            linked = [one for one in self.readers[value] if one in group_of]
             maker = self.known.maker.get(value)
-            if maker in parent:
+            if maker in group_of:
                 linked.append(maker)
             elif value not in self.weights or len(linked) < len(self.readers[value]):
                 continue
             for other in linked[1:]:
-                parent[root(other)] = root(linked[0])
-        groups: dict[Expression, list[Expression]] = {}
-        for one in parent:
-            groups.setdefault(root(one), []).append(one)
-        return list(groups.values())
+                small, large = sorted((group_of[linked[0]], group_of[other]), key=len)
+                if small is not large:
+                    large.extend(small)
+                    group_of.update(dict.fromkeys(small, large))
+        return list({id(group): group for group in group_of.values()}.values())
 
     def _is_read_outside(self, value: ir.Value) -> bool:
         """Return whether a graph output, or a node of no expression, is or reads it."""
