@@ -62,25 +62,18 @@ def find_groups(
                 readers.setdefault(value, []).append(decision.node or decision.output)
     head_of: dict[ir.Value, ir.Node] = {}
     members: dict[ir.Node, list[ir.Value]] = {}
-
-    def join(head: ir.Node, value: ir.Value) -> None:
-        other = head_of.get(value)
-        if other is head:
-            return
-        moved = [value] if other is None else members.pop(other)
-        members.setdefault(head, []).extend(moved)
-        head_of.update(dict.fromkeys(moved, head))
-
     # from the last Concat back, so that Concats of Concats join its group
     for node in reversed(graph):
-        if node.op_type != "Concat":
-            continue
         result = node.outputs[0]
-        if result in readers or result in head_of:
-            head = head_of.get(result, node)
-            for value in (result, *node.inputs):
-                if value is not None:
-                    join(head, value)
+        if node.op_type != "Concat" or not (result in readers or result in head_of):
+            continue
+        head = head_of.get(result, node)
+        for value in filter(None, (result, *node.inputs)):
+            other = head_of.get(value)
+            if other is not head:
+                moved = [value] if other is None else members.pop(other)
+                members.setdefault(head, []).extend(moved)
+                head_of.update(dict.fromkeys(moved, head))
     # of each group what is read as int8, and by whom
     groups = list[ScaleGroup]()
     for head, values in members.items():
