@@ -60,11 +60,6 @@ def test_merged_casts_say_what_happens_beyond_the_range() -> None:
             " { wide = Expand(x, whole) y = Add(wide, z) }",
             "Add",
         ),
-        (
-            "(float[2] x, float[2] z) => (float[6] y)"
-            " { a = Concat<axis = 0>(x, z) y = Concat<axis = 0>(a, x) }",
-            "Concat",
-        ),
     ],
 )
 def test_two_in_a_row_become_one(text: str, left: str) -> None:

@@ -1,26 +1,23 @@
 """Rules that remove nodes that return their input, and merge pairs of nodes.
 
 A rule of an identity returns the value that a node's first output equals, bit for bit,
-or None. Adding +0.0 is not an identity (-0.0 + 0.0 is +0.0); adding -0.0 is, and so is
-subtracting +0.0.
+or None. Adding 0.0 is not an identity: -0.0 + 0.0 is +0.0.
 
 A rule of a pair rewrites the graph around a node and returns the node to visit next
 (the node itself, now unread, if it was removed), or None where it does not apply.
 """
 
 import dataclasses
-import functools
 from collections.abc import Callable
 
 import numpy as np
 import onnx_ir as ir
 
-from me2e_compress.graph import array_of, provenance, static_shape
+from me2e_compress.graph import array_of, provenance, rank_of, static_shape
 from me2e_compress.graph.nodes import (
     ELEMENTWISE,
     NATIVE,
     VIEWS,
-    Array,
     draws,
     input_at,
     integers_at,
@@ -124,37 +121,19 @@ def _pad(node: ir.Node) -> ir.Value | None:
     return node.inputs[0] if pads is not None and not any(pads) else None
 
 
-def _neutral(test: Callable[[Array], bool], *, either: bool) -> Identity:
-    """Build the rule of a neutral constant; of ``either`` operand if they commute."""
-
-    def rule(node: ir.Node) -> ir.Value | None:
-        for kept, other in ((0, 1), (1, 0))[: 2 if either else 1]:
-            array, source = array_of(node.inputs[other]), node.inputs[kept]
-            if array is None or source is None or not array.size or not test(array):
-                continue
-            # Broadcasting the constant must keep the shape of the other operand
-            spreads = same_shape(source, node.outputs[0]) or (
-                array.size == 1
-                and source.shape is not None
-                and array.ndim <= len(source.shape)
-            )
-            if source.dtype == node.outputs[0].dtype and spreads:
-                return source
-        return None
-
-    return rule
-
-
-def _zero(array: Array, *, negative: bool) -> bool:
-    """Return whether all numbers are zero, those with a sign of zero of this one."""
-    if array.dtype.kind in "iu":
-        return not array.any()
-    zero = array.dtype.kind == "f" and not array.any()
-    return zero and bool(np.all(np.signbit(array) == negative))
-
-
-def _one(array: Array) -> bool:
-    return array.dtype.kind in "iuf" and bool(np.all(array == 1))
+def _times_one(node: ir.Node) -> ir.Value | None:
+    """A product with ones, or a division by ones, that keeps the shape."""
+    for index in (1, 0) if node.op_type == "Mul" else (1,):
+        ones, source = array_of(node.inputs[index]), node.inputs[1 - index]
+        if ones is None or source is None or not ones.size or (ones != 1).any():
+            continue
+        # Broadcasting the ones must keep the shape of the other operand
+        rank = rank_of(source)
+        is_small = ones.size == 1 and rank is not None and ones.ndim <= rank
+        same = is_small or same_shape(source, node.outputs[0])
+        if same and source.dtype == node.outputs[0].dtype:
+            return source
+    return None
 
 
 def _where(node: ir.Node) -> ir.Value | None:
@@ -167,15 +146,13 @@ IDENTITIES: dict[str, Identity] = {
     **dict.fromkeys(("Concat", "Max", "Mean", "Min", "Split", "Sum"), _if_alone),
     **dict.fromkeys(("Expand", "Flatten", "Reshape", "Squeeze"), _if_same_shape),
     **dict.fromkeys(("Tile", "Unsqueeze"), _if_same_shape),
-    "Add": _neutral(functools.partial(_zero, negative=True), either=True),
     "Cast": _cast,
-    "Div": _neutral(_one, either=False),
+    "Div": _times_one,
     "Dropout": lambda node: None if draws(node) else node.inputs[0],
     "Identity": lambda node: node.inputs[0],
-    "Mul": _neutral(_one, either=True),
+    "Mul": _times_one,
     "Pad": _pad,
     "Slice": _slice,
-    "Sub": _neutral(functools.partial(_zero, negative=False), either=False),
     "Transpose": _transpose,
     "Where": _where,
 }
@@ -282,30 +259,6 @@ def _casts(node: ir.Node, site: MergeSite) -> ir.Node | None:
     return put(node, "Cast", read, by=site.by, sources=[inner], attributes=options)
 
 
-def _concats(node: ir.Node, site: MergeSite) -> ir.Node | None:
-    axis = node.attributes.get_int("axis", 0)
-    inputs: list[ir.Value | None] = []
-    sources: list[ir.Node] = []
-    # Take in the operands of Concats that nothing else reads
-    for index, value in enumerate(node.inputs):
-        inner = _before(node, index)
-        if (
-            inner is not None
-            and inner.op_type == "Concat"
-            and inner.attributes.get_int("axis", 0) == axis
-            and sole_reader(inner.outputs[0]) is node
-        ):
-            inputs.extend(inner.inputs)
-            sources.append(inner)
-        else:
-            inputs.append(value)
-    if not sources:
-        return None
-    # One Concat reads all operands
-    by, options = site.by, {"axis": axis}
-    return put(node, "Concat", inputs, by=by, sources=sources, attributes=options)
-
-
 def _drop_expand(node: ir.Node, site: MergeSite) -> ir.Node | None:
     """Drop an Expand, or a Tile that only repeats, before a broadcasting operator."""
     target = static_shape(node.outputs[0])
@@ -339,6 +292,5 @@ PAIRS: dict[str, tuple[Rule, ...]] = {
     **dict.fromkeys(BROADCASTING, (_drop_expand,)),
     **dict.fromkeys(_RESHAPING, (_views,)),
     "Cast": (_casts,),
-    "Concat": (_concats,),
     "Transpose": (_views, _transposes),
 }
