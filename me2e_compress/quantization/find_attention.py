@@ -1,6 +1,7 @@
 """Find attention: the matrix products around every softmax."""
 
 import dataclasses
+import itertools
 import math
 from collections.abc import Callable, Collection, Iterable, Mapping
 from typing import TypeAlias
@@ -15,55 +16,52 @@ from me2e_compress.operators import op_types
 # is written out head by head; a bound, so that sweeps stay linear.
 KEEP = 16
 
-# (nodes in between, product), nearest first.
-Hits: TypeAlias = tuple[tuple[int, ir.Node], ...]
-
-Nearest: TypeAlias = Mapping[ir.Value, Hits]
+Products: TypeAlias = tuple[ir.Node, ...]
 Test: TypeAlias = Callable[[ir.Node], bool]
 
 
-def behind(graph: ir.Graph, through: Collection[str], is_product: Test) -> Nearest:
+def behind(
+    graph: ir.Graph, through: Collection[str], is_product: Test
+) -> Mapping[ir.Value, Products]:
     """List, for every value, the products it comes from through some operators only.
 
     The graph is in topological order.
     """
-    hits_of: dict[ir.Value, Hits] = {}
+    known: dict[ir.Value, Products] = {}
     for node in graph:
         if is_product(node):
-            hits: Hits = ((0, node),)
+            products: Products = (node,)
         elif node.op_type in through:
-            hits = _merged(hits_of.get(v, ()) for v in node.inputs if v is not None)
+            products = _merged(known.get(v, ()) for v in node.inputs if v is not None)
         else:
             continue
-        if hits:
-            hits_of.update(dict.fromkeys(node.outputs, hits))
-    return hits_of
+        if products:
+            known.update(dict.fromkeys(node.outputs, products))
+    return known
 
 
-def ahead(graph: ir.Graph, through: Collection[str], is_product: Test) -> Nearest:
+def ahead(
+    graph: ir.Graph, through: Collection[str], is_product: Test
+) -> Mapping[ir.Value, Products]:
     """List, for every value, the products that read it through some operators only."""
-    hits_of: dict[ir.Value, Hits] = {}
-    beyond: dict[ir.Node, Hits] = {}
+    known: dict[ir.Value, Products] = {}
+    beyond: dict[ir.Node, Products] = {}
     for node in reversed(graph):
         for value in node.outputs:
-            hits_of[value] = _merged(
+            known[value] = _merged(
                 beyond.get(reader, ()) for reader in value.consumers()
             )
         # what reads a node's inputs: the product itself, or what lies ahead of it
         if is_product(node):
-            beyond[node] = ((0, node),)
+            beyond[node] = (node,)
         elif node.op_type in through:
-            beyond[node] = _merged(hits_of[value] for value in node.outputs)
-    return hits_of
+            beyond[node] = _merged(known[value] for value in node.outputs)
+    return known
 
 
-def _merged(sources: Iterable[Hits]) -> Hits:
-    steps: dict[ir.Node, int] = {}
-    for hits in sources:
-        for step, node in hits:
-            steps[node] = min(step + 1, steps.get(node, step + 1))
-    nearest = sorted(steps.items(), key=lambda item: item[1])  # stable: graph order
-    return tuple((step, node) for node, step in nearest[:KEEP])
+def _merged(sources: Iterable[Products]) -> Products:
+    """Return the products of several values, each once."""
+    return tuple(dict.fromkeys(itertools.chain(*sources)))[:KEEP]
 
 
 # Operators of ONNX and com.microsoft that are attention as a whole.
@@ -145,14 +143,13 @@ def find_attention(
             continue
         # a mask may have products of its own, of another size
         queries_by_keys = [
-            node for _, node in scored.get(scores, ()) if _fits(node.outputs[0], scores)
+            node for node in scored.get(scores, ()) if _fits(node.outputs[0], scores)
         ]
         if not queries_by_keys:
             continue
         shape = open_shape(queries_by_keys[0].outputs[0]) or ()
         attention = Attention(*(shape[-2:] if len(shape) > 1 else (None, None)))
-        by_values = [node for _, node in weighed.get(weights, ())]
-        for product in (*queries_by_keys, *by_values):
+        for product in (*queries_by_keys, *weighed.get(weights, ())):
             attentions.setdefault(product, attention)
     return attentions
 

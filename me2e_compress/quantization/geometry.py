@@ -338,5 +338,5 @@ def _companions(
         for node in model.graph
         if node.op_type in scores
         if (value := node.inputs[scores[node.op_type]]) is not None
-        for _, layer in nearest.get(value, ())
+        for layer in nearest.get(value, ())
     }
