@@ -13,10 +13,8 @@ from collections.abc import Callable
 import numpy as np
 import onnx_ir as ir
 
-from me2e_compress.graph import array_of, provenance, rank_of, static_shape
+from me2e_compress.graph import array_of, rank_of, static_shape
 from me2e_compress.graph.nodes import (
-    ELEMENTWISE,
-    NATIVE,
     VIEWS,
     draws,
     input_at,
@@ -160,8 +158,6 @@ IDENTITIES: dict[str, Identity] = {
 
 _RESHAPING = VIEWS - {"Identity"}
 
-BROADCASTING = frozenset({*ELEMENTWISE, "Where"})
-
 
 @dataclasses.dataclass
 class MergeSite:
@@ -242,55 +238,8 @@ def _transposes(node: ir.Node, site: MergeSite) -> ir.Node | None:
     return put(node, "Transpose", [source], by=by, sources=sources, attributes=options)
 
 
-def _casts(node: ir.Node, site: MergeSite) -> ir.Node | None:
-    inner = _before(node)
-    if inner is None or inner.op_type != "Cast" or inner.inputs[0] is None:
-        return None
-    source, middle = inner.inputs[0].dtype, inner.outputs[0].dtype
-    if source is None or middle is None:
-        return None
-    # The first Cast must lose nothing; of 64 bits, some do that numpy calls safe
-    known = {source, middle} <= NATIVE and source.itemsize < 8
-    if not known or not np.can_cast(source.numpy(), middle.numpy(), "safe"):
-        return None
-    if sole_reader(inner.outputs[0]) is None and source != node.outputs[0].dtype:
-        return None
-    options, read = {n: a.value for n, a in node.attributes.items()}, inner.inputs[:1]
-    return put(node, "Cast", read, by=site.by, sources=[inner], attributes=options)
-
-
-def _drop_expand(node: ir.Node, site: MergeSite) -> ir.Node | None:
-    """Drop an Expand, or a Tile that only repeats, before a broadcasting operator."""
-    target = static_shape(node.outputs[0])
-    if target is None:
-        return None
-    # Look for an operand that only repeats axes of size 1
-    for index, value in enumerate(node.inputs):
-        inner = _before(node, index)
-        if inner is None or inner.op_type not in ("Expand", "Tile"):
-            continue
-        source = inner.inputs[0]
-        small, large = static_shape(source), static_shape(value)
-        if small is None or large is None or len(small) > len(large):
-            continue
-        pairs = zip(small[::-1], large[::-1], strict=False)
-        if any(one not in (1, two) for one, two in pairs):
-            continue
-        # The other operands must still broadcast to the same shape
-        others = [static_shape(other) for other in node.inputs]
-        others[index] = small
-        shapes = [shape for shape in others if shape is not None]
-        if len(shapes) == len(others) and np.broadcast_shapes(*shapes) == target:
-            node.replace_input_with(index, source)
-            provenance.inherit(node, (node, inner), by=site.by)
-            return node
-    return None
-
-
 # Rules by operator; of several, the first that applies.
 PAIRS: dict[str, tuple[Rule, ...]] = {
-    **dict.fromkeys(BROADCASTING, (_drop_expand,)),
     **dict.fromkeys(_RESHAPING, (_views,)),
-    "Cast": (_casts,),
     "Transpose": (_views, _transposes),
 }
