@@ -168,9 +168,6 @@ def _scaled(layer: ir.Node, weight: Numbers, scale: Numbers) -> Numbers:
     return weight * rows.reshape(*rows.shape, *rest)
 
 
-# Constants that cancel more than three decimal digits are not added in advance.
-CANCELLATION = 1e3
-
 # MatMul and bias of rank 2 as a Gemm. At rank 3 they stay: Reshape, Gemm, Reshape would
 # hide the product from attention patterns and misplace the quantizers.
 
@@ -192,30 +189,6 @@ def _is_of_matrices(match: Match, facts: Facts) -> bool:
     return len(left) == len(right) == 2 and added in ((), (1,), columns, (1, *columns))
 
 
-SOURCE = var("source", computed=True)
-FIRST, SECOND = constant(), constant()
-
-
-def _chain(match: Match, kit: Kit) -> str | None:
-    """Multiply (or add) two consecutive constants in advance."""
-    first, second = match.numbers(FIRST), match.numbers(SECOND)
-    op_type, output = match.root.op_type, match.root.outputs[0]
-    # Combine in float64, unless digits would be lost
-    together = second * first if op_type == "Mul" else second + first
-    if op_type == "Add" and np.any(np.abs(first) > CANCELLATION * np.abs(together)):
-        return "constants that cancel when added up"
-    size = np.abs(together[together != 0])
-    limits = None if output.dtype is None else np.finfo(output.dtype.numpy())
-    if limits is None or not np.all((size <= limits.max) & (size >= limits.tiny)):
-        return "constants that overflow when multiplied"
-    if together.size > max(first.size, second.size):
-        return "constants that grow when combined"
-    array = together.astype(limits.dtype)
-    value = kit.constant(array, f"{output.name}_{op_type.lower()}")
-    kit.put(op_type, [match[SOURCE], value])
-    return None
-
-
 FUSIONS = (
     Fusion("layers with what follows them", AFFINE, _fold_affine, where=_is_affine),
     Fusion(
@@ -223,9 +196,5 @@ FUSIONS = (
         PLUS,
         lambda match, kit: kit.put("Gemm", [match[LEFT], match[RIGHT], match[OFFSET]]),
         where=_is_of_matrices,
-    ),
-    *(
-        Fusion("constant chains", op(kind, op(kind, SOURCE, FIRST), SECOND), _chain)
-        for kind in ("Add", "Mul")
     ),
 )

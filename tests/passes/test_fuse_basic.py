@@ -77,10 +77,6 @@ STAYS = {
         " y, m, v = BatchNormalization<training_mode = 1>(a, gamma, beta, mean, var) }",
         {"weight": normal(8, 4, 1, 1), **statistics(8)},
     ),
-    "constants that cancel": (
-        "(float[4] x) => (float[4] y) { a = Add(x, p) y = Add(a, q) }",
-        {"p": np.float32(1e6), "q": np.float32(-1e6)},
-    ),
 }
 
 
@@ -136,12 +132,6 @@ def test_the_weight_of_a_constant_node_is_written_anew() -> None:
         " a = Conv(x, weight) y = Mul(a, c) }"
     )
     fuse_basic(text, ["Conv"], c=np.float32(3))
-
-
-@pytest.mark.parametrize("op", ["Add", "Mul"])
-def test_constants_in_a_row_are_combined(op: str) -> None:
-    text = f"g (float[2,4] x) => (float[2,4] y) {{ a = {op}(x, p) y = {op}(q, a) }}"
-    fuse_basic(text, [op], p=np.abs(normal(4)), q=np.abs(normal(1)))
 
 
 def test_nothing_is_fused_into_a_body() -> None:
