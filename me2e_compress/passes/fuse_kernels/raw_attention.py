@@ -9,8 +9,8 @@ import numpy as np
 import onnx_ir as ir
 
 from me2e_compress.base.errors import PreconditionError
-from me2e_compress.graph import array_of, is_standard, static_shape
-from me2e_compress.graph.nodes import producer_of, sole_reader
+from me2e_compress.graph import array_of, static_shape
+from me2e_compress.graph.nodes import sole_maker
 from me2e_compress.graph.rewrite.raise_opset import OLDEST_OPSET
 from me2e_compress.operators import OWN_DOMAIN, FusedCall
 from me2e_compress.operators.deformable_attention import RAW_ATTENTION
@@ -22,7 +22,7 @@ from me2e_compress.passes.fuse_operators.fused_form import (
     laid_out,
     whole_views,
 )
-from me2e_compress.passes.fuse_operators.views import View, aligned, sources, terms
+from me2e_compress.passes.fuse_operators.views import View, operands, sources
 
 BATCH, QUERY, HEAD, LEVEL, POINT = "batch", "query", "head", "level", "point"
 # The axes of locations, which are in 0..1: not the ``xy`` of a grid's in -1..1.
@@ -177,7 +177,7 @@ def _written(call: FusedCall, read: _Match) -> list[ir.Value]:
 
 def _sum(view: View) -> tuple[View, View] | None:
     """Return reference points and offsets, if a value is their sum and nothing else."""
-    parts = terms(whole_views(view)[-1])
+    parts = operands(whole_views(view)[-1], "Add")
     if parts is None:
         return None
     near, away = sorted(parts, key=lambda part: math.prod(sizes_of(part.layout)))
@@ -197,23 +197,14 @@ def _product(view: View, plain: _Match) -> _Match | None:
     """Return the factors of weights, if one of them is a softmax over points."""
     # Walk back to where the weights are made: a Softmax, or a Mul of factors
     *_, last = (source for source in sources(view) if isinstance(source, View))
-    node = producer_of(last.value)
-    if node is None or not is_standard(node) or last.shift != 0.0:
+    if last.shift != 0.0:
         return None
-    if sole_reader(last.value) is None:
-        return None
-    if node.op_type == "Softmax":
+    node = sole_maker(last.value, "Softmax")
+    if node is not None:
         return _softmax(node, last, plain)
-    shapes = [static_shape(value) for value in node.inputs]
-    if node.op_type != "Mul" or None in shapes:
-        return None
     # One factor is the softmax, perhaps behind other products
-    factors = [
-        View(value, aligned(last.layout, shape))
-        for value, shape in zip(node.inputs, shapes, strict=True)
-        if value is not None and shape is not None
-    ]
-    for one, other in itertools.permutations(factors):
+    factors = operands(View(last.value, last.layout), "Mul") or ()
+    for one, other in itertools.permutations(factors, 2):
         inner = _product(one, plain)
         if inner is not None:
             masks, scale = (*inner.masks, other), inner.scale * last.scale

@@ -33,8 +33,8 @@ from me2e_compress.passes.fuse_operators.views import (
     Selection,
     View,
     joined,
+    operands,
     sources,
-    terms,
 )
 
 
@@ -102,7 +102,7 @@ def sums_of(option: Source) -> list[Source]:
     """
     if len(option.views) != 1 or scaling(option.views[0]) != (1.0, 0.0):
         return []
-    parts = terms(option.views[0])
+    parts = operands(option.views[0], "Add")
     if parts is None:
         return []
     first, second = (

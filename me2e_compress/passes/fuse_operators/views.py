@@ -14,6 +14,7 @@ from me2e_compress.graph.nodes import (
     numbers_of,
     permutation_of,
     producer_of,
+    sole_maker,
     sole_reader,
 )
 from me2e_compress.passes.digits import Digits, Layout, before, regrouped
@@ -90,20 +91,17 @@ def joined(selections: Sequence[Selection], digits: Digits) -> View | None:
     return dataclasses.replace(first.view, layout=layout)
 
 
-def terms(view: View) -> tuple[View, View] | None:
-    """Return the two terms of a sum that is read once; None if there are none."""
-    node = producer_of(view.value)
-    if node is None or node.op_type != "Add" or not is_standard(node):
+def operands(view: View, op_type: str) -> tuple[View, ...] | None:
+    """Return both operands of an Add or Mul that is read once; None of other values."""
+    node = sole_maker(view.value, op_type)
+    shapes = [] if node is None else [static_shape(value) for value in node.inputs]
+    if node is None or None in shapes:
         return None
-    shapes = [static_shape(value) for value in node.inputs]
-    if sole_reader(view.value) is None or None in shapes:
-        return None
-    first, second = (
+    return tuple(
         dataclasses.replace(view, value=operand, layout=aligned(view.layout, shape))
         for operand, shape in zip(node.inputs, shapes, strict=True)
         if operand is not None and shape is not None
     )
-    return first, second
 
 
 def aligned(layout: Layout, shape: Sequence[int]) -> Layout:
