@@ -56,20 +56,25 @@ class AttachBodies(Pass):
         for call in operators.fused_nodes(model):
             if call.node in bare:
                 kinds.setdefault(call.node.op_identifier(), []).append(call)
-        # Calls of a name that agree share a function
+        # Calls of a name that agree in attributes and number of inputs share a function
         count = 0
         for calls in kinds.values():
             what = f"for {len(calls)} {calls[0].node.op_type}"
             if calls[0].node not in named:
                 notes.append(f"no body {what}: it has no domain of its own")
                 continue
-            groups = _group_alike(calls)
-            for group in groups:
+            alike: dict[tuple[object, ...], list[FusedNode]] = {}
+            for call in calls:
+                options = sorted(
+                    (n, str(a.value)) for n, a in call.node.attributes.items()
+                )
+                alike.setdefault((len(call.node.inputs), *options), []).append(call)
+            for group in alike.values():
                 _set_overload(group, model)
                 function = self._body(group)
                 model.functions[function.identifier()] = function
-            count += len(groups)
-            bodies = "a body" if len(groups) == 1 else f"{len(groups)} bodies"
+            count += len(alike)
+            bodies = "a body" if len(alike) == 1 else f"{len(alike)} bodies"
             notes.append(f"{bodies} {what}")
         return PassResult(model, count, tuple(notes))
 
@@ -98,15 +103,6 @@ class AttachBodies(Pass):
         operators.expand(node, opset=first.opset, by=self.name)
         write_constant_nodes(function)
         return function
-
-
-def _group_alike(calls: Sequence[FusedNode]) -> list[list[FusedNode]]:
-    """Group calls that agree in attributes and number of inputs."""
-    groups: dict[tuple[object, ...], list[FusedNode]] = {}
-    for call in calls:
-        options = sorted((n, str(a.value)) for n, a in call.node.attributes.items())
-        groups.setdefault((len(call.node.inputs), *options), []).append(call)
-    return list(groups.values())
 
 
 def _set_overload(calls: Sequence[FusedNode], model: ir.Model) -> None:

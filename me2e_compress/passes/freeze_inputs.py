@@ -89,10 +89,17 @@ class FreezeInputs(Pass):
 
 
 def advice(model: ir.Model) -> str:
-    """Return a sentence that names inputs that may become constants, or "".
+    """Return a sentence that names inputs that may become constants, or ""."""
+    names = ",".join(deciding_inputs(model))
+    return names and (
+        f"branches or projections hang on {names}: where all frames have one value,"
+        " compress first with --passes"
+        f" import-normalize,freeze-inputs{{inputs=[{names}]}},fold-constants"
+    )
 
-    They alone decide a branch, or are the matrices of a projection.
-    """
+
+def deciding_inputs(model: ir.Model) -> tuple[str, ...]:
+    """Name the inputs that alone decide a branch, or are matrices of a projection."""
     names, states = dict[str, None](), recurrent_inputs(model)
     for node in nodes_of(model):
         if node.op_type not in ("If", "MatMul"):
@@ -106,12 +113,7 @@ def advice(model: ir.Model) -> str:
         sizes = [static_shape(root) for root in roots]
         if all(size is not None and math.prod(size) <= largest for size in sizes):
             names |= dict.fromkeys(str(root.name) for root in roots)
-    listed = ",".join(name for name in names if name not in states)
-    return listed and (
-        f"branches or projections hang on {listed}: where all frames have one value,"
-        " compress first with --passes"
-        f" import-normalize,freeze-inputs{{inputs=[{listed}]}},fold-constants"
-    )
+    return tuple(name for name in names if name not in states)
 
 
 def _roots(model: ir.Model, value: ir.Value | None) -> list[ir.Value]:

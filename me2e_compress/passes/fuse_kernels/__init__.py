@@ -9,7 +9,7 @@ import onnx_ir as ir
 from me2e_compress.base.display import plural
 from me2e_compress.base.errors import PreconditionError
 from me2e_compress.graph import graphs_of, opset_of
-from me2e_compress.graph.nodes import STANDARD
+from me2e_compress.graph.nodes import is_standard
 from me2e_compress.graph.rewrite import remove_dead, replace_value, value_names
 from me2e_compress.operators import OWN_DOMAIN, FusedCall
 from me2e_compress.passes.base import Context, Pass, PassResult
@@ -67,7 +67,8 @@ class FuseKernels(Pass):
         left: list[str] = []
         for body in graphs_of(model.graph):
             for node in list(body):
-                fuser = _FUSERS.get(node.op_type) if node.domain in _FUSABLE else None
+                known = is_standard(node) or node.domain == OWN_DOMAIN
+                fuser = _FUSERS.get(node.op_type) if known else None
                 if node.graph is not body or fuser is None:
                     continue
                 call = FusedCall(node, opset=opset, by=self.name, names=names)
@@ -84,6 +85,3 @@ class FuseKernels(Pass):
             remove_dead(model.graph)
         notes = [f"fused: {plural(n, kind)}" for kind, n in sorted(done.items())]
         return PassResult(model, done.total(), (*notes, *left))
-
-
-_FUSABLE = (*STANDARD, OWN_DOMAIN)

@@ -313,12 +313,14 @@ def _draw_views(
     views: Sequence[View], random: np.random.Generator
 ) -> dict[ir.Value, Array]:
     """Draw normal numbers; a third of the positions lie outside the feature maps."""
-    return {view.value: _draw(view, random) for view in views}
-
-
-def _draw(view: View, random: np.random.Generator) -> Array:
-    shape, kind = sizes(view.layout), (view.value.dtype or ir.DataType.FLOAT).numpy()
-    if not any(digit.axis == decomposed.XY for digit in flat(view.layout)):
-        return random.standard_normal(shape).astype(kind)
-    places = random.uniform(-1 - 2 * OUTSIDE, 1 + 2 * OUTSIDE, shape)
-    return ((places - view.shift) / view.scale).astype(kind)
+    drawn: dict[ir.Value, Array] = {}
+    for view in views:
+        shape = sizes(view.layout)
+        if any(digit.axis == decomposed.XY for digit in flat(view.layout)):
+            places = random.uniform(-1 - 2 * OUTSIDE, 1 + 2 * OUTSIDE, shape)
+            array = (places - view.shift) / view.scale
+        else:
+            array = random.standard_normal(shape)
+        kind = view.value.dtype or ir.DataType.FLOAT
+        drawn[view.value] = array.astype(kind.numpy())
+    return drawn
