@@ -150,34 +150,6 @@ def _node(
     return proto
 
 
-def learn_shapes(
-    node: ir.Node, known: Mapping[ir.Value, Array], opset: int, *, answers: bool
-) -> bool:
-    """Infer missing shapes of a node's outputs; return whether any is new.
-
-    ``answers``: whether shapes of graph outputs are refined, which in loops may change
-    between rounds.
-    """
-    try:
-        inferred = shapes.infer_node(node, opset, known=known.get)
-    except shapes.REFUSALS:
-        return False
-    learnt = False
-    for value, (kind, shape) in inferred.items():
-        # Shapes of graph outputs are only refined
-        if value.is_graph_output():
-            if answers and (more := refined(value.shape, shape)) is not value.shape:
-                value.shape, learnt = more, True
-            continue
-        if value.type is None:
-            value.type = kind
-        if shape is None or (value.shape is not None and value.shape.is_static()):
-            continue
-        if value.shape is None or shape.is_static():
-            value.shape, learnt = shape, True
-    return learnt
-
-
 def branch_fits(node: ir.Node, branch: ir.Graph, opset: int) -> bool:
     """Return whether an If's readers would be valid if they read a branch directly.
 
@@ -273,15 +245,38 @@ class Sweep:
         return True
 
     def _infer(self, node: ir.Node) -> None:
-        """Infer the shapes of a node that nobody could before."""
-        outputs = node.outputs
-        if all(static_shape(v) is not None and v.type is not None for v in outputs):
+        """Infer missing types and shapes of a node's outputs.
+
+        Shapes of graph outputs are only refined, and not in loops, where they may
+        change between rounds.
+        """
+        if all(
+            static_shape(v) is not None and v.type is not None for v in node.outputs
+        ):
             return
         for value in filter(None, node.inputs):
             self._known(value)
-        arrays, trust = self.known.arrays, self.trust_shapes
-        if learn_shapes(node, arrays, self.opset, answers=trust):
-            self.learnt.update(outputs)
+        arrays = self.known.arrays
+        try:
+            inferred = shapes.infer_node(node, self.opset, known=arrays.get)
+        except shapes.REFUSALS:
+            return
+        # Write what is new; a static shape is known already
+        learnt = False
+        for value, (kind, shape) in inferred.items():
+            if value.is_graph_output():
+                more = refined(value.shape, shape) if self.trust_shapes else value.shape
+                if more is not value.shape:
+                    value.shape, learnt = more, True
+                continue
+            if value.type is None:
+                value.type = kind
+            if shape is None or (value.shape is not None and value.shape.is_static()):
+                continue
+            if value.shape is None or shape.is_static():
+                value.shape, learnt = shape, True
+        if learnt:
+            self.learnt.update(node.outputs)
 
     def _add(self, node: ir.Node) -> None:
         """Enter a constant node, unless its values are too large or of odd types."""
