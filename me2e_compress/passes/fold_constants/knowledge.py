@@ -96,10 +96,25 @@ def run(
     opset: int,
 ) -> dict[ir.Value, Any]:
     """Compute values of expressions, as written, in one session of onnxruntime."""
+    # Copy the nodes under short names: v0, v1, ...
     names: dict[ir.Value, str] = {}
     feeds: dict[str, Any] = {}
-    nodes = [_node(one, names, feeds, arrays) for one in expressions]
-    # Write the expressions as a model of their own
+    nodes: list[onnx.NodeProto] = []
+    for one in expressions:
+        proto = ir.serde.serialize_node(one.nodes[0])
+        del proto.input[:], proto.output[:], proto.metadata_props[:]
+        for value in one.inputs:
+            if value is not None and value not in names:
+                names[value] = f"v{len(names)}"
+                array = arrays.get(value)
+                feeds[names[value]] = array_of(value) if array is None else array
+            proto.input.append("" if value is None else names[value])
+        for value in one.nodes[0].outputs:
+            if value.name:
+                names[value] = f"v{len(names)}"
+            proto.output.append(names[value] if value.name else "")
+        nodes.append(proto)
+    # Write them as a model of their own
     kind_of = onnx.helper.np_dtype_to_tensor_dtype
     port = onnx.helper.make_tensor_value_info
     ports = [port(n, kind_of(np.dtype(a.dtype)), a.shape) for n, a in feeds.items()]
@@ -123,31 +138,6 @@ def run(
     run.log_severity_level = SILENT
     outputs = session.run([names[value] for value in values], feeds, run)
     return dict(zip(values, outputs, strict=True))
-
-
-def _node(
-    one: Expression,
-    names: dict[ir.Value, str],
-    feeds: dict[str, Any],
-    arrays: Mapping[ir.Value, Any],
-) -> onnx.NodeProto:
-    # Copy the node under short names: v0, v1, ...
-    proto = ir.serde.serialize_node(one.nodes[0])
-    del proto.input[:], proto.output[:], proto.metadata_props[:]
-    for value in one.inputs:
-        if value is None:
-            proto.input.append("")
-            continue
-        if value not in names:
-            names[value] = f"v{len(names)}"
-            array = arrays.get(value)
-            feeds[names[value]] = array_of(value) if array is None else array
-        proto.input.append(names[value])
-    for value in one.nodes[0].outputs:
-        if value.name:
-            names[value] = f"v{len(names)}"
-        proto.output.append(names[value] if value.name else "")
-    return proto
 
 
 def branch_fits(node: ir.Node, branch: ir.Graph, opset: int) -> bool:

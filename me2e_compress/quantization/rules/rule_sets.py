@@ -465,9 +465,7 @@ class SafeRules(PaperRules):
     def own_rules(self) -> tuple[Rule, ...]:
         """Return rules of operators, safety, the paper's stages, kernels and cost."""
         operator, _, module, weight, length, _ = super().own_rules()
-        return (
-            *(operator, module, weight),
-            *(Geometry(), Coordinates(), EgoInput()),
-            *(length, AttentionWeights(), MatrixVector(share=0.1)),
-            *(SmallProduct(), NarrowConvolution(), FileSize(), CostGate()),
-        )
+        safety = (Geometry(), Coordinates(), EgoInput())
+        stages = (length, AttentionWeights(), MatrixVector(share=0.1))
+        kernels = (SmallProduct(), NarrowConvolution(), FileSize(), CostGate())
+        return (operator, module, weight, *safety, *stages, *kernels)
