@@ -202,8 +202,10 @@ class FoldConstants(Pass):
             tally["kept"] = 0
             self._fold(model.graph, opset, tally, refusals, fresh, trust=True)
             taken = _inline_branches(model.graph, opset, self.name)
-            fresh = {value for node in taken or () for value in node.inputs if value}
-            if taken is not None:
+            # The Ifs had hidden the shapes of what their branches read
+            nodes = (node for branch in taken for node in branch)
+            fresh = {value for node in nodes for value in node.inputs if value}
+            if taken:
                 tally.update(changes=1, inlined=1)
                 continue
             for body in list(graphs_of(model.graph))[1:]:
@@ -371,20 +373,15 @@ def _reshape_bounds(graph: ir.Graph, opset: int, by: str) -> int:
 # Replace an If whose condition is known by the branch that it takes.
 
 
-def _inline_branches(graph: ir.Graph, opset: int, by: str) -> list[ir.Node] | None:
-    """Replace every If of known condition, in bodies too; None where there is none.
-
-    Returns:
-        The nodes of the branches, whose shapes the Ifs had hidden.
-    """
-    known = [
+def _inline_branches(graph: ir.Graph, opset: int, by: str) -> list[list[ir.Node]]:
+    """Replace every If of known condition, in bodies too; list the branches' nodes."""
+    return [
         nodes
         for body in list(graphs_of(graph))
         for node in list(body)
         if node.op_type == "If" and node.graph is body
         if (nodes := _inline_branch(node, opset, by)) is not None
     ]
-    return [node for nodes in known for node in nodes] if known else None
 
 
 def _inline_branch(node: ir.Node, opset: int, by: str) -> list[ir.Node] | None:
