@@ -264,16 +264,15 @@ class FoldConstants(Pass):
 
 
 def _notes(tally: Counter[str], refused: Counter[str]) -> tuple[str, ...]:
+    inlined, growth = tally["inlined"], tally["growth_bytes"]
     folded, kept = plural(tally["folded"], "node"), plural(tally["kept"], "node")
-    weights, growth = plural(tally["stored"], "initializer"), tally["growth_bytes"]
+    stored = plural(tally["stored"], "initializer")
     listed = ", ".join(f"{count} {op}" for op, count in sorted(refused.items()))
+    left = f"{kept} left to compute constants: smaller than their values"
     notes = (
-        (tally["folded"], f"{folded} became {weights} ({growth:+,} bytes)"),
-        (
-            tally["inlined"],
-            "branches took the places of Ifs whose conditions are known",
-        ),
-        (tally["kept"], f"{kept} left to compute constants: smaller than their values"),
+        (tally["folded"], f"{folded} became {stored} ({growth:+,} bytes)"),
+        (inlined, "branches took the places of Ifs whose conditions are known"),
+        (tally["kept"], left),
         (listed, f"onnxruntime cannot evaluate {listed}: left as they are"),
     )
     return tuple(note for condition, note in notes if condition)
