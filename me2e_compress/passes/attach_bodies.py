@@ -87,12 +87,12 @@ class AttachBodies(Pass):
         # One call of the operator inside a function of the same signature
         result = ir.Value(name="y")
         values, identifier = [v for v, _ in inputs], first.node.op_identifier()
-        given = list(first.node.attributes.values())
-        node = ir.Node(*identifier[:2], values, given, outputs=[result])
+        options = list(first.node.attributes.values())
+        node = ir.Node(*identifier[:2], values, options, outputs=[result])
         node.overload, node.name = identifier[2], first.operator.name
         opsets = {"": first.opset}
         body = ir.Graph(values, [result], nodes=[node], opset_imports=opsets)
-        attributes = [ir.Attr(a.name, a.type, a.value) for a in given]
+        attributes = [ir.Attr(a.name, a.type, a.value) for a in options]
         function = ir.Function(*identifier, graph=body, attributes=attributes)
         # Store shared constants, then expand the operator
         for value, known in inputs:
@@ -118,16 +118,16 @@ def _set_overload(calls: Sequence[FusedNode], model: ir.Model) -> None:
 
 
 def _parameter(
-    index: int, given: Sequence[ir.Value | None]
+    index: int, inputs: Sequence[ir.Value | None]
 ) -> tuple[ir.Value, Array | None]:
     """Make a function input with the type, shape and constant common to all calls."""
-    shapes = [open_shape(value) for value in given if value is not None]
-    types = {value.dtype for value in given if value is not None}
+    shapes = [open_shape(value) for value in inputs if value is not None]
+    types = {value.dtype for value in inputs if value is not None}
     value = ir.Value(name=f"x{index}", shape=_agreed(shapes))
     if len(types) == 1 and (kind := next(iter(types))) is not None:
         value.type = ir.TensorType(kind)
     # Only a small constant that is equal in every call is stored
-    arrays = [None if v is None else graph.array_of(v) for v in given]
+    arrays = [None if v is None else graph.array_of(v) for v in inputs]
     first = arrays[0]
     if first is None or first.size > LARGEST_TABLE:
         return value, None

@@ -60,7 +60,7 @@ def regrouped(layout: Layout, shape: Sequence[int]) -> Layout | None:
     rest = list(reversed(flat(layout)))
     groups: list[Digits] = []
     for size in shape:
-        taken: list[Digit] = []
+        group: list[Digit] = []
         # Take digits from the front, and split the last if it divides
         while size > 1:
             if not rest:
@@ -74,9 +74,9 @@ def regrouped(layout: Layout, shape: Sequence[int]) -> Layout | None:
                 digit = Digit(digit.axis, digit.stride * low, size)
             elif size % digit.size:
                 return None
-            taken.append(digit)
+            group.append(digit)
             size //= digit.size
-        groups.append(tuple(taken))
+        groups.append(tuple(group))
     return None if rest else tuple(groups)
 
 

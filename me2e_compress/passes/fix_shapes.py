@@ -145,8 +145,8 @@ def _sized(
         elif isinstance(dim, ir.SymbolicDim) and dim.value in sizes:
             size = sizes[str(dim.value)]
         elif isinstance(dim, ir.SymbolicDim):  # an expression such as 2*s0 + 1
-            given = {name: sizes[name] for name in _symbols(dim) if name in sizes}
-            size = dim.evaluate(given) if given else dim
+            known = {name: sizes[name] for name in _symbols(dim) if name in sizes}
+            size = dim.evaluate(known) if known else dim
         dims.append(size if isinstance(size, int) else dim)
     same = all(a is b for a, b in zip(dims, shape, strict=True))
     return shape if same else ir.Shape(dims)

@@ -118,13 +118,13 @@ def deciding_inputs(model: ir.Model) -> tuple[str, ...]:
 
 def _roots(model: ir.Model, value: ir.Value | None) -> list[ir.Value]:
     """Return the inputs whose numbers, not only their sizes, a value depends on."""
-    seen, pending = set[ir.Value](), [value]
+    visited, pending = set[ir.Value](), [value]
     while pending:
         value = pending.pop()
-        if value is None or value in seen:
+        if value is None or value in visited:
             continue
-        seen.add(value)
+        visited.add(value)
         made = producer_of(value)
         if made is not None and made.op_type not in ("Shape", "Size"):
             pending += made.inputs
-    return [port for port in model.graph.inputs if port in seen]
+    return [port for port in model.graph.inputs if port in visited]

@@ -96,14 +96,14 @@ def _affine(match: Match) -> tuple[Numbers, Numbers] | None:
 
 
 def _is_per_channel(match: Match) -> bool:
-    source, given = match[LAYER], match.array(NUMBERS).shape
+    source, constant_shape = match[LAYER], match.array(NUMBERS).shape
     shape = static_shape(source)
     rank = len(source.shape) if source.shape is not None else 0
-    if len(given) > rank or rank < 2:
+    if len(constant_shape) > rank or rank < 2:
         return False
-    if math.prod(given) == 1:
+    if math.prod(constant_shape) == 1:
         return True
-    full = (1,) * (rank - len(given)) + given
+    full = (1,) * (rank - len(constant_shape)) + constant_shape
     if any(size != 1 for axis, size in enumerate(full) if axis != 1):
         return False
     same = shape == static_shape(match.root.outputs[0])

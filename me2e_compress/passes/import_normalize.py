@@ -245,18 +245,18 @@ def _name_nodes(model: ir.Model, by: str) -> int:
         # Reserve all existing names first
         nodes = list(nodes_in(body))
         reserved = {node.name for node in nodes if node.name}
-        taken = set[str]()
+        used = set[str]()
         counters = defaultdict[str, Iterator[int]](itertools.count)
         for node in nodes:
-            if node.name and node.name not in taken:
-                taken.add(node.name)
+            if node.name and node.name not in used:
+                used.add(node.name)
                 continue
             # Take the first free number
             stem = node.name or node.op_type
             names = (f"{stem}_{number}" for number in counters[stem])
             node.name = next(name for name in names if name not in reserved)
             reserved.add(node.name)
-            taken.add(node.name)
+            used.add(node.name)
             provenance.inherit(node, [node], by=by)
             count += 1
     return count

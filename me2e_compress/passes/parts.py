@@ -144,15 +144,15 @@ def result_of(model: ir.Model, part: Part, like: ir.Value | None = None) -> ir.V
 
 def is_shape_arithmetic(value: ir.Value) -> bool:
     """Return whether integers come only from shapes and constants, not from data."""
-    waiting, seen = [value], set[ir.Value]()
+    waiting, visited = [value], set[ir.Value]()
     while waiting:
         current = waiting.pop()
         if current.is_graph_input() or current.dtype not in _INTEGERS:
             return False
-        seen.add(current)
+        visited.add(current)
         producer = current.producer()
         if producer is not None and producer.op_type not in ("Shape", "Size"):
-            waiting += {v for v in producer.inputs if v is not None} - seen
+            waiting += {v for v in producer.inputs if v is not None} - visited
     return True
 
 

@@ -146,14 +146,14 @@ def _islands(
     kept: Collection[ir.Node], touching: Mapping[ir.Node, list[Border]]
 ) -> Iterator[list[ir.Node]]:
     """Yield the layers that are joined by borders, directly or through others."""
-    seen: set[ir.Node] = set()
+    visited: set[ir.Node] = set()
     for first in kept:
         island, waiting = list[ir.Node](), [first]
         while waiting:
             layer = waiting.pop()
-            if layer in seen or layer not in kept:
+            if layer in visited or layer not in kept:
                 continue
-            seen.add(layer)
+            visited.add(layer)
             island.append(layer)
             for border in touching[layer]:
                 waiting += border.layers()

@@ -261,9 +261,9 @@ class Override(_Strict):
         return self.reason or f"override: {self}"
 
     def __str__(self) -> str:
-        given = {key: getattr(self, key) for key in ("nodes", "module", "op", "reads")}
+        fields = {key: getattr(self, key) for key in ("nodes", "module", "op", "reads")}
         return ", ".join(
-            f"{k} {text!r}" for k, text in given.items() if text is not None
+            f"{k} {text!r}" for k, text in fields.items() if text is not None
         )
 
 
@@ -282,8 +282,8 @@ def overrides_text(overrides: Iterable[Override]) -> str:
     entries = []
     for override in overrides:
         keys = ("nodes", "module", "op", "reads", "dtype", "reason")
-        given = {key: text for key in keys if (text := getattr(override, key))}
-        lines = (f"{key} = {toml_string(text)}\n" for key, text in given.items())
+        fields = {key: text for key in keys if (text := getattr(override, key))}
+        lines = (f"{key} = {toml_string(text)}\n" for key, text in fields.items())
         entries.append("[[override]]\n" + "".join(lines))
     return "\n".join(entries)
 

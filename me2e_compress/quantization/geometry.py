@@ -296,13 +296,13 @@ def _behind_positions(
         for index in positions.get(node.op_type, ())
         if (value := input_at(node, index)) is not None
     )
-    seen: set[ir.Node] = set()
+    visited: set[ir.Node] = set()
     while queue:
         value, reader = queue.popleft()
         node = value.producer()
-        if node is None or node in seen or value in known:
+        if node is None or node in visited or value in known:
             continue
-        seen.add(node)
+        visited.add(node)
         yield node, reader
         # Indices and bounds are looked at on their own
         if node.op_type in _POSITION_ARITHMETIC:

@@ -50,9 +50,9 @@ class FoldWithOnnxsim(Pass):
         """Fold a copy; a crash, refusal or timeout of onnxsim is a PassError."""
         # Exchange the model through files
         with tempfile.TemporaryDirectory(prefix="me2e-onnxsim-") as folder:
-            given, folded = Path(folder, "given.onnx"), Path(folder, "folded.onnx")
-            save(model, given)
-            _simplify(given, folded, self.timeout_s)
+            source, folded = Path(folder, "source.onnx"), Path(folder, "folded.onnx")
+            save(model, source)
+            _simplify(source, folded, self.timeout_s)
             result = load(folded)
             _own_weights(result, model)
         # Restore what onnxsim drops and remove what it adds
@@ -68,9 +68,9 @@ class FoldWithOnnxsim(Pass):
         return PassResult(result, max(1, node_count(model) - node_count(result)))
 
 
-def _simplify(given: Path, folded: Path, timeout_s: float) -> None:
+def _simplify(source: Path, folded: Path, timeout_s: float) -> None:
     try:
-        run_script(_WORKER, (str(given), str(folded)), timeout_s).check_returncode()
+        run_script(_WORKER, (str(source), str(folded)), timeout_s).check_returncode()
     except subprocess.TimeoutExpired as error:
         message = f"fold-with-onnxsim: onnxsim took longer than {timeout_s:g} s"
         raise PassError(message) from error

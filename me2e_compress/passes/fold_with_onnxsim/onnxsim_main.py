@@ -6,9 +6,9 @@ import onnx
 import onnxsim
 
 
-def fold(given: str, folded: str) -> None:
+def fold(source: str, folded: str) -> None:
     """Fold a file's constants with onnxsim; weights go to a data file next to it."""
-    model, _ = onnxsim.simplify(given, perform_optimization=False)
+    model, _ = onnxsim.simplify(source, perform_optimization=False)
     onnx.save(model, folded, save_as_external_data=True, location="folded.data")
 
 

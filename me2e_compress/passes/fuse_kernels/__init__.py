@@ -64,7 +64,7 @@ class FuseKernels(Pass):
         # Try the fuser of every operator; an almost matching one says why it stays
         opset, names = opset_of(model), value_names(model.graph)
         done: collections.Counter[str] = collections.Counter()
-        left: list[str] = []
+        rejected: list[str] = []
         for body in graphs_of(model.graph):
             for node in list(body):
                 known = is_standard(node) or node.domain == OWN_DOMAIN
@@ -75,7 +75,7 @@ class FuseKernels(Pass):
                 try:
                     new = fuser(node, call)
                 except PreconditionError as error:
-                    left.append(f"left {node.name}: {error}")
+                    rejected.append(f"left {node.name}: {error}")
                     continue
                 if new is not None:
                     replace_value(node.outputs[0], new)
@@ -84,4 +84,4 @@ class FuseKernels(Pass):
             model.opset_imports.setdefault(OWN_DOMAIN, 1)
             remove_dead(model.graph)
         notes = [f"fused: {plural(n, kind)}" for kind, n in sorted(done.items())]
-        return PassResult(model, done.total(), (*notes, *left))
+        return PassResult(model, done.total(), (*notes, *rejected))

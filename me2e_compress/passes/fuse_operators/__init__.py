@@ -79,10 +79,10 @@ class FuseOperators(Pass):
         opset, unread = opset_of(model), remove_dead(model.graph)
         names, proofs = value_names(model.graph), _Proofs(opset, context.seed)
         run = _Run(self.name, opset, names, proofs)
-        left: list[str] = []
+        rejected: list[str] = []
         for body in graphs_of(model.graph):
-            left += run.try_nodes(body, gathered.is_sampler, run.sample)
-            left += run.try_nodes(body, _is_sampler, run.fuse)
+            rejected += run.try_nodes(body, gathered.is_sampler, run.sample)
+            rejected += run.try_nodes(body, _is_sampler, run.fuse)
         if run.fused:
             model.opset_imports.setdefault(OWN_DOMAIN, 1)
         if run.fused or run.sampled:
@@ -93,7 +93,12 @@ class FuseOperators(Pass):
         )
         sampled = (f"written as GridSample: {run.sampled} samplings by Gather",)
         swept = (f"removed: {unread} unread",) * bool(unread)
-        notes = (*fused * bool(run.fused), *sampled * bool(run.sampled), *left, *swept)
+        notes = (
+            *fused * bool(run.fused),
+            *sampled * bool(run.sampled),
+            *rejected,
+            *swept,
+        )
         return PassResult(model, run.fused + run.sampled + unread, notes)
 
 

@@ -154,11 +154,11 @@ def guesses(node: ir.Node, opset: int) -> Iterator[Sampling]:
         total = math.prod(sizes(at[0].layout)) // (3 - len(at))
         outer = (Digit(AT, total // batch, batch),) if batch > 1 else ()
         inner, channel = whole(AT, total // batch), whole(CHANNEL, channels)
-        taken = View(image, (outer, channel, whole(ROW, rows), whole(COLUMN, columns)))
+        maps = View(image, (outer, channel, whole(ROW, rows), whole(COLUMN, columns)))
         for result in _sums(node):
             summed = regrouped((outer, channel, inner), static_shape(result) or ())
             if summed is not None:
-                yield Sampling(View(result, summed), taken, shape, at, scale, shift)
+                yield Sampling(View(result, summed), maps, shape, at, scale, shift)
 
 
 def _image(node: ir.Node) -> ir.Value:

@@ -107,14 +107,14 @@ def _before_repeats(node: ir.Node, layout: Layout) -> Layout | None:
     """Return the layout of what a node moves or repeats; None if it does neither."""
     if not is_standard(node) or not node.inputs:
         return None
-    given = static_shape(node.inputs[0])
-    if given is None or node.op_type not in REPEATS:
+    small = static_shape(node.inputs[0])
+    if small is None or node.op_type not in REPEATS:
         return before(node, layout)
     if node.op_type == "Concat" and len(set(node.inputs)) != 1:
         return None
     # The digits of an axis before it was repeated are its last ones
     once: list[Digits] = []
-    for digits, size in zip(layout[len(layout) - len(given) :], given, strict=True):
+    for digits, size in zip(layout[len(layout) - len(small) :], small, strict=True):
         times = math.prod(digit.size for digit in digits) // size
         split = regrouped((digits,), (times, size))
         if split is None:
@@ -124,18 +124,18 @@ def _before_repeats(node: ir.Node, layout: Layout) -> Layout | None:
 
 
 def _sizes(
-    shape: Sequence[int], kept: Digits
+    shape: Sequence[int], source_digits: Digits
 ) -> tuple[tuple[int, ...], tuple[int, ...]] | None:
     """Return the small and the large sizes; None if the source has another order."""
     small, large, mine = list[int](), list[int](), list[Digit]()
 
     def is_kept(one: Digit) -> bool:
-        same = (other for other in kept if other.axis == one.axis)
+        same = (other for other in source_digits if other.axis == one.axis)
         return any(o.stride <= one.stride and one.end <= o.end for o in same)
 
     # Cut each axis into digits that the source has and digits that it repeats over
     for axis, size in enumerate(shape):
-        pieces = split_like(whole(str(axis), size), kept)
+        pieces = split_like(whole(str(axis), size), source_digits)
         if not pieces:
             small.append(1)
             large.append(1)
@@ -144,7 +144,7 @@ def _sizes(
             large.append(math.prod(digit.size for digit in digits))
             small.append(large[-1] if stays else 1)
             mine.extend(digits if stays else ())
-    return (tuple(small), tuple(large)) if merged(mine) == kept else None
+    return (tuple(small), tuple(large)) if merged(mine) == source_digits else None
 
 
 # Operators that compute every element, or every row of the last axis, by itself.
@@ -226,13 +226,13 @@ def _plan(node: ir.Node) -> _Plan | None:
     if node.op_type in BINARY:
         return _combined(node, shape)
     # An operator along the last axis needs it whole
-    repeated, given = repeated_axes(value), static_shape(value)
-    if repeated is None or not given:
+    repeated, width_shape = repeated_axes(value), static_shape(value)
+    if repeated is None or not width_shape:
         return None
     operand = _Operand(value, repeated.small, repeated)
     if node.op_type in UNARY:
         return _Plan((operand,), repeated.small, repeated.large)
-    if not repeated.small[-1] == repeated.large[-1] == given[-1]:
+    if not repeated.small[-1] == repeated.large[-1] == width_shape[-1]:
         return None
     ends = shape[-1:]
     return _Plan((operand,), repeated.small[:-1] + ends, repeated.large[:-1] + ends)
@@ -253,14 +253,14 @@ def _combined(node: ir.Node, shape: tuple[int, ...]) -> _Plan | None:
     # The smaller operand is repeated by the operator itself
     operands: list[_Operand] = []
     for value in node.inputs:
-        given = static_shape(value)
-        if value is None or given is None:
+        full = static_shape(value)
+        if value is None or full is None:
             return None
         same = value.dtype == node.outputs[0].dtype and not holds_numbers(value)
         repeated = repeated_axes(value) if same else None
-        if repeated is not None and repeated.large != given:
+        if repeated is not None and repeated.large != full:
             return None
-        small = given if repeated is None else repeated.small
+        small = full if repeated is None else repeated.small
         operands.append(_Operand(value, small, repeated))
     if all(operand.repeated is None for operand in operands):
         return None

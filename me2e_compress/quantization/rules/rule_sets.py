@@ -331,9 +331,9 @@ class SmallProduct(Rule):
         if node.op_type not in PRODUCTS:
             return None
         size = extent(node, weight=node.inputs[1] in facts.constants)
-        for name, found in (("K", size.depth), ("N", size.columns)):
-            if found is not None and found < self.minimum:
-                return f"{name} = {found}, below {self.minimum}: less than one tile"
+        for name, elements in (("K", size.depth), ("N", size.columns)):
+            if elements is not None and elements < self.minimum:
+                return f"{name} = {elements}, below {self.minimum}: less than one tile"
         return None
 
 
