@@ -9,6 +9,7 @@ from typing import TypeAlias
 import onnx_ir as ir
 
 from me2e_compress.graph import WEIGHTED, input_at, is_standard, static_shape
+from me2e_compress.graph.nodes import maker
 from me2e_compress.graph.shapes import open_shape
 from me2e_compress.operators import op_types
 
@@ -104,9 +105,9 @@ def find_attention(
     One sweep over the graph remembers, for every value, which products lie behind it,
     another which lie ahead; scaling, masks, casts and changes of layout are looked
     through. A softmax with a product behind it is an attention: that product is queries
-    by keys, the one ahead weights by values. Products may be MatMul, Gemm or Einsum. A
-    mask's own products are told from the scores by their size. The search is linear in
-    the graph.
+    by keys, the one ahead weights by values. Products may be MatMul, Gemm or Einsum,
+    the softmax may be written as five nodes. A mask's own products are told from the
+    scores by their size. The search is linear in the graph.
 
     Operators that are attention as a whole (:func:`is_fused`) are mapped too. Sampling
     weights of deformable attention come from a linear layer, not from such a product,
@@ -136,9 +137,8 @@ def find_attention(
             shapes = [open_shape(value) or () for value in node.inputs[:2]]
             tokens = [shape[-2] if len(shape) > 1 else None for shape in shapes]
             attentions[node] = Attention(tokens[0], tokens[-1])
-    softmaxes = [node for node in model.graph if node.op_type == "Softmax"]
-    for node in softmaxes:
-        weights, scores = node.outputs[0], node.inputs[0]
+    for node in model.graph:
+        weights, scores = node.outputs[0], _scores(node)
         if scores is None:
             continue
         # a mask may have products of its own, of another size
@@ -169,6 +169,18 @@ def find_attention_weights(
         if any(value in softmaxes for value in reads if value is not None):
             reasons.setdefault(node, "reads the weights that a softmax gives")
     return reasons
+
+
+def _scores(node: ir.Node) -> ir.Value | None:
+    """Return what a softmax is taken of; None of other nodes."""
+    if node.op_type == "Softmax":
+        return node.inputs[0]
+    # In five nodes it ends with Div(Exp(x), ReduceSum(Exp(x)))
+    above, below = node.inputs[:2] if node.op_type == "Div" else (None, None)
+    power, total = maker(above, "Exp"), maker(below, "ReduceSum")
+    if power is None or total is None or total.inputs[0] is not above:
+        return None
+    return power.inputs[0]
 
 
 def _fits(product: ir.Value, scores: ir.Value) -> bool:

@@ -47,6 +47,8 @@ VARIANTS = {
     " d = Dropout(p) y = MatMul(d, v)",
     "Where after softmax": "s = MatMul(q, k) p = Softmax(s) w = Where(seen, p, zero)"
     " y = MatMul(w, v)",
+    "softmax in five nodes": "s = MatMul(q, k) m = ReduceMax<axes=[-1]>(s)"
+    " c = Sub(s, m) e = Exp(c) t = ReduceSum(e, last) p = Div(e, t) y = MatMul(p, v)",
     "Einsum": 's = Einsum<equation="bhqd,bhdk->bhqk">(q, k) p = Softmax(s)'
     ' y = Einsum<equation="bhqk,bhkd->bhqd">(p, v)',
 }
