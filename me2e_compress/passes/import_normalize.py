@@ -29,11 +29,18 @@ from me2e_compress.graph.nodes import (
     nodes_in,
     nodes_of,
 )
-from me2e_compress.graph.rewrite import lift_constants, put, remove_node, value_names
+from me2e_compress.graph.rewrite import (
+    add_constant,
+    lift_constants,
+    put,
+    remove_node,
+    value_names,
+)
 from me2e_compress.graph.rewrite.raise_opset import OLDEST_OPSET, raise_opset
 from me2e_compress.graph.validity import ORIGINAL_DOMAIN, PLUGIN_DOMAIN
 from me2e_compress.operators import FusedCall
 from me2e_compress.passes.base import Context, Pass, PassResult
+from me2e_compress.targets.quantized import PAIR
 
 # Attributes of standard operators that name an element type: Cast; EyeLike, Random*,
 # Bernoulli, Multinomial, SequenceEmpty; the window functions and MelWeightMatrix.
@@ -161,9 +168,10 @@ class ImportNormalize(Pass):
     6. Constant nodes become initializers.
     7. A model with functions declares at least IR version 8, and all used domains are
        imported.
-    8. An Einsum that is a product becomes a MatMul: a layer, which becomes int8.
-    9. A tensor that is split into a sequence, of which only parts are read, is split
-       into these.
+    8. Stored scales and zero points by channel become vectors.
+    9. An Einsum that is a product becomes a MatMul: a layer, which becomes int8.
+    10. A tensor that is split into a sequence, of which only parts are read, is split
+        into these.
 
     Subgraphs and function bodies are included. Unknown operators are left alone.
 
@@ -201,7 +209,8 @@ class ImportNormalize(Pass):
                 if node.domain not in body.opset_imports:
                     body.opset_imports[node.domain] = 1
                     changes += 1
-        # Products and parts of tensors in their plain forms
+        # Scales, products and parts of tensors in their plain forms
+        changes += _flatten_scales(model, self.name)
         changes += _write_einsums(model, self.name)
         if opset_of(model) >= OLDEST_OPSET:
             changes += _unpack_sequences(model, self.name)
@@ -292,6 +301,30 @@ def _plugins_without_domain(
         and is_plugin(node)
         and node.op_identifier() not in model.functions
     ]
+
+
+def _flatten_scales(model: ir.Model, by: str) -> int:
+    """Write stored scales and zero points by channel as vectors, and count them.
+
+    NNCF stores those of a Conv's weight as [channels, 1, 1].
+    """
+    count = 0
+    for node in model.graph:
+        shape = static_shape(node.inputs[0]) if node.op_type in PAIR else None
+        axis = node.attributes.get_int("axis", 1)
+        if not shape or axis >= len(shape) or "block_size" in node.attributes:
+            continue
+        for index in range(1, len(node.inputs)):
+            array = array_of(node.inputs[index])
+            if array is None or array.ndim < 2:
+                continue
+            if array.size == max(array.shape) == shape[axis]:
+                name = f"{node.name}_vector_{index}"
+                vector = add_constant(model.graph, array.reshape(-1), name)
+                node.replace_input_with(index, vector)
+                provenance.inherit(node, [node], by=by)
+                count += 1
+    return count
 
 
 _TWO_OPERANDS = re.compile(r"([A-Za-z]+),([A-Za-z]+)->([A-Za-z]+)")

@@ -272,3 +272,25 @@ def test_doubles_that_the_outside_wants_stay(text: str, culprit: str) -> None:
     assert _doubles_of(ir.to_proto(model)) > 0
     assert result.notes == (f"float64 stays: {culprit} is double",)
     assert settled(model)
+
+
+@pytest.mark.parametrize(
+    ("sides", "axis", "stays"),
+    [("3,1,1", 0, False), ("1,3,1,1", 0, False), ("3,1", 1, True), ("2,2", 1, True)],
+)
+def test_scales_by_channel_become_vectors(sides: str, axis: int, stays: bool) -> None:
+    text = f"""
+        <ir_version: 10, opset_import: ["" : 21]>
+        g () => (float[3,4] y)
+            <int8[3,4] w = {{1,2,3,4,5,6,7,8,9,10,11,12}},
+             float[{sides}] s = {{1,2,3{",4" * (sides == "2,2")}}}>
+        {{ y = DequantizeLinear<axis={axis}>(w, s) }}
+    """
+    model = ir.from_onnx_text(text)
+
+    normalise(model)
+
+    scale = model.graph[0].inputs[1]
+    assert scale is not None
+    assert scale.shape is not None
+    assert (len(scale.shape) > 1) is stays
