@@ -20,7 +20,6 @@ from me2e_compress.calibration.dataset import CalibrationSet, load_arrays, npz_b
 from me2e_compress.calibration.observers import DEFAULT_METHOD, OBSERVERS
 from me2e_compress.calibration.ranges import Ranges
 from me2e_compress.calibration.statistics import (
-    BINS,
     NOT_FINITE,
     Floats,
     Statistics,
@@ -34,6 +33,7 @@ from me2e_compress.calibration.statistics import (
 )
 from me2e_compress.graph.nodes import makers_of, reads_of
 from me2e_compress.operators import OWN_DOMAIN
+from me2e_compress.operators.kernels.kernel import BINS
 from me2e_compress.runtime.frames import Array
 from me2e_compress.runtime.probing import (
     READINGS,

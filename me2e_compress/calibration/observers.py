@@ -13,7 +13,8 @@ import numpy.typing as npt
 
 from me2e_compress.base.errors import FramesError, RecipeError
 from me2e_compress.base.registry import Registry
-from me2e_compress.calibration.statistics import BINS, Statistics
+from me2e_compress.calibration.statistics import Statistics
+from me2e_compress.operators.kernels.kernel import BINS
 
 __all__ = ["OBSERVERS", "QUANT_MAX", "Bounds", "Observer", "scale_of"]
 

@@ -96,7 +96,8 @@ class Statistics:
     @property
     def exponents(self) -> npt.NDArray[np.int64]:
         """The least e for which 2^e exceeds all magnitudes: int64 [tensors]."""
-        return exponents_of(self.measured).max(axis=0, initial=LEAST_EXPONENT)
+        exponents = exponents_of(self.measured)
+        return np.asarray(exponents.max(axis=0, initial=LEAST_EXPONENT))
 
     def histograms(self) -> npt.NDArray[np.int64]:
         """Return the histograms; FramesError if none were collected."""

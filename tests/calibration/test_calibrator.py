@@ -17,7 +17,7 @@ from me2e_compress.calibration.observers import OBSERVERS
 from me2e_compress.calibration.ranges import Ranges
 from me2e_compress.calibration.statistics import Statistics
 from me2e_compress.runtime.frames import Array, Frame
-from me2e_compress.runtime.probing import Probe
+from me2e_compress.runtime.probing import Probe, insert_probes
 from me2e_compress.runtime.providers import CPU, CpuProvider, Provider
 from me2e_compress.runtime.session import Session, replay
 from tests.support.frames import record
@@ -278,7 +278,7 @@ def test_where_all_that_is_read_is_finite_no_other_tensor_is_looked_at(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """To look at all of VAD-tiny's took 15 GB."""
-    asked, whole = list[int](), statistics.insert_probes
+    asked, whole = list[int](), insert_probes
 
     def counted(model: ir.Model, tensors: Sequence[str], probe: Probe) -> ir.Model:
         asked.append(len(tensors))

@@ -24,8 +24,9 @@ from me2e_compress.calibration.observers import (
 )
 from me2e_compress.calibration.ranges import Activity, Ranges
 from me2e_compress.calibration.review import review
-from me2e_compress.calibration.statistics import BINS, Statistics
+from me2e_compress.calibration.statistics import Statistics
 from me2e_compress.graph import infer_shapes
+from me2e_compress.operators.kernels.kernel import BINS
 from tests.support.frames import record
 from tests.support.nets import conv_attention, image, parsed
 from tests.support.profiles import scaled
