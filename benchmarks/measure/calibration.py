@@ -32,8 +32,8 @@ from me2e_compress import graph
 from me2e_compress.calibration.calibrator import Calibrator
 from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.graph.modules.module_map import ModuleMap
+from me2e_compress.quantization.decision import QuantScheme
 from me2e_compress.quantization.plan import make_plan, tensors_of
-from me2e_compress.quantization.scheme import QuantScheme
 from me2e_compress.runtime.session import Session, replay
 
 OURS = {

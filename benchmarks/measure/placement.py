@@ -38,10 +38,15 @@ from me2e_compress.graph.modules.module_map import ModuleMap
 from me2e_compress.graph.nodes import constant_values
 from me2e_compress.manager import PassManager, recipe
 from me2e_compress.passes import Context
-from me2e_compress.quantization.decision import FLOAT, INT8, Decision, QuantPlan
+from me2e_compress.quantization.decision import (
+    FLOAT,
+    INT8,
+    Decision,
+    QuantPlan,
+    QuantScheme,
+)
 from me2e_compress.quantization.plan import make_plan
 from me2e_compress.quantization.rules.rule_sets import SafeRules
-from me2e_compress.quantization.scheme import QuantScheme
 from me2e_compress.runtime.session import Session
 from me2e_compress.targets.tensorrt import TensorRT
 from me2e_compress.targets.weights import evaluate_constants

@@ -31,10 +31,9 @@ from me2e_compress.commands.lint import lint
 from me2e_compress.commands.options import CompressOptions, LintOptions
 from me2e_compress.graph import provenance
 from me2e_compress.graph.modules.module_map import ModuleMap
-from me2e_compress.quantization.decision import stamp_plan
+from me2e_compress.quantization.decision import QuantScheme, stamp_plan
 from me2e_compress.quantization.plan import make_plan
 from me2e_compress.quantization.rules import RULE_SETS
-from me2e_compress.quantization.scheme import QuantScheme
 from me2e_compress.targets import TARGETS
 
 PRESETS = {"uniad-tiny": "uniad", "vad-tiny": "vad"}

@@ -16,10 +16,9 @@ from me2e_compress.graph import provenance
 from me2e_compress.graph.modules.module_map import ModuleMap
 from me2e_compress.graph.provenance import Provenance
 from me2e_compress.quantization.costs import CostsOf
-from me2e_compress.quantization.decision import QuantPlan
+from me2e_compress.quantization.decision import QuantPlan, QuantScheme
 from me2e_compress.quantization.plan import make_plan
 from me2e_compress.quantization.rules import RULE_SETS
-from me2e_compress.quantization.scheme import QuantScheme
 from me2e_compress.runtime.frames import Frame
 from me2e_compress.runtime.session import Session, replay
 from me2e_compress.targets.onnxruntime import OnnxRuntime

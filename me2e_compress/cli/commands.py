@@ -1,4 +1,4 @@
-"""The commands: arguments, options by their dataclass, one workflow, what it gives.
+"""The commands: arguments, options by their dataclass, one function, its result.
 
 What is heavy is imported in the bodies, so that a command explains itself at once.
 """
@@ -41,8 +41,6 @@ def demo(
     writing: WriteOptions = WRITING,
 ) -> None:
     """Run the main job on what ships: compress, verify, compare, drive, report.
-
-    The trained driver is compressed and drives before and after.
 
     Args:
         output: the folder to write

@@ -10,12 +10,11 @@ from me2e_compress.base.display import plural
 from me2e_compress.base.errors import FramesError
 from me2e_compress.base.listener import SILENT, Listener
 from me2e_compress.calibration.calibrator import Calibrator
-from me2e_compress.calibration.dataset import CalibrationSet
+from me2e_compress.calibration.dataset import CalibrationSet, draw
 from me2e_compress.calibration.exchange import pick_ranges, read_cache
 from me2e_compress.calibration.observers import OBSERVERS
 from me2e_compress.calibration.ranges import Ranges, rms_of
 from me2e_compress.calibration.review import RangeFinding, missing_ranges, review
-from me2e_compress.calibration.sample import draw
 from me2e_compress.commands.checks import (
     model_path,
     output_path,
@@ -136,7 +135,6 @@ def calibrate(
                 method = options.method or prepared.method
                 calibrator = Calibrator(
                     method,
-                    options.threads,
                     checkpoint=checkpoint,
                     provider=options.runs_on,
                 )
@@ -167,7 +165,7 @@ def _import(
     # two frames show the size of every tensor; the second has a state
     if part is not None:
         few = part.part(part.places[:2])
-        calibrator = Calibrator(threads=options.threads, provider=options.runs_on)
+        calibrator = Calibrator(provider=options.runs_on)
         statistics = calibrator.collect(prepared.model, tuple(ranges.tensors), few)
         ranges = dataclasses.replace(ranges, rms=rms_of(statistics))
     return ranges, [name for name in tensors if name not in ranges.tensors]

@@ -1,16 +1,24 @@
 """Compress a model, from file to file."""
 
 import dataclasses
+import time
 from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any, TypeAlias
 
+import onnx
+
 from me2e_compress import graph
 from me2e_compress.base import atomic
 from me2e_compress.base.atomic import write_document
 from me2e_compress.base.display import format_mb
-from me2e_compress.base.errors import PreconditionError, RecipeError
+from me2e_compress.base.errors import (
+    FramesError,
+    GraphError,
+    PreconditionError,
+    RecipeError,
+)
 from me2e_compress.base.listener import SILENT, Listener
 from me2e_compress.calibration.review import NOT_FINITE
 from me2e_compress.commands.checks import (
@@ -22,17 +30,17 @@ from me2e_compress.commands.checks import (
     writing,
 )
 from me2e_compress.commands.inspect import WEIGHTS
-from me2e_compress.commands.int8_outcome import Int8Outcome
 from me2e_compress.commands.lint import LintResult, lint_written
-from me2e_compress.commands.measured_loss import (
+from me2e_compress.commands.options import CompressOptions
+from me2e_compress.commands.outcome import (
+    Int8Outcome,
     MeasuredLoss,
     measure_loss,
     split_frames,
 )
-from me2e_compress.commands.options import CompressOptions
 from me2e_compress.commands.result import Result, View, plain
-from me2e_compress.commands.written import size_note, speed_note
 from me2e_compress.fidelity.floor import Floor
+from me2e_compress.graph import file_bytes
 from me2e_compress.graph.files import data_names
 from me2e_compress.graph.provenance import drop_traces
 from me2e_compress.graph.shapes import records_shapes, without_inferable_shapes
@@ -48,7 +56,8 @@ from me2e_compress.passes.quantize_int8 import QuantizeInt8, Quantizer, quantize
 from me2e_compress.quantization.decision import plan_of, save_plan
 from me2e_compress.runtime.frames import Frames
 from me2e_compress.runtime.latency_trace import cpu_seconds
-from me2e_compress.runtime.providers import CPU
+from me2e_compress.runtime.providers import CPU, Provider
+from me2e_compress.runtime.session import Session, replay
 
 Recipe: TypeAlias = str | Path | Sequence[Pass]
 """A shipped recipe's name, a TOML file, or passes."""
@@ -358,3 +367,56 @@ def _write(
         record = report.record(source, output) | result.findings()
         write_document(sidecar(output, "report"), record, indent=2)
     return dataclasses.replace(result, record=record)
+
+
+ROUNDS = 5
+"""Runs of each file, the least of which counts."""
+ENOUGH_S = 3.0
+"""So long is measured at most, but for the first round."""
+
+
+def size_note(source: Path, output: Path) -> str:
+    """Return by how much a file is larger than its source, and why; else empty."""
+    more = file_bytes(output) - file_bytes(source)
+    if more <= 0:
+        return ""
+    model = onnx.load(output, load_external_data=False)
+    notes = [entry for node in model.graph.node for entry in node.metadata_props]
+    known = sum(each.ByteSize() for each in (*notes, *model.metadata_props))
+    shapes = sum(each.ByteSize() for each in model.graph.value_info)
+    return (
+        f"{output.name} is {more:,} bytes larger than {source.name}: origins and plan"
+        f" take {known:,}, shapes {shapes:,}, the rest are nodes and weights"
+    )
+
+
+def speed_note(source: Path, output: Path, frames: Frames, provider: Provider) -> str:
+    """Return how much longer than its source a file takes here; empty if not longer.
+
+    CPU time of one frame on one thread, in turn, as anybody opens the files. Empty,
+    too, where one of them does not run.
+    """
+    frame = next(iter(frames))
+    least, begun = dict[Path, float](), time.perf_counter()
+    try:
+        sessions = {
+            path: Session(path, threads=1, stock=True, provider=provider)
+            for path in (source, output)
+        }
+        for _ in range(1 + ROUNDS):
+            for path, session in sessions.items():
+                start = time.process_time()
+                next(replay(session, [frame]))
+                took = time.process_time() - start
+                least[path] = min(took, least.get(path, took))
+            if time.perf_counter() - begun > ENOUGH_S:
+                break
+    except (FramesError, GraphError):
+        return ""
+    ratio = least[output] / least[source]
+    if ratio < 1:
+        return ""
+    return (
+        f"{output.name} takes {ratio:.2f} times as long as {source.name} here (CPU time"
+        " of one frame, one thread)"
+    )

@@ -218,15 +218,12 @@ class CalibrateOptions(WriteOptions, GraphOptions):
     """number of frames, drawn in whole scenes"""
     imported: Annotated[File | None, Parameter(name="--import")] = None
     """what another tool measured; frames then judge its scales alone"""
-    threads: int = 0
-    """of onnxruntime; 0 takes all"""
 
     def __post_init__(self) -> None:
         if self.method is not None:
             from me2e_compress.calibration.observers import OBSERVERS
 
             OBSERVERS.parse(self.method)
-        check_count("--threads", self.threads, most=MOST_THREADS)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

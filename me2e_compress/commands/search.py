@@ -14,9 +14,8 @@ from me2e_compress.base.display import format_mb, format_significant, plural, ta
 from me2e_compress.base.errors import EnergyError, RecipeError
 from me2e_compress.base.listener import SILENT, Listener
 from me2e_compress.calibration.calibrator import Calibrator
-from me2e_compress.calibration.dataset import CalibrationSet
+from me2e_compress.calibration.dataset import CalibrationSet, draw
 from me2e_compress.calibration.ranges import Ranges
-from me2e_compress.calibration.sample import draw
 from me2e_compress.commands.checks import (
     load_map,
     model_path,
@@ -44,8 +43,8 @@ from me2e_compress.fidelity.sensitivity import (
 )
 from me2e_compress.fidelity.sensitivity import search as find
 from me2e_compress.manager import recipe
+from me2e_compress.quantization.decision import QuantScheme
 from me2e_compress.quantization.rules import DEFAULT_RULES, RULE_SETS
-from me2e_compress.quantization.scheme import QuantScheme
 from me2e_compress.runtime.energy.energy_counter import EnergySchedule, open_counter
 from me2e_compress.runtime.energy.energy_result import FEWEST_WINDOWS, Absent, Reader
 from me2e_compress.runtime.energy.meter import measure_energy

@@ -27,12 +27,12 @@ from me2e_compress.quantization.decision import (
     RESIDUAL,
     Overrides,
     QuantPlan,
+    QuantScheme,
     keep_float,
     overrides_text,
 )
 from me2e_compress.quantization.plan import make_plan
 from me2e_compress.quantization.rules import RuleSet
-from me2e_compress.quantization.scheme import QuantScheme
 from me2e_compress.runtime.frames import Frames
 from me2e_compress.runtime.providers import CPU, Provider
 from me2e_compress.runtime.session import Session

@@ -20,11 +20,11 @@ from me2e_compress.quantization.decision import (
     METADATA,
     Overrides,
     QuantPlan,
+    QuantScheme,
     stamp_plan,
 )
 from me2e_compress.quantization.plan import make_plan
 from me2e_compress.quantization.rules import DEFAULT_RULES, RULE_SETS, RuleSet
-from me2e_compress.quantization.scheme import QuantScheme
 from me2e_compress.targets import DEFAULT_TARGET, TARGETS, Target
 from me2e_compress.targets.onnxruntime.convert import unranged
 from me2e_compress.targets.quantized import describe_quantized

@@ -15,10 +15,63 @@ from me2e_compress.base import documents
 from me2e_compress.base.atomic import write_document
 from me2e_compress.base.display import Table, table
 from me2e_compress.base.documents import toml_string
-from me2e_compress.base.errors import RecipeError
+from me2e_compress.base.errors import ModuleMapError, RecipeError
 from me2e_compress.graph import WEIGHTED, provenance
+from me2e_compress.graph.modules.module_map import ModuleMap, Role
 from me2e_compress.operators import int8_op_types
-from me2e_compress.quantization.scheme import QuantScheme
+
+SCHEMES: dict[str, tuple[Role, ...]] = {
+    "feature-ext": ("feature",),
+    "prediction": ("prediction",),
+    "full": ("feature", "prediction"),
+}
+"""The three schemes of the paper (Table 4): the feature extraction is backbone, neck
+and BEV encoder, the prediction every other functional module, full their union."""
+
+
+@dataclasses.dataclass(frozen=True)
+class QuantScheme:
+    """A named choice of modules.
+
+    ``name`` is ``modules`` if the modules were listed one by one.
+    """
+
+    name: str
+    modules: tuple[str, ...]
+
+    @classmethod
+    def named(cls, name: str, modules: ModuleMap) -> Self:
+        """Return the modules of a map whose roles a scheme names.
+
+        A scheme of one role needs a map that has modules of both.
+
+        Raises:
+            RecipeError: no such scheme; int4 and fp8 are none.
+            ModuleMapError: the map has modules of one role only.
+        """
+        if name not in SCHEMES:
+            raise RecipeError(
+                f"no scheme {name}; there are {', '.join(SCHEMES)}, all of them int8"
+            )
+        wanted = SCHEMES[name]
+        # a scheme of a part needs a map that knows parts
+        lacking = [role for role in SCHEMES["full"] if not modules.names(role)]
+        if lacking and name != "full":
+            raise ModuleMapError(
+                f"scheme {name} is of a part of the graph, and map {modules.name}"
+                f" ({', '.join(modules.names())}) has no module of role {lacking[0]}:"
+                " name a map that has (--map), or take scheme full"
+            )
+        chosen = (module.name for module in modules.modules if module.role in wanted)
+        return cls(name, tuple(chosen))
+
+    @classmethod
+    def of(cls, chosen: tuple[str, ...], modules: ModuleMap) -> Self:
+        """Return the scheme of modules chosen by name."""
+        for name in chosen:
+            modules.module(name)
+        return cls("modules", tuple(n for n in modules.names() if n in chosen))
+
 
 METADATA = "me2e.quant_plan"
 """Key of the model's metadata under which a quantized graph carries its plan."""

@@ -28,6 +28,7 @@ from me2e_compress.quantization.decision import (
     Override,
     Overrides,
     QuantPlan,
+    QuantScheme,
     ScaleGroup,
     check_followed,
 )
@@ -39,7 +40,6 @@ from me2e_compress.quantization.rules import (
     RuleFacts,
     RuleSet,
 )
-from me2e_compress.quantization.scheme import QuantScheme
 
 # Find tensors whose scales are decided together.
 

@@ -10,8 +10,7 @@ from me2e_compress.base.display import (
     plural,
     with_prefix,
 )
-from me2e_compress.quantization.decision import Decision, QuantPlan
-from me2e_compress.quantization.scheme import QuantScheme
+from me2e_compress.quantization.decision import Decision, QuantPlan, QuantScheme
 
 
 def test_a_plan_has_a_row_a_module_with_the_rules_that_kept_float() -> None:

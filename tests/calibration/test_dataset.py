@@ -6,8 +6,13 @@ import pytest
 
 from me2e_compress.base.errors import FramesError, PreconditionError
 from me2e_compress.calibration import dataset
-from me2e_compress.calibration.dataset import CalibrationSet, draw_frames, load_arrays
-from me2e_compress.calibration.sample import draw, hold_out
+from me2e_compress.calibration.dataset import (
+    CalibrationSet,
+    draw,
+    draw_frames,
+    hold_out,
+    load_arrays,
+)
 from tests.fuzz.frames import archive, broken_frames, member
 from tests.support.frames import record
 from tests.support.nets import parsed

@@ -33,7 +33,6 @@ def test_a_number_that_is_none(cli: Cli, dense: Path, line: str, value: str) -> 
 @pytest.mark.parametrize(
     "line",
     [
-        f"calibrate {F} -o out --threads -1",
         "compress dense.onnx -r exact -o out --verify-frames -1",
         "compress dense.onnx -r exact -o out --verify-frames 1001",
         f"sensitivity {F} -o out --node-trials -1",

@@ -14,8 +14,8 @@ import me2e_compress as me2e
 from me2e_compress import graph
 from me2e_compress.calibration.calibrator import Calibrator
 from me2e_compress.calibration.dataset import CalibrationSet
-from me2e_compress.commands.measured_loss import ADVICE
-from me2e_compress.commands.written import size_note, speed_note
+from me2e_compress.commands.compress import size_note, speed_note
+from me2e_compress.commands.outcome import ADVICE
 from me2e_compress.runtime.providers import CPU
 from tests.support.command import Command
 from tests.support.frames import record

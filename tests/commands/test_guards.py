@@ -12,14 +12,12 @@ from me2e_compress.base.errors import RecipeError
     ("make", "message"),
     [
         (lambda: me2e.CompressOptions(verify_frames=-1), "-frames is -1"),
-        (lambda: me2e.CalibrateOptions(threads=-2), "--threads is -2"),
         (lambda: me2e.CalibrateOptions(method="max"), "method 'max'"),
         (lambda: me2e.SearchOptions(), "give a budget"),
         (lambda: me2e.SearchOptions(max_ms=float("nan")), "is nan"),
         (lambda: me2e.SensitivityOptions(limit=-1.0), "--limit is -1"),
         (lambda: me2e.ProfileOptions(samples=10**20), "--samples is 1"),
         (lambda: me2e.ProfileOptions(threads=10**9), "1,024 at most"),
-        (lambda: me2e.CalibrateOptions(threads=10**9), "1,024 at most"),
         (lambda: me2e.LintOptions(target="onnxruntime", trt_check=True), "trt"),
     ],
 )

@@ -7,11 +7,10 @@ import pytest
 
 from me2e_compress.base.errors import RecipeError
 from me2e_compress.graph.nodes import constant_values
-from me2e_compress.quantization.decision import Decision, Overrides
+from me2e_compress.quantization.decision import Decision, Overrides, QuantScheme
 from me2e_compress.quantization.find_attention import Attention, find_attention
 from me2e_compress.quantization.plan import make_plan
 from me2e_compress.quantization.rules import RULE_SETS
-from me2e_compress.quantization.scheme import QuantScheme
 from me2e_compress.targets import TARGETS
 from tests.support.nets import MODULES, net
 

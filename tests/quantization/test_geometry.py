@@ -7,11 +7,10 @@ import numpy as np
 import onnx_ir as ir
 import pytest
 
-from me2e_compress.quantization.decision import QuantPlan
+from me2e_compress.quantization.decision import QuantPlan, QuantScheme
 from me2e_compress.quantization.plan import make_plan
 from me2e_compress.quantization.rules import RULE_SETS
 from me2e_compress.quantization.rules.rule_sets import Geometry
-from me2e_compress.quantization.scheme import QuantScheme
 from tests.support.nets import MODULES, by_output, net
 
 HEAD = QuantScheme.of(("head",), MODULES)

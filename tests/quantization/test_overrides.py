@@ -8,9 +8,8 @@ import pytest
 from me2e_compress.base.errors import RecipeError
 from me2e_compress.graph import provenance
 from me2e_compress.graph.provenance import Provenance
-from me2e_compress.quantization.decision import Overrides, QuantPlan
+from me2e_compress.quantization.decision import Overrides, QuantPlan, QuantScheme
 from me2e_compress.quantization.plan import make_plan
-from me2e_compress.quantization.scheme import QuantScheme
 from tests.support.nets import FULL, MODULES, PAPER, conv_attention
 
 

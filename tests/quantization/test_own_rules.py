@@ -11,11 +11,10 @@ from me2e_compress.manager import recipe
 from me2e_compress.passes import PASSES, Context
 from me2e_compress.passes.quantize_int8 import QuantizeInt8
 from me2e_compress.quantization.costs import Border, Costs, CostsOf, Join, Loss
-from me2e_compress.quantization.decision import Overrides, QuantPlan
+from me2e_compress.quantization.decision import Overrides, QuantPlan, QuantScheme
 from me2e_compress.quantization.plan import make_plan
 from me2e_compress.quantization.rules import RULE_SETS, Rule, RuleFacts, RuleSet
 from me2e_compress.quantization.rules.rule_sets import PaperRules
-from me2e_compress.quantization.scheme import QuantScheme
 from tests.support.nets import MODULES, conv_attention
 
 

@@ -4,10 +4,9 @@ import numpy as np
 import pytest
 
 from me2e_compress.base.errors import RecipeError
-from me2e_compress.quantization.decision import Decision
+from me2e_compress.quantization.decision import Decision, QuantScheme
 from me2e_compress.quantization.plan import make_plan
 from me2e_compress.quantization.rules import RULE_SETS
-from me2e_compress.quantization.scheme import QuantScheme
 from me2e_compress.targets.onnxruntime import OnnxRuntime
 from me2e_compress.targets.tensorrt import TensorRT
 from tests.support.nets import MODULES, by_output, net, planned

@@ -13,11 +13,10 @@ from me2e_compress.calibration.ranges import Ranges
 from me2e_compress.graph import provenance
 from me2e_compress.graph.modules.module_map import ModuleMap
 from me2e_compress.graph.provenance import Provenance
-from me2e_compress.quantization.decision import Decision, QuantPlan
+from me2e_compress.quantization.decision import Decision, QuantPlan, QuantScheme
 from me2e_compress.quantization.plan import make_plan
 from me2e_compress.quantization.rules import RULE_SETS
 from me2e_compress.quantization.rules.rule_sets import PaperRules
-from me2e_compress.quantization.scheme import QuantScheme
 from me2e_compress.runtime.frames import Frame
 from me2e_compress.targets import TARGETS
 

@@ -24,9 +24,9 @@ from me2e_compress.passes.ablate_modules import AblateModules
 from me2e_compress.passes.fold_constants import FoldConstants
 from me2e_compress.passes.import_normalize import ImportNormalize
 from me2e_compress.passes.quantize_int8 import QuantizeInt8
+from me2e_compress.quantization.decision import QuantScheme
 from me2e_compress.quantization.plan import make_plan, tensors_of
 from me2e_compress.quantization.rules.rule_sets import PaperRules
-from me2e_compress.quantization.scheme import QuantScheme
 from me2e_compress.runtime.plan_adapter import PlanAdapter
 from me2e_compress.runtime.session import Session
 from me2e_compress.targets import onnxruntime

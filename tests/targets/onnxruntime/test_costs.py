@@ -8,10 +8,9 @@ import onnx_ir as ir
 import pytest
 
 from me2e_compress.operators import kernels
-from me2e_compress.quantization.decision import QuantPlan
+from me2e_compress.quantization.decision import QuantPlan, QuantScheme
 from me2e_compress.quantization.plan import make_plan
 from me2e_compress.quantization.rules import RULE_SETS
-from me2e_compress.quantization.scheme import QuantScheme
 from me2e_compress.runtime.optimized import optimize
 from me2e_compress.targets.onnxruntime import OnnxRuntime
 from me2e_compress.targets.onnxruntime.costs import work_of

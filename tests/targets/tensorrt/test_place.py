@@ -11,10 +11,10 @@ from hypothesis import strategies as st
 from me2e_compress import graph
 from me2e_compress.calibration.ranges import Ranges
 from me2e_compress.graph import array_of, provenance
+from me2e_compress.quantization.decision import QuantScheme
 from me2e_compress.quantization.plan import make_plan, tensors_of
 from me2e_compress.quantization.rules import RULE_SETS
 from me2e_compress.quantization.rules.rule_sets import SafeRules
-from me2e_compress.quantization.scheme import QuantScheme
 from me2e_compress.runtime.session import Session, run_once
 from me2e_compress.targets.tensorrt import TensorRT
 from me2e_compress.targets.tensorrt.rtx_check import check

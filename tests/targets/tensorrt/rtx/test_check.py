@@ -11,10 +11,9 @@ from me2e_compress.base.errors import MissingExtraError, PreconditionError, Reci
 from me2e_compress.graph.modules.assign import map_of
 from me2e_compress.manager import PassManager, recipe
 from me2e_compress.passes import Context
-from me2e_compress.quantization.decision import stamp_plan
+from me2e_compress.quantization.decision import QuantScheme, stamp_plan
 from me2e_compress.quantization.plan import make_plan
 from me2e_compress.quantization.rules import RULE_SETS
-from me2e_compress.quantization.scheme import QuantScheme
 from me2e_compress.shipped.drivers import shipped_model
 from me2e_compress.targets.tensorrt import TensorRT
 from me2e_compress.targets.tensorrt.rtx_check import (
