@@ -37,6 +37,7 @@ from me2e_compress.graph.rewrite import (
     value_names,
 )
 from me2e_compress.graph.rewrite.raise_opset import OLDEST_OPSET, raise_opset
+from me2e_compress.graph.shapes import open_shape
 from me2e_compress.graph.validity import ORIGINAL_DOMAIN, PLUGIN_DOMAIN
 from me2e_compress.operators import FusedCall
 from me2e_compress.passes.base import Context, Pass, PassResult
@@ -169,7 +170,8 @@ class ImportNormalize(Pass):
     7. A model with functions declares at least IR version 8, and all used domains are
        imported.
     8. Stored scales and zero points by channel become vectors.
-    9. An Einsum that is a product becomes a MatMul: a layer, which becomes int8.
+    9. An Einsum that is a product becomes a MatMul, a weight in front of columns a
+       Conv: layers, which become int8.
     10. A tensor that is split into a sequence, of which only parts are read, is split
         into these.
 
@@ -212,6 +214,7 @@ class ImportNormalize(Pass):
         # Scales, products and parts of tensors in their plain forms
         changes += _flatten_scales(model, self.name)
         changes += _write_einsums(model, self.name)
+        changes += _write_convolutions(model, self.name)
         if opset_of(model) >= OLDEST_OPSET:
             changes += _unpack_sequences(model, self.name)
         return PassResult(model, changes, tuple(filter(None, (raise_note, note))))
@@ -394,6 +397,32 @@ def _transposed(call: FusedCall, value: ir.Value, have: str, want: str) -> ir.Va
     if have == want:
         return value
     return call.transpose(value, [have.index(label) for label in want])
+
+
+def _write_convolutions(model: ir.Model, by: str) -> int:
+    """Write products of a weight with columns as convolutions, and count them.
+
+    Given:   y = MatMul(w [m, k], x [batch, k, n])
+
+    Result:  y = Conv(x, w [m, k, 1])
+    """
+    count, names = 0, value_names(model.graph)
+    for body in graphs_of(model.graph):
+        for node in list(body):
+            if node.op_type != "MatMul" or not is_standard(node):
+                continue
+            weight, columns = node.inputs
+            array, shape = array_of(weight), open_shape(columns) or ()
+            if weight is None or array is None or (array.ndim, len(shape)) != (2, 3):
+                continue
+            if array_of(columns) is not None or node.outputs[0].dtype not in FLOATS:
+                continue
+            name = f"{weight.name}_kernel"
+            kernel = add_constant(body, array[:, :, None], name, names)
+            options = {"kernel_shape": [1]}
+            put(node, "Conv", [columns, kernel], by=by, attributes=options)
+            count += 1
+    return count
 
 
 def _unpack_sequences(model: ir.Model, by: str) -> int:

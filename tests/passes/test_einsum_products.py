@@ -1,4 +1,4 @@
-"""Einsums become products that answer the same."""
+"""Einsums and weights in front become layers that answer the same."""
 
 import numpy as np
 import onnx_ir as ir
@@ -73,3 +73,14 @@ def test_an_open_axis_is_no_obstacle_where_nothing_is_reshaped() -> None:
     model = einsum("bnhd,hde->bne", open_batch=True)
     normalise(model)
     assert ops(model) == ["Einsum"]
+
+
+@pytest.mark.parametrize("shape", [(4, 7), (2, 4, 7)])
+def test_a_weight_in_front_of_columns_is_a_convolution(shape: tuple[int, ...]) -> None:
+    model = ir.from_onnx_text(
+        f"""<ir_version: 9, opset_import: ["" : 17]>
+        g (float[{",".join(map(str, shape))}] x) => (float y)
+        <float[3,4] w = {{1,2,3,4,5,6,7,8,9,1,2,3}}> {{ ["p"] y = MatMul(w, x) }}"""
+    )
+    compare(model, shape)
+    assert ops(model) == ["Conv" if len(shape) == 3 else "MatMul"]
