@@ -14,33 +14,20 @@ from me2e_compress.base.display import plural
 from me2e_compress.graph import (
     array_of,
     graphs_of,
-    input_at,
     is_standard,
     opset_of,
     provenance,
     static_shape,
 )
 from me2e_compress.graph.modules.assign import assign
-from me2e_compress.graph.nodes import (
-    FLOATS,
-    bodies,
-    integers_of,
-    is_plugin,
-    nodes_in,
-    nodes_of,
-)
-from me2e_compress.graph.rewrite import (
-    add_constant,
-    lift_constants,
-    put,
-    remove_node,
-    value_names,
-)
+from me2e_compress.graph.nodes import FLOATS, bodies, is_plugin, nodes_in, nodes_of
+from me2e_compress.graph.rewrite import add_constant, lift_constants, put, value_names
 from me2e_compress.graph.rewrite.raise_opset import OLDEST_OPSET, raise_opset
 from me2e_compress.graph.shapes import open_shape
 from me2e_compress.graph.validity import ORIGINAL_DOMAIN, PLUGIN_DOMAIN
 from me2e_compress.operators import FusedCall
 from me2e_compress.passes.base import Context, Pass, PassResult
+from me2e_compress.passes.sequences import unpack_sequences
 from me2e_compress.targets.quantized import PAIR
 
 # Attributes of standard operators that name an element type: Cast; EyeLike, Random*,
@@ -172,8 +159,8 @@ class ImportNormalize(Pass):
     8. Stored scales and zero points by channel become vectors.
     9. An Einsum that is a product becomes a MatMul, a weight in front of columns a
        Conv: layers, which become int8.
-    10. A tensor that is split into a sequence, of which only parts are read, is split
-        into these.
+    10. A sequence of which tensors, their number or all of them joined are read becomes
+        these tensors.
 
     Subgraphs and function bodies are included. Unknown operators are left alone.
 
@@ -216,7 +203,7 @@ class ImportNormalize(Pass):
         changes += _write_einsums(model, self.name)
         changes += _write_convolutions(model, self.name)
         if opset_of(model) >= OLDEST_OPSET:
-            changes += _unpack_sequences(model, self.name)
+            changes += unpack_sequences(model, self.name)
         return PassResult(model, changes, tuple(filter(None, (raise_note, note))))
 
 
@@ -423,65 +410,3 @@ def _write_convolutions(model: ir.Model, by: str) -> int:
             put(node, "Conv", [columns, kernel], by=by, attributes=options)
             count += 1
     return count
-
-
-def _unpack_sequences(model: ir.Model, by: str) -> int:
-    """Split tensors instead of making sequences of parts; return how many nodes change.
-
-    All readers must take a part at a constant place. TensorRT's parser supports no
-    sequences.
-
-    Given:   s = SplitToSequence(x, [2, 4])  ;  y = SequenceAt(s, 1)
-
-    Result:  a, b = Split(x, [2, 4])         ;  y = Identity(b)
-    """
-    count, names, opset = 0, value_names(model.graph), opset_of(model)
-    for body in graphs_of(model.graph):
-        for node in list(body):
-            if node.op_type != "SplitToSequence" or not is_standard(node):
-                continue
-            # Lengths and places of all parts must be known
-            sequence, lengths = node.outputs[0], _lengths(node)
-            readers = list(sequence.consumers())
-            if lengths is None or not readers or sequence.is_graph_output():
-                continue
-            places = [_place(reader, len(lengths)) for reader in readers]
-            if None in places:
-                continue
-            # Split the tensor, and read its parts
-            source, axis = node.inputs[0], node.attributes.get_int("axis", 0)
-            call = FusedCall(node, opset=opset, by=by, names=names)
-            inputs, options = [source, call.integers(lengths)], {"axis": axis}
-            split = call.add("Split", inputs, options, outputs=len(lengths)).producer()
-            assert source is not None
-            assert split is not None
-            for part in split.outputs:
-                part.type = source.type
-            for reader, place in zip(readers, places, strict=True):
-                put(reader, "Identity", [split.outputs[place or 0]], by=by)
-            remove_node(node)
-            count += 1 + len(readers)
-    return count
-
-
-def _lengths(node: ir.Node) -> list[int] | None:
-    """Return the lengths of a sequence's tensors along its axis; None if unknown."""
-    if array_of(node.inputs[0]) is not None:  # fold-constants splits weights
-        return None
-    split = input_at(node, 1)
-    lengths, array = integers_of(split), array_of(split)
-    if lengths is None or array is None or array.ndim:
-        return lengths
-    # One number is the length of each part but the last
-    (most,) = lengths
-    shape = static_shape(node.inputs[0])
-    if shape is None or most < 1:
-        return None
-    size = shape[node.attributes.get_int("axis", 0)]
-    return [min(most, size - at) for at in range(0, size, most)]
-
-
-def _place(reader: ir.Node, count: int) -> int | None:
-    """Return which of ``count`` tensors a SequenceAt takes; None of other readers."""
-    places = integers_of(reader.inputs[1]) if reader.op_type == "SequenceAt" else None
-    return places[0] if places and -count <= places[0] < count else None

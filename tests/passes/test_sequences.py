@@ -32,6 +32,14 @@ def normalise(model: ir.Model) -> None:
     [
         '["s"] s = SplitToSequence<axis = 1>(x, parts) ["y"] y = SequenceAt(s, last)',
         '["s"] s = SplitToSequence<axis = -1>(x, four) ["y"] y = SequenceAt(s, last)',
+        '["s"] s = SplitToSequence<axis = -1>(x, four) ["y"] y = ConcatFromSequence'
+        "<axis = 1>(s)",
+        '["s"] s = SplitToSequence(x) ["y"] y = SequenceAt(s, zero)',
+        '["s"] s = SequenceConstruct(stored, x) ["y"] y = SequenceLength(s)',
+        '["n"] n = Neg(x) ["s"] s = SequenceConstruct(x, n)'
+        ' ["y"] y = ConcatFromSequence<axis = 1>(s)',
+        '["n"] n = Neg(x) ["s"] s = SequenceConstruct(x, n)'
+        ' ["y"] y = ConcatFromSequence<axis = -1, new_axis = 1>(s)',
     ],
 )
 def test_a_sequence_becomes_its_tensors(body: str) -> None:
@@ -46,14 +54,18 @@ def test_a_sequence_becomes_its_tensors(body: str) -> None:
 @pytest.mark.parametrize(
     "body",
     [
-        '["s"] s = SplitToSequence(x) ["y"] y = SequenceAt(s, zero)',
-        '["s"] s = SplitToSequence(x, four) ["t"] t = SequenceInsert(s, x)'
+        '["s"] s = SplitToSequence<keepdims = 0>(x) ["y"] y = SequenceAt(s, zero)',
+        '["s"] s = SequenceConstruct(x) ["t"] t = SequenceInsert(s, x)'
         ' ["y"] y = SequenceAt(t, last)',
         '["s"] s = SplitToSequence<axis = 1>(stored, parts)'
         ' ["y"] y = SequenceAt(s, last)',
-        '["s"] s = SplitToSequence<axis = 1>(x, parts) ["y"] y = SequenceAt(s, four)',
+        '["s"] s = SplitToSequence(x) ["y"] y = SequenceAt(s, four)',
+        '["y"] y = SequenceConstruct(x, x) ["n"] n = SequenceLength(y)',
+        '["y"] y = Neg(x) ["s"] s = SequenceConstruct(x, y)',
         '["s"] s = SplitToSequence(x, zero) ["y"] y = SequenceAt(s, zero)',
-        '["s"] s = other.SplitToSequence(x, parts) ["y"] y = SequenceAt(s, zero)',
+        '["s"] s = other.SequenceConstruct(x) ["y"] y = SequenceAt(s, zero)',
+        '["s"] s = SequenceConstruct(x, x) ["n"] n = SequenceLength(s)'
+        ' ["t"] t = SequenceErase(s) ["y"] y = SequenceAt(t, zero)',
     ],
 )
 def test_other_sequences_stay(body: str) -> None:
@@ -72,10 +84,15 @@ BODIES = """<ir_version: 9, opset_import: ["" : 17]>
     ["/if"] y = If(c) <then_branch = t () => (float[2,4] a) {
         ["s"] s = SplitToSequence<axis = 1>(s_Split_0, parts)
         ["/at"] at = SequenceAt(s, one)
-        ["/a"] a = Mul(at, s_lengths)
+        ["/length"] length = SequenceLength(s)
+        ["/cast"] wide = Cast<to = 1>(length)
+        ["/mul"] scaled = Mul(at, wide)
+        ["/a"] a = Mul(scaled, s_lengths)
     }, else_branch = e () => (float[2,4] b) {
         ["/outer"] outer = SequenceAt(whole, one)
-        ["/b"] b = Neg(outer)
+        ["/joined"] pair = SequenceConstruct(outer, outer)
+        ["/stack"] stacked = ConcatFromSequence<axis = 0, new_axis = 1>(pair)
+        ["/b"] b = ReduceMax<axes = [0], keepdims = 0>(stacked)
     }>
 }"""
 
@@ -101,8 +118,11 @@ def test_bodies_too_have_tensors_with_a_type_a_name_and_a_past(taken: bool) -> N
         and past.passes == ("import-normalize",)
     }
     assert {past.module for past in made.values()} == {"planner"}
-    kinds = ["Split of /whole", "Split of s", "Identity of /at", "Identity of /outer"]
-    assert list(made) == kinds
+    # a new axis is put into both tensors of the pair
+    assert list(made) == [
+        "Split of /whole", "Split of s", "Identity of /at", "Identity of /length",
+        "Identity of /outer", "Unsqueeze of /stack", "Concat of /stack",
+    ]  # fmt: skip
     splits = [node for node in model.graph.all_nodes() if node.op_type == "Split"]
     types = {value.dtype for node in splits for value in node.outputs}
     assert types == {ir.DataType.FLOAT}
