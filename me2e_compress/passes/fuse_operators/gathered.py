@@ -1,9 +1,9 @@
 """Find bilinear sampling that is written with Gather, and write it as GridSample.
 
 mmcv's ``bilinear_grid_sample`` and the like avoid GridSample, which older TensorRT
-lacks: they pad the map, take the floor of each position, gather the four corners, and
-add them up, times their shares. Only the Pad, the floors and the sum are matched; that
-shares are those of GridSample is proven numerically.
+lacks: they take the floor of each position, gather the four corners, and add them up,
+times their shares. Only the floors and the sum are matched; that masks and shares are
+those of GridSample is proven numerically.
 """
 
 import dataclasses
@@ -15,7 +15,7 @@ import numpy as np
 import onnx_ir as ir
 
 from me2e_compress.base.errors import PreconditionError
-from me2e_compress.graph import is_standard, static_shape
+from me2e_compress.graph import array_of, is_standard, static_shape
 from me2e_compress.graph.nodes import (
     ELEMENTWISE,
     LAYOUT_OPERATORS,
@@ -118,8 +118,8 @@ class Sampling:
 
 def is_sampler(node: ir.Node) -> bool:
     """Return whether a node gathers at indices that are made of floors."""
-    gathers = node.op_type == "GatherElements" and is_standard(node)
-    return gathers and bool(floors_of(node))
+    gathers = node.op_type in ("Gather", "GatherElements", "GatherND")
+    return gathers and is_standard(node) and bool(floors_of(node))
 
 
 def floors_of(node: ir.Node) -> tuple[ir.Value, ...]:
@@ -146,42 +146,76 @@ def guesses(node: ir.Node, opset: int) -> Iterator[Sampling]:
     """Guess what the sum of corners samples that a Gather takes part in, best first."""
     if opset < GRID_SAMPLE_OPSET:
         raise PreconditionError(f"GridSample needs opset {GRID_SAMPLE_OPSET}")
-    image = _image(node)
-    batch, channels, rows, columns = static_shape(image) or (0, 0, 0, 0)
-    shape = batch, channels, rows, columns
+    image, borders, widths = _image(node)
     for at, scale, shift in _positions(floors_of(node)):
-        # Positions [batch, ...] give samples [batch, channels, ...]
         total = math.prod(sizes(at[0].layout)) // (3 - len(at))
-        outer = (Digit(AT, total // batch, batch),) if batch > 1 else ()
-        inner, channel = whole(AT, total // batch), whole(CHANNEL, channels)
-        maps = View(image, (outer, channel, whole(ROW, rows), whole(COLUMN, columns)))
         for result in _sums(node):
-            summed = regrouped((outer, channel, inner), static_shape(result) or ())
-            if summed is not None:
-                yield Sampling(View(result, summed), maps, shape, at, scale, shift)
+            maps = _maps(image, result, widths, total)
+            for (shape, taken, summed), border in itertools.product(maps, borders):
+                moved = shift[0] - border, shift[1] - border
+                yield Sampling(summed, taken, shape, at, scale, moved)
 
 
-def _image(node: ir.Node) -> ir.Value:
-    """Return the feature map [N, C, H, W] of a Gather, which a Pad gives a border."""
-    value = node.inputs[0]
+def _image(node: ir.Node) -> tuple[ir.Value, tuple[int, ...], list[int]]:
+    """Return the feature map of a Gather, borders it may have, and numbers of columns.
+
+    The border is a Pad. Without one, the columns are a factor of the index, or a
+    dimension.
+    """
+    data = value = node.inputs[0]
     while (before := maker(value, *LAYOUT_OPERATORS, "Pad")) is not None:
         value = before.inputs[0]
-        if before.op_type == "Pad":
-            break
-    padded = before is not None and len(static_shape(value) or ()) == 4
-    if value is None or not padded or value.dtype != ir.DataType.FLOAT:
-        raise PreconditionError("it gathers no padded float32 map of a known shape")
-    return value
+        small, large = static_shape(value), static_shape(before.outputs[0])
+        if before.op_type != "Pad" or value is None or not (small and large):
+            continue
+        sides = [pair for pair in zip(small, large, strict=True) if pair[0] != pair[1]]
+        if sides:
+            inner, outer = sides[-1]
+            return value, (0, (outer - inner) // 2), [inner]
+    shape = static_shape(data)
+    if data is None or shape is None or data.dtype != ir.DataType.FLOAT:
+        raise PreconditionError("it gathers no float32 of a known shape")
+    products = [made for made in _behind(node.inputs[1]) if made.op_type == "Mul"]
+    arrays = [array_of(value) for made in products for value in made.inputs]
+    factors = [int(a.item()) for a in arrays if a is not None and a.size == 1]
+    return data, (0,), [n for n in dict.fromkeys((*factors, *shape[1:])) if n > 0]
+
+
+def _maps(
+    image: ir.Value, result: ir.Value, widths: list[int], total: int
+) -> Iterator[tuple[tuple[int, int, int, int], View, View]]:
+    """Describe image and result with their channels before or behind all else."""
+    have, made = static_shape(image) or (0,), static_shape(result) or (0,)
+    channels = math.prod(made) // total
+    batches = dict.fromkeys((have[0], made[0], 1))
+    for batch, columns in itertools.product(batches, widths):
+        if not batch * channels:
+            continue
+        # Several images are the first axis of the map, of positions and of the sum
+        rows = math.prod(have) // (batch * channels * columns)
+        outer = (Digit(AT, total // batch, batch),) if batch > 1 else ()
+        inner, channel = whole(AT, total // batch), whole(CHANNEL, channels)
+        pixels = (*whole(ROW, rows), *whole(COLUMN, columns))
+        maps = (outer, channel, pixels), (outer, pixels, channel)
+        sums = (outer, channel, inner), (outer, inner, channel)
+        for one, two in itertools.product(maps, sums):
+            taken, summed = regrouped(one, have), regrouped(two, made)
+            if taken is not None and summed is not None:
+                shape = batch, channels, rows, columns
+                yield shape, View(image, taken), View(result, summed)
 
 
 _Positions = tuple[tuple[View, ...], tuple[float, float], tuple[float, float]]
 
 
 def _positions(floors: tuple[ir.Value, ...]) -> Iterator[_Positions]:
-    """Trace x and y back to where their elements come from: to one value first."""
-    if len(floors) != 2:
+    """Trace positions back to where their elements come from: to one value first."""
+    walks = [list(sources(_position(v, is_pair=len(floors) == 1))) for v in floors]
+    far = [[view for view in walk if isinstance(view, View)][-1] for walk in walks]
+    if len(far) == 1 and any(digit.axis == PAIR for digit in flat(far[0].layout)):
+        yield _unscaled(far, far * 2)
+    if len(far) != 2:
         return
-    walks = [list(sources(_position(value))) for value in floors]
     parts = [walk[-1] for walk in walks if isinstance(walk[-1], Selection)]
     for pair in itertools.permutations(parts, 2):
         plain = [
@@ -192,7 +226,6 @@ def _positions(floors: tuple[ir.Value, ...]) -> Iterator[_Positions]:
         if together is not None:
             yield _unscaled([together], [part.view for part in pair])
     # Else each is a value of its own
-    far = [[view for view in walk if isinstance(view, View)][-1] for walk in walks]
     for both in itertools.permutations(far):
         yield _unscaled(both, both)
 
@@ -203,16 +236,18 @@ def _unscaled(at: Sequence[View], axes: Sequence[View]) -> _Positions:
     return plain, (x.scale, y.scale), (x.shift, y.shift)
 
 
-def _position(value: ir.Value) -> View:
+def _position(value: ir.Value, *, is_pair: bool) -> View:
     """Describe what a floor is taken of, or what that was before it was clipped."""
     while (clip := maker(value, "Clip")) is not None and clip.inputs[0] is not None:
         value = clip.inputs[0]
     shape = static_shape(value)
     if shape is None:
         raise PreconditionError("its shapes are not known: run fold-constants first")
-    layout = regrouped((whole(AT, math.prod(shape)),), shape)
+    is_pair = is_pair and shape[-1:] == (2,)
+    where = shape[:-1] if is_pair else shape
+    layout = regrouped((whole(AT, math.prod(where)),), where)
     assert layout is not None
-    return View(value, layout)
+    return View(value, (*layout, whole(PAIR, 2)) if is_pair else layout)
 
 
 def _sums(node: ir.Node) -> list[ir.Value]:
