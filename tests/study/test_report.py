@@ -299,3 +299,21 @@ def test_words_in_a_drawing_are_text() -> None:
     finally:
         plt.close(figure)
     assert "<script" not in drawn
+
+
+def test_the_line_of_the_docs_reads_a_folder_of_records(
+    result: StudyResult, folder: Path
+) -> None:
+    pandas = pytest.importorskip("pandas")
+    text = Path("docs/study.md").read_text("utf-8")
+    (line,) = re.findall(r"^    (pandas\.concat.*)$", text, re.MULTILINE)
+
+    names = {"pandas": pandas, "Path": Path}
+    rows = eval(line.replace("OUT/", f"{folder}/"), names)
+
+    means = rows.groupby(level=0).driving_score.mean().to_dict()
+    assert means == {
+        drive.name: pytest.approx(drive.scores.driving_score.value)
+        for drive in result.drives
+        if drive.scores is not None
+    }

@@ -336,3 +336,15 @@ def test_a_table_of_pairs() -> None:
 
     assert [len(row) for row in table.rows] == [len(table.columns)]
     assert [cell.text for cell in table.rows[0][:2]] == ["int8.fog", "float.ideal"]
+
+
+@pytest.mark.usefixtures("short")
+def test_the_same_seed_gives_the_same_bytes(make: Make, tmp_path: Path) -> None:
+    _, slow, again, _ = make().variants
+    asked = make(variants=(slow, again, BLIND), conditions=(SLOW,))
+
+    one, two = (
+        json.dumps(without_latency(run_study(asked, tmp_path / way, Here()).to_json()))
+        for way in "ab"
+    )
+    assert one == two

@@ -1,5 +1,10 @@
+import hashlib
+import os
+import subprocess
+import sys
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
@@ -188,3 +193,29 @@ def test_brightness_saturates_and_noise_has_the_deviation_asked_for(see: Eyes) -
     noise = (see(Weather(noise=8.0)) - clear)[(clear > 40) & (clear < 215)]
     assert noise.std() == pytest.approx(8.0, rel=0.05)
     assert abs(noise.mean()) < 0.2
+
+
+PROGRAM = """
+import hashlib
+from tests.simulator.cameras import town
+from me2e_compress.simulator.camera_rig import CameraRig, Weather
+from me2e_compress.simulator.cameras.renderer import Cameras
+for options in (Weather(), town.STORM):
+    images = Cameras(town.paint(), CameraRig(96, 160), options).render(town.busy())
+    print(hashlib.sha256(images.tobytes()).hexdigest())
+"""
+
+
+def test_frames_are_the_same_in_every_process() -> None:
+    def hashes(salt: str) -> list[str]:
+        command, place = [sys.executable, "-c", PROGRAM], Path(__file__).parents[3]
+        salted = {**os.environ, "PYTHONHASHSEED": salt}
+        return subprocess.check_output(
+            command, env=salted, cwd=place, text=True
+        ).split()
+
+    first = hashes("1")
+    assert first == hashes("2")
+    assert len(set(first)) == 2
+    images = Cameras(town.paint(), CameraRig(96, 160)).render(town.busy())
+    assert hashlib.sha256(images.tobytes()).hexdigest() == first[0]
