@@ -7,6 +7,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -336,6 +337,12 @@ def test_a_table_of_pairs() -> None:
 
     assert [len(row) for row in table.rows] == [len(table.columns)]
     assert [cell.text for cell in table.rows[0][:2]] == ["int8.fog", "float.ideal"]
+
+
+def without_latency(record: dict[str, Any]) -> dict[str, Any]:
+    for table in (record, *record["schemes"]):
+        del table["latency"]
+    return record
 
 
 @pytest.mark.usefixtures("short")
