@@ -102,8 +102,7 @@ class QuantizeInt8(Quantizer):
     context's frames, or read from a file; there is no calibration on made-up data.
 
     Attributes:
-        scheme: ``feature-ext``, ``prediction`` or ``full``.
-        modules: module names instead of a scheme.
+        scheme: ``feature-ext``, ``prediction`` or ``full``, or a list of modules.
         rules: ``safe``; ``paper``, its two stages alone; a rule set of your own, by
             name or, in Python, as an object; with options, ``paper{without=[gemv]}``.
         target: who will run the graph: ``onnxruntime``, ``tensorrt``.
@@ -117,8 +116,7 @@ class QuantizeInt8(Quantizer):
     name = "quantize-int8"
     exact = False
     takes_float = True
-    scheme: str = "full"
-    modules: tuple[str, ...] = ()
+    scheme: str | tuple[str, ...] = "full"
     rules: str | RuleSet = DEFAULT_RULES
     # what a text means must not change with the default
     target: str = dataclasses.field(default=DEFAULT_TARGET, metadata=IN_TEXT)
@@ -163,10 +161,7 @@ class QuantizeInt8(Quantizer):
         """Choose for every node, as its target can; shapes must be inferred."""
         file, target, modules = self.overrides, self._runtime, context.modules
         overrides = Overrides() if file is None else Overrides.load(file)
-        if self.modules:
-            scheme = QuantScheme.of(self.modules, modules)
-        else:
-            scheme = QuantScheme.named(self.scheme, modules)
+        scheme = QuantScheme.of(self.scheme, modules)
         costs, objection = target.costs, target.fused_objection
         plan = make_plan(model, scheme, self._rules(), overrides, costs, objection)
         kept_float = target.kept_float(plan, model)

@@ -66,8 +66,10 @@ class QuantScheme:
         return cls(name, tuple(chosen))
 
     @classmethod
-    def of(cls, chosen: tuple[str, ...], modules: ModuleMap) -> Self:
-        """Return the scheme of modules chosen by name."""
+    def of(cls, chosen: str | tuple[str, ...], modules: ModuleMap) -> Self:
+        """Return the scheme of a name, or of modules that are listed."""
+        if isinstance(chosen, str):
+            return cls.named(chosen, modules)
         for name in chosen:
             modules.module(name)
         return cls("modules", tuple(n for n in modules.names() if n in chosen))

@@ -122,7 +122,7 @@ def test_what_is_quantized_while_it_runs_is_not_lowered(context: Context) -> Non
 
 def test_a_quantized_graph_is_not_quantized_again(context: Context) -> None:
     # its plan has decided of the layers, too, that are float
-    half = dataclasses.replace(PAPER, modules=("backbone",))
+    half = dataclasses.replace(PAPER, scheme=("backbone",))
     once = half.run(conv_attention(), context).model
 
     with pytest.raises(PreconditionError) as caught:
@@ -200,7 +200,7 @@ def partly(packed: str, form: str, end: str) -> ir.Model:
     ("options", "error", "message"),
     [
         ({"scheme": "fp8"}, RecipeError, "no scheme fp8; there are feature-ext"),
-        ({"modules": ("occ",)}, ModuleMapError, "occ: no such module"),
+        ({"scheme": ("occ",)}, ModuleMapError, "occ: no such module"),
         ({"rules": "safe{without=[speed]}"}, RecipeError, "speed cannot be switched "),
         ({"rules": "int4"}, RecipeError, "no rule set 'int4'; there are safe, paper"),
         ({"target": "qnn"}, RecipeError, "no target 'qnn'; there are tensorrt"),

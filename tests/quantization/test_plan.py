@@ -294,7 +294,7 @@ def test_weights_that_stay_float_are_counted_by_rule() -> None:
     shapes |= dict.fromkeys(("recurrent", "step"), (1, 256, 64))
     model = net(TEXT, {name: np.ones(shape) for name, shape in shapes.items()})
     counts = [
-        float_bytes(model, QuantizeInt8(modules=m, rules="paper").plan(model, context))
+        float_bytes(model, QuantizeInt8(scheme=m, rules="paper").plan(model, context))
         for context in (Context(MODULES),)
         for m in (("backbone", "head"), ("head",))
     ]
