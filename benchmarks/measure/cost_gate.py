@@ -237,7 +237,7 @@ def modules(name: str, ready: PreparedGraph) -> None:
 def by_module(ready: PreparedGraph, target: Target) -> dict[str, str]:
     """Describe what each module would be, alone in int8 on a target."""
     step = QuantizeInt8(
-        modules=ready.modules.names(),
+        scheme=ready.modules.names(),
         target="tensorrt",
         rules="safe{without=[cost]}",
     )

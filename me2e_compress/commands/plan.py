@@ -109,7 +109,7 @@ class PreparedGraph:
             sets, none = (*RULE_SETS.usable(), _MOST_RANGES), "no node can become int8"
             for rules, target in itertools.product(sets, TARGETS.usable()):
                 every = QuantizeInt8(
-                    modules=self.modules.names(), rules=rules, target=target
+                    scheme=self.modules.names(), rules=rules, target=target
                 )
                 plan = every.plan(self.model, context)
                 tensors = TARGETS.parse(target).tensors(plan, self.model)
