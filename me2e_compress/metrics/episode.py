@@ -11,11 +11,15 @@ from pydantic import ConfigDict, Field, TypeAdapter, with_config
 
 __all__ = [
     "FRAME_US",
+    "ConflictRecord",
+    "Contact",
     "EgoFrame",
     "Ending",
     "Episode",
     "Given",
     "InferenceRecord",
+    "Infraction",
+    "InfractionKind",
 ]
 
 
