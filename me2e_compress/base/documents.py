@@ -60,10 +60,10 @@ class MalformedError(ValueError):
 def reading(
     path: Path | str, error: Callable[[str], Exception], otherwise: str
 ) -> Iterator[None]:
-    """Turn what is wrong with a file that is read here into one line that names it.
+    """Raise whatever fails while this block reads a file as one line that names it.
 
-    ``otherwise`` is what the line says of a file that is there and does not fit; the
-    first place that does not is named. ``error`` is what is raised.
+    ``error`` makes the exception of the line. ``otherwise`` is the line's word for a
+    file whose content does not fit, e.g. "not TOML"; the first misfit follows.
     """
     try:
         yield
@@ -72,7 +72,6 @@ def reading(
     except (MalformedError, UnicodeDecodeError) as cause:
         raise error(f"{path}: {otherwise}: {cause}") from cause
     except ValidationError as cause:
-        # Of what does not fit, the first place is named
         first = cause.errors(include_url=False)[0]
         location = ".".join(map(str, first["loc"])) or "the file"
         raise error(f"{path}: {otherwise}: {location}: {first['msg']}") from cause

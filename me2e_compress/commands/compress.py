@@ -38,7 +38,7 @@ from me2e_compress.commands.outcome import (
     measure_loss,
     split_frames,
 )
-from me2e_compress.commands.result import Result, View, plain
+from me2e_compress.commands.result import Result, View, json_ready
 from me2e_compress.fidelity.floor import Floor
 from me2e_compress.graph import file_bytes
 from me2e_compress.graph.files import data_names
@@ -180,7 +180,7 @@ class CompressResult(Result):
             "lint": None if self.lint is None else self.lint.summary(),
             "verdict": [*self.summary_lines(), *self.alerts()],
         }
-        return {name: plain(each) for name, each in findings.items()}
+        return {name: json_ready(each) for name, each in findings.items()}
 
     def to_json(self) -> object:
         """Return the report file's content except the verdict, which `lines` has."""

@@ -162,7 +162,7 @@ def lint(
     # Rules and operator tables of the target
     path = model_path(model)
     loaded = graph.load(path)
-    options = retarget(loaded, options or LintOptions())
+    options = with_target(loaded, options or LintOptions())
     target, provider = _target_of(options), options.runs_on
     findings = target.lint(loaded)
     if provider.native != CPU.native:  # the list of kernels is the CPU's
@@ -176,7 +176,7 @@ def lint(
     return LintResult(path, options, findings, build)
 
 
-def retarget(model: ir.Model, options: LintOptions) -> LintOptions:
+def with_target(model: ir.Model, options: LintOptions) -> LintOptions:
     """Return options with a target: the user's, the plan's, or tensorrt; or refuse."""
     if options.target is None:
         plan = None if options.of_tensorrt else plan_of(model)

@@ -73,11 +73,11 @@ class Result:
         return "warning" if self.alerts() else "ok"
 
     def to_json(self) -> object:
-        """Return all data, for `plain`: by default the fields that `keys` name."""
+        """Return all data, for `json_ready`: by default the fields that `keys` name."""
         content, own = dict[str, object](), _fields(self)
         for key in self.keys or own:
             name = key.removeprefix("*")
-            content |= {name: own[name]} if name == key else plain(own[name])
+            content |= {name: own[name]} if name == key else json_ready(own[name])
         return content
 
     def document(self) -> dict[str, object]:
@@ -86,7 +86,7 @@ class Result:
         Dataclasses and paths become objects and strings, numbers that are not finite
         null.
         """
-        content = plain(self.to_json())
+        content = json_ready(self.to_json())
         if not isinstance(content, Mapping):
             raise TypeError(f"{type(self).__name__}.to_json: not an object")
         verdict = [*(self.lines() or (self.headline,)), *self.alerts()]
@@ -98,19 +98,19 @@ def _fields(value: Any) -> dict[str, object]:
     return {name: getattr(value, name) for name in names}
 
 
-def plain(value: object) -> Any:
+def json_ready(value: object) -> Any:
     """Turn objects, by their own `to_json` or their fields, into what JSON can hold.
 
     Paths become strings, NaN and infinities null.
     """
     if (own := getattr(value, "to_json", None)) is not None:
-        return plain(own())
+        return json_ready(own())
     if dataclasses.is_dataclass(value):
-        return plain(_fields(value))
+        return json_ready(_fields(value))
     if isinstance(value, Mapping):
-        return {key: plain(item) for key, item in value.items()}
+        return {key: json_ready(item) for key, item in value.items()}
     if isinstance(value, (list, tuple)):
-        return [plain(item) for item in value]
+        return [json_ready(item) for item in value]
     if isinstance(value, float):
         return float(value) if math.isfinite(value) else None
     return str(value) if isinstance(value, Path) else value

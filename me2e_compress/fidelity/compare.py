@@ -308,21 +308,17 @@ class Tally:
 
 
 def channel_axes(shape: tuple[int, ...]) -> tuple[int, ...]:
-    """Return the axes that may be those of an output's channels.
-
-    The last of ``[batch, n]`` and of ``[layers, 1, n, channels]``, the shorter of the
-    last two of ``[batch, n, channels]``, which some heads transpose, the second of
-    pictures; the second or the last of ``[batch, layers, n, channels]``.
-    """
+    """Return the axes of an output that may be its channels: none, one or two."""
     rank, axes = len(shape), tuple[int, ...]()
-    if rank == 3:
+    if rank == 3:  # [batch, n, channels], which some heads transpose: the shorter
         axes = (1 if shape[1] < shape[2] else 2,)
-    elif rank == 2 or (rank > 3 and 1 in shape[1:-1]):
+    elif rank == 2 or (rank > 3 and 1 in shape[1:-1]):  # [layers, 1, n, channels]
         axes = (rank - 1,)
-    elif rank == 4 and max(shape[2:]) <= _MOST_ASPECT * min(shape[2:]):
+    elif rank == 4 and max(shape[2:]) <= _MOST_ASPECT * min(shape[2:]):  # pictures
         axes = (1,)
-    elif rank > 3:
+    elif rank > 3:  # [batch, layers, n, channels], or channels in front
         axes = 1, rank - 1
+    # One channel, or very many, are none
     return tuple(axis for axis in axes if 1 < shape[axis] <= _MOST_CHANNELS)
 
 

@@ -241,8 +241,8 @@ class PairedDifference:
     mcnemar_p: float = 1.0
 
     @property
-    def smallest_shown(self) -> float:
-        """Smallest difference of driving scores that these routes can show, in points.
+    def least_detectable(self) -> float:
+        """Smallest difference of driving scores that these routes detect, in points.
 
         Half the interval's width, under the usual scatter (`SCATTER`) or more.
         """

@@ -176,7 +176,7 @@ _LAYOUT = ("Expand", "Identity", "Reshape", "Squeeze", "Transpose", "Unsqueeze")
 
 
 def _before_softmax(call: FusedCall, weights: ir.Value) -> ir.Value | None:
-    """Write the scores of a softmax in the layout of its weights, if there is one."""
+    """Write what a softmax made ``weights`` of, in their layout; None if none did."""
     # The last two axes of `weights` are one row of the softmax
     shape = static_shape(weights)
     if shape is None:

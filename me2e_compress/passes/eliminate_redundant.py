@@ -96,13 +96,13 @@ class EliminateRedundant(Pass):
         while work:
             node, _ = work.popitem()
             if node.graph is body:
-                work.update(dict.fromkeys(self._visit(node, site, tally)))
+                work.update(dict.fromkeys(self._simplify(node, site, tally)))
         tally["equal nodes"] += share_nodes(body, self.name)
 
-    def _visit(
+    def _simplify(
         self, node: ir.Node, site: "_MergeSite", tally: Counter[str]
     ) -> list[ir.Node]:
-        # Unread nodes go first
+        """Remove, bypass or merge a node; return those that may be simpler now."""
         if not any(is_read(value) for value in node.outputs):
             makers = list(node.predecessors())
             remove_node(node)

@@ -194,7 +194,7 @@ FUSIONS = (
     Fusion(
         "MatMul + bias",
         PLUS,
-        lambda match, kit: kit.put("Gemm", [match[LEFT], match[RIGHT], match[OFFSET]]),
+        lambda m, kit: kit.replace_by("Gemm", [m[LEFT], m[RIGHT], m[OFFSET]]),
         where=_is_of_matrices,
     ),
 )

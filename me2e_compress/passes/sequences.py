@@ -44,7 +44,7 @@ def unpack_sequences(model: ir.Model, by: str) -> int:
             call = FusedCall(node, opset=opset, by=by, names=names)
             tensors = node.inputs if built else _split(call, lengths)
             for reader in readers:
-                _read(FusedCall(reader, opset=opset, by=by, names=names), tensors)
+                _rewire(FusedCall(reader, opset=opset, by=by, names=names), tensors)
             remove_node(node)
             count += 1 + len(readers)
     return count
@@ -96,8 +96,8 @@ def _split(call: FusedCall, lengths: list[int]) -> Sequence[ir.Value]:
     return split.outputs
 
 
-def _read(call: FusedCall, tensors: Sequence[ir.Value | None]) -> None:
-    """Rewrite a reader of a sequence to read its tensors."""
+def _rewire(call: FusedCall, tensors: Sequence[ir.Value | None]) -> None:
+    """Replace a reader of a sequence by an operator on its ``tensors``."""
     reader, by = call.node, call.by
     if reader.op_type == "SequenceAt":
         (place,) = integers_of(reader.inputs[1]) or (0,)

@@ -142,9 +142,8 @@ def find_attention(
         if scores is None:
             continue
         # a mask may have products of its own, of another size
-        queries_by_keys = [
-            node for node in scored.get(scores, ()) if _fits(node.outputs[0], scores)
-        ]
+        products = scored.get(scores, ())
+        queries_by_keys = [n for n in products if _may_be_scores(n.outputs[0], scores)]
         if not queries_by_keys:
             continue
         shape = open_shape(queries_by_keys[0].outputs[0]) or ()
@@ -183,14 +182,14 @@ def _scores(node: ir.Node) -> ir.Value | None:
     return power.inputs[0]
 
 
-def _fits(product: ir.Value, scores: ir.Value) -> bool:
-    """Return whether scores may be this product's: as many, or as many per row."""
-    left, right = static_shape(product), static_shape(scores)
-    if not left or not right:
-        widths = [(open_shape(value) or (None,))[-1] for value in (product, scores)]
-        return None in widths or widths[0] == widths[1]
-    have, want = math.prod(left), math.prod(right)
-    return have == want or (left[-1] == right[-1] and have > 0 and want % have == 0)
+def _may_be_scores(product: ir.Value, scores: ir.Value) -> bool:
+    """Return whether scores may be made of a product: as many, or rows repeated."""
+    made, read = static_shape(product), static_shape(scores)
+    if not made or not read:  # open shapes: compare rows if they are known
+        rows = [(open_shape(value) or (None,))[-1] for value in (product, scores)]
+        return None in rows or rows[0] == rows[1]
+    size, wanted = math.prod(made), math.prod(read)
+    return size == wanted or (made[-1] == read[-1] and size > 0 and wanted % size == 0)
 
 
 def is_fused(node: ir.Node) -> bool:

@@ -24,8 +24,8 @@ def estimate_cell(
     return Cell(text, f"{number(estimate.low, form)} to {number(estimate.high, form)}")
 
 
-def anew_cell(estimate: Estimate) -> Cell:
-    """Show the interval of a difference over types drawn anew, alone."""
+def redrawn_cell(estimate: Estimate) -> Cell:
+    """Show a difference's interval over scenario types drawn anew, without its mean."""
     low, high = estimate.anew_low, estimate.anew_high
     if low is None or high is None:
         return Cell(MISSING, reason=f"fewer than {FEWEST_TYPES} scenario types")

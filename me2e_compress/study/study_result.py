@@ -7,13 +7,13 @@ from itertools import chain
 from typing import Any
 
 from me2e_compress.base.display import Cell, Table, plural
-from me2e_compress.commands.result import Result, View, plain
+from me2e_compress.commands.result import Result, View, json_ready
 from me2e_compress.metrics.bench2drive import ABILITIES
 from me2e_compress.metrics.measure import unseen_share
 from me2e_compress.metrics.route_summary import COLUMNS, PairedDifference, holm
 from me2e_compress.runtime.latency_trace import Load
 from me2e_compress.runtime.providers import PROVIDERS
-from me2e_compress.study.cells import MISSING, anew_cell, estimate_cell, measure_cell
+from me2e_compress.study.cells import MISSING, estimate_cell, measure_cell, redrawn_cell
 from me2e_compress.study.condition import Condition
 from me2e_compress.study.definition import Study
 from me2e_compress.study.drive_record import Comparison, DriveRecord, compare_pairs
@@ -143,7 +143,7 @@ class StudyResult(Result):
             "machine": self.machine,
             "versions": self.versions,
         }
-        return plain(content)
+        return json_ready(content)
 
 
 def scoreboard(result: StudyResult) -> Table:
@@ -223,7 +223,7 @@ def difference_table(result: StudyResult) -> Table:
     note += "."
     # What so few routes cannot show
     if gaps:
-        on, least = plural(gaps[0].driving_score.n, "route"), gaps[0].smallest_shown
+        on, least = plural(gaps[0].driving_score.n, "route"), gaps[0].least_detectable
         note += f" {on} cannot show a difference below {least:.1f} points."
     for gap in gaps:
         if not (gap.routes_better or gap.routes_worse):
@@ -240,7 +240,7 @@ def _gap_cells(gap: Comparison | PairedDifference) -> tuple[Cell, ...]:
     """Return one cell for each of `GAPS`."""
     estimates = gap.driving_score, gap.room_kept, gap.success_rate
     score, room, rate = (estimate_cell(estimate, signed=True) for estimate in estimates)
-    return score, anew_cell(gap.driving_score), room, rate
+    return score, redrawn_cell(gap.driving_score), room, rate
 
 
 def abilities(result: StudyResult) -> Table:

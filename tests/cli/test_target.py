@@ -10,7 +10,7 @@ import pytest
 
 from me2e_compress import graph
 from me2e_compress.base.errors import RecipeError
-from me2e_compress.commands.lint import retarget
+from me2e_compress.commands.lint import with_target
 from me2e_compress.commands.options import LintOptions
 from me2e_compress.graph.provenance import decompressed
 from me2e_compress.manager import recipe
@@ -108,16 +108,17 @@ def test_lint_asks_tensorrt_of_files_that_do_not_say(cli: Cli, model: Path) -> N
         assert cli.document(f"lint {file}", code=1)["target"] == "tensorrt"
     for option in ("--target tensorrt", "--target-version 10.13"):
         assert cli.document(f"lint out.onnx {option}", code=1)["target"] == "tensorrt"
-    assert retarget(made, LintOptions(trt_check=True)).target == "tensorrt"
+    assert with_target(made, LintOptions(trt_check=True)).target == "tensorrt"
 
 
 def test_a_provider_is_for_whom_opens_a_session(model: Path, cli: Cli) -> None:
     cli.done(f"{INT8} -o out.onnx")
     options = LintOptions(provider=CudaProvider())
 
-    assert retarget(graph.load(model / "out.onnx"), options).provider == CudaProvider()
+    loaded = graph.load(model / "out.onnx")
+    assert with_target(loaded, options).provider == CudaProvider()
     with pytest.raises(RecipeError, match="lint for tensorrt opens no session"):
-        retarget(graph.load(model / "m.onnx"), options)
+        with_target(graph.load(model / "m.onnx"), options)
 
 
 def test_lowered_int8_is_for_onnxruntime(cli: Cli, model: Path) -> None:

@@ -136,7 +136,7 @@ def paired(
 def test_few_routes_show_only_large_differences(
     routes: int, low: float | None, high: float | None, least: float
 ) -> None:
-    assert paired(routes, low, high).smallest_shown == pytest.approx(least, abs=0.05)
+    assert paired(routes, low, high).least_detectable == pytest.approx(least, abs=0.05)
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from me2e_compress.commands.evaluate import EvaluateResult
-from me2e_compress.commands.result import Result, plain
+from me2e_compress.commands.result import Result, json_ready
 from me2e_compress.commands.score import ScoreResult, scores_table
 from me2e_compress.metrics.bench2drive import ABILITIES
 from me2e_compress.metrics.deadlines import (
@@ -69,7 +69,7 @@ def test_an_ability_that_was_not_driven_is_not_zero() -> None:
 
 
 def test_json_has_value_low_high_and_n_for_each_score_and_says_a_partial_set() -> None:
-    record = plain(score(SET))
+    record = json_ready(score(SET))
 
     for key in ("driving_score", "success_rate", "efficiency", "comfort", "abilities"):
         assert {"value", "low", "high", "n"} <= set(record[key])

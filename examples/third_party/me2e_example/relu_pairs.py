@@ -12,7 +12,7 @@ X = var("x")
 RELU_PAIR = Fusion(
     "Relu of Relu",
     op("Relu", op("Relu", X)),
-    lambda match, kit: kit.put("Relu", [match[X]]),
+    lambda match, kit: kit.replace_by("Relu", [match[X]]),
 )
 
 

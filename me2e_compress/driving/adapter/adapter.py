@@ -181,9 +181,9 @@ class Adapter(BaseModel):
             raise EvaluationError(f"{origin} {where}: {words}") from error
 
     def metadata(self, own: Mapping[str, str]) -> dict[str, str]:
-        """Return recurrent pairs and plan as metadata; ``own`` is what a graph has."""
-        pairs = {**(declared_pairs(own) or {})}
-        pairs |= dict.fromkeys((*self.feeds, *self.images))
+        """Return recurrent pairs and plan, as metadata of a graph that has ``own``."""
+        pairs = dict(declared_pairs(own) or {})
+        pairs |= dict.fromkeys((*self.feeds, *self.images))  # None: not recurrent
         for name, entry in (self.recurrent or {}).items():
             if entry.answer is not None:
                 pairs[name] = entry.answer

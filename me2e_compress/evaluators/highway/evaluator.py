@@ -79,7 +79,7 @@ class Highway(Evaluator):
             "weather": weather,
             "frame_limit_s": drive.frame_limit_s,
             "set_size": drive.set_size,
-            "routes_sha256": digest_of(_ours(drive.routes)),
+            "routes_sha256": digest_of(_highway_routes(drive.routes)),
         }
 
     def episodes(
@@ -100,14 +100,14 @@ class Highway(Evaluator):
             )
             engine = LocalEngine()
         # A long route that starts last would leave all other workers waiting
-        ordered = longest_first(_ours(drive.routes))
+        ordered = longest_first(_highway_routes(drive.routes))
         for driven in engine.drive(policy, replace(drive, routes=()), ordered):
             log_cost(folder, driven)
             yield driven.episode
 
     def expected_s(self, route: RouteInfo) -> float:
         """Return what the expert takes for its type, and half as much for traffic."""
-        (ours,) = _ours([route])
+        (ours,) = _highway_routes([route])
         return EXPERT_S[ours.scenario] * LONGER
 
     def render(
@@ -124,7 +124,7 @@ class Highway(Evaluator):
         from me2e_compress.simulator.world import World
 
         moments: list[Moment] = []
-        (ours,) = _ours([route])
+        (ours,) = _highway_routes([route])
 
         def on_moment(moment: Moment) -> None:
             # Every fourth moment stays, and the last one
@@ -144,7 +144,8 @@ class Highway(Evaluator):
         return gif, png
 
 
-def _ours(routes: Sequence[RouteInfo]) -> list[Route]:
+def _highway_routes(routes: Sequence[RouteInfo]) -> list[Route]:
+    """Return routes of highway's own kind; an EvaluationError of any others."""
     ours = [route for route in routes if isinstance(route, Route)]
     if len(ours) < len(routes):
         raise EvaluationError("highway drives routes of its own kind alone")

@@ -63,7 +63,7 @@ class Kit:
         node.resize_inputs(max(index + 1, len(node.inputs)))
         node.replace_input_with(index, self.constant(array, name))
 
-    def put(
+    def replace_by(
         self,
         op_type: str,
         inputs: Sequence[ir.Value | None],
@@ -71,7 +71,7 @@ class Kit:
         *,
         domain: str = "",
     ) -> None:
-        """Replace all matched nodes by one operator, of any domain."""
+        """Replace all matched nodes by one operator, of any ``domain``."""
         root, *sources = self.match.nodes
         edits.put(
             root, op_type, inputs, by=self.by, sources=sources,
@@ -110,7 +110,7 @@ class Fusion:
 
         x = var("x")
         twice = op("Relu", op("Relu", x))
-        once = Fusion("Relu of Relu", twice, lambda m, kit: kit.put("Relu", [m[x]]))
+        once = Fusion("Relu pair", twice, lambda m, kit: kit.replace_by("Relu", [m[x]]))
 
     Attributes:
         name: its name in the report.

@@ -27,8 +27,6 @@ _SCAN_AS_IS = 9
 # onnx 1.23 does not write; onnxruntime takes the left neighbour where it enlarges, the
 # right one where it shrinks (GetNearestPixelFromOriginal, `SIMPLE`).
 _RESIZE_AS_IS = 11
-
-
 # The oldest opset that a graph is written in, as *import-normalize* does
 OLDEST_OPSET = 13
 
@@ -62,8 +60,8 @@ def write_in(
     # them before the first is replaced, equal ones once
     made, known = dict[ir.Node, ir.Graph](), dict[bytes, onnx.ModelProto]()
     for node, own, after, in_function in changed:
-        called, old = f"{node.op_type} {node.name!r}", alone(node, own)
-        if reason := _not_converted(node, own):
+        called, old = f"{node.op_type} {node.name!r}", _single_node_model(node, own)
+        if reason := _why_misconverted(node, own):
             return 0, f"{called} stays as it is: {reason}"
         key = old.SerializeToString() + bytes([after])
         try:
@@ -99,7 +97,7 @@ def _changes(node: ir.Node, own: int, after: int) -> bool:
     return bool(before) and before != since(node.op_type, after)
 
 
-def alone(node: ir.Node, opset: int) -> onnx.ModelProto:
+def _single_node_model(node: ir.Node, opset: int) -> onnx.ModelProto:
     """Build a model of one node without its name; unknown types become float32."""
     inputs = list(dict.fromkeys(value for value in node.inputs if value is not None))
     outputs = _named(node.outputs)
@@ -136,13 +134,13 @@ def _operators(graph: onnx.GraphProto) -> list[tuple[str, ...]]:
     return [(node.op_type, *node.input) for node in graph.node]
 
 
-def _not_converted(node: ir.Node, before: int) -> str:
-    """Return why the converter, which accepts a node, converts it wrongly; or ""."""
+def _why_misconverted(node: ir.Node, opset: int) -> str:
+    """Return why the converter errs on a node that it takes; "" where it is right."""
     if has_subgraph(node):
         return "Scan of opset 8 has a batch"
     if node.op_type == "Hardmax":
         return "onnx converts it without its axis"
-    if node.op_type != "Resize" or before >= _RESIZE_AS_IS:
+    if node.op_type != "Resize" or opset >= _RESIZE_AS_IS:
         return ""
     scales = _scales(node)
     both = not scales or (max(scales) > 1 and min(scales) < 1)

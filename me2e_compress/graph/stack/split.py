@@ -95,15 +95,17 @@ def _rename(graph: ir.Graph, file: Part, inputs: Values, outputs: Values) -> Non
 
     for value, name in zip(graph.outputs, outputs, strict=True):
         name_it(value, name)
+    # Where one output feeds two inputs of the part, all is read from the first of them
     copies = dict(zip(dict.fromkeys(inputs.values()), list(graph.inputs), strict=True))
-    kinds = {str(value.name): value for value in file.model.graph.inputs}
-    named = dict[ir.Value, None]()
+    declared = {str(value.name): value for value in file.model.graph.inputs}
+    renamed = list[ir.Value]()
     for name, source in inputs.items():
         value = copies[source]
-        if value in named:  # one output feeds two inputs of a part
-            value = ir.Value(name=name, type=kinds[name].type, shape=kinds[name].shape)
+        if value in renamed:
+            own = declared[name]
+            value = ir.Value(name=name, type=own.type, shape=own.shape)
         name_it(value, name)
-        named[value] = None
-    graph.inputs[:] = named
-    ends = {str(value.name): value for value in (*named, *graph.outputs)}
+        renamed.append(value)
+    graph.inputs[:] = renamed
+    ends = {str(value.name): value for value in (*renamed, *graph.outputs)}
     graph.outputs[:] = [ends[name] for name in file.outputs if name in ends]

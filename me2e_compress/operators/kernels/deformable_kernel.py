@@ -200,12 +200,13 @@ def functions_of(
 def _compute(
     ranks: tuple[int, ...], scale: int, words_of_call: int, queries: int, take: Any
 ) -> Callable[[int, int], Word]:
-    room, inputs = stack(types.int64, words_of_call), len(ranks)
+    """Return the function of a call: check inputs, make the output, run the blocks."""
+    room_of_call, inputs = stack(types.int64, words_of_call), len(ranks)
     room_of_inputs = stack(types.int64, EACH * (scale + 2))
-    quantized = inputs > scale
 
     def compute(state: int, context: int) -> Word:
-        t, x, a = words(state), room_of_inputs(), room()
+        # Words of the runtime's functions, of the inputs, and of the call
+        t, x, a = words(state), room_of_inputs(), room_of_call()
         # Read the inputs and check their ranks
         for i in range(EACH * (scale + 2)):
             x[i] = 0
@@ -225,7 +226,7 @@ def _compute(
         if misfit >= 0:
             return error_status(t, misfit)
         a[SCALES] = 0
-        if quantized:
+        if inputs > scale:  # of int8 values: scale and zero point
             a[SCALE] = x[EACH * scale + ADDRESS]
             a[ZERO] = x[EACH * (scale + 1) + ADDRESS]
             if not _take_scale(a, x, scale):

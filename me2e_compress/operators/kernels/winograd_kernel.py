@@ -125,7 +125,9 @@ def _input_rows(
 def _input_columns(
     w: Vectors, rows: Any, row: Any, to: Any, plane: Any, count: Any
 ) -> None:
+    """Multiply B^T d of ``count`` tiles by B; strides ``row``, ``plane`` in numbers."""
     builder, mask = w.builder, w.within(WORD(0), count)
+    following = range(1, LANES + 1)  # lanes: all but the first, then that behind
     for k in range(SIDE):
         first = w.place(rows, builder.mul(row, WORD(k)))
         places = [builder.gep(first, [WORD(LANES * part)]) for part in range(OUT + 1)]
@@ -133,7 +135,6 @@ def _input_columns(
         # The last two of a tile are the first two of the next
         for part in range(SIDE - OUT):
             after = builder.load(builder.gep(places[OUT], [WORD(part)]))
-            following = range(1, LANES + 1)
             columns.append(w.choose(columns[part], w.spread(after), following))
         for part, vector in enumerate(_input(w, columns)):
             at = builder.mul(plane, WORD(k * SIDE + part))
@@ -259,11 +260,10 @@ def input_plane(depth: int) -> Word:
 @compiled
 def transform_filters(a: Any, panel: int, to: int, plane: int) -> None:
     """Write the transformed filters of one panel."""
-    depth, wide = a[C], a[K]
+    depth, wide, count = a[C], a[K], a[K] - panel * LANES
     for c in range(depth):
         elements = a[FILTERS] + (c * wide + panel * LANES) * 4
         at = to + c * LANES * 4
-        count = wide - panel * LANES
         filters((elements, depth * wide, count, at, plane, AHEAD * wide))
 
 

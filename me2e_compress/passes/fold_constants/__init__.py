@@ -193,13 +193,13 @@ class FoldConstants(Pass):
             tally["changes"] += _write_casts(body, self.name)
             tally["changes"] += _reshape_bounds(body, opset, self.name)
         # Fold until nothing changes; a branch that is not taken is never looked into
-        before, fresh = -1, set[ir.Value]()
+        before, fresh = -1, set[ir.Value]()  # fresh: not seen by shape inference
         while tally["changes"] > before:
             before = tally["changes"]
             if model.functions:  # through which a sweep learns no shapes
                 graphs.infer_shapes(model)
             tally["changes"] += remove_dead(model.graph)
-            tally["kept"] = 0
+            tally["kept"] = 0  # the last round's counts
             self._fold(model.graph, opset, tally, refusals, fresh, trust=True)
             taken = _inline_branches(model.graph, opset, self.name)
             # The Ifs had hidden the shapes of what their branches read

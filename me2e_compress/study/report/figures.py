@@ -151,24 +151,27 @@ def _colour(outcome: StudyResult, variant: str) -> str:
 
 
 def _cost_panels(outcome: StudyResult, places: Mapping[str, float]) -> Iterator[Panel]:
-    """Yield the panels of size, time and plan, which are known without a drive."""
+    """Yield the panels of size, time and plan; ``places`` are the variants' rows."""
     baseline = outcome.variant(outcome.study.baseline)
     sizes, times, plans = list[Mark](), list[Mark](), list[Mark]()
-    for own in outcome.variants:
-        place, colour = places[own.name], _colour(outcome, own.name)
-        for marks, measure, its, form in (
-            (sizes, own.size_mb, baseline.size_mb, ".2f"),
-            (times, own.latency_ms[50], baseline.latency_ms[50], ".1f"),
+    for variant in outcome.variants:
+        place, colour = places[variant.name], _colour(outcome, variant.name)
+        # Size and time, with their shares of the baseline's
+        for marks, measure, base, form in (
+            (sizes, variant.size_mb, baseline.size_mb, ".2f"),
+            (times, variant.latency_ms[50], baseline.latency_ms[50], ".1f"),
         ):
             words = measure_cell(measure, form).text
-            if own is not baseline and measure.value is not None and its.value:
-                words += f" ({100.0 * measure.value / its.value:.0f} %)"
+            if variant is not baseline and measure.value is not None and base.value:
+                words += f" ({100.0 * measure.value / base.value:.0f} %)"
             marks.append(Mark(place, colour, words, measure.value))
-        mean, most = own.fidelity.plan_mean, own.fidelity.plan_max.value
+        # Distances from the baseline's plan, from the mean to the largest
+        mean, most = variant.fidelity.plan_mean, variant.fidelity.plan_max.value
         words = measure_cell(mean, ".2f").text
-        if most is not None:
+        if variant is baseline:
+            words = "the reference"
+        elif most is not None:
             words += f" (at most {number(most, '.2f')})"
-        words = "the reference" if own is baseline else words
         plans.append(Mark(place, colour, words, mean.value, mean.value, most))
     yield Panel("File, MB", sizes, bars=True)
     yield Panel("Time of a decision, ms", times, bars=True)

@@ -196,7 +196,7 @@ def limits(outcome: StudyResult) -> str:
     gaps = [gap for drive in outcome.drives if (gap := drive.difference) is not None]
     if not gaps:
         return ""
-    (routes, whole), least = outcome.coverage, max(gap.smallest_shown for gap in gaps)
+    (routes, whole), least = outcome.coverage, max(gap.least_detectable for gap in gaps)
     rest = ""
     if routes < whole:
         rest = f", all {whole} none below {smallest_difference(whole):.1f}"

@@ -166,31 +166,29 @@ def _step_of(node: ir.Node) -> Floats:
 
 
 def _weight_of(layer: ir.Node) -> QuantizedWeight | None:
-    """Read the weight of a layer; None if it is not quantized for its kernel."""
-    # A MatMul by [1, ..., K, N] reads [K, N]. onnxruntime's own quantizer, and so
-    # ModelOpt, puts scales along axis 1 of such a weight, which is K: no kernel takes
-    # it. Another grid than symmetric int8, or other axes, are a PreconditionError.
+    """Read a layer's weight as int8 with a scale for each output channel.
+
+    None if it is not quantized, or not for a kernel. Another grid than symmetric int8,
+    or scales along another axis, are a PreconditionError.
+    """
     node = producer_of(layer.inputs[1])
     if node is None or node.op_type != DEQUANTIZE:
         return None
     step, source = _step_of(node), node.inputs[0]
     stored = array_of(source)
-    if stored is not None:
-        integers = stored.astype(np.int8)
-    else:
-        # ModelOpt stores floats: quantize them here
-        quantize = maker(source, QUANTIZE)
-        weight = None if quantize is None else array_of(quantize.inputs[0])
-        if weight is None:
-            return None
-        shape = [1] * weight.ndim
-        if step.size > 1:
-            shape[node.attributes.get_int("axis", 1) % weight.ndim] = step.size
-        steps: Floats = np.rint(weight.astype(np.float32) / step.reshape(shape))
-        integers = np.clip(steps, -QUANT_MAX, QUANT_MAX).astype(np.int8)
-    # A batch of one matrix is read as that matrix
-    along = node.attributes.get_int("axis", 1) % integers.ndim
-    axis = graph.channel_axis(layer)
+    quantize = maker(source, QUANTIZE) if stored is None else None
+    if quantize is not None:  # ModelOpt stores floats: they are quantized here
+        stored = array_of(quantize.inputs[0])
+    if stored is None:
+        return None
+    along = node.attributes.get_int("axis", 1) % stored.ndim
+    if quantize is not None:
+        by_axis = step.reshape([-1 if at == along else 1 for at in range(stored.ndim)])
+        steps: Floats = np.rint(stored.astype(np.float32) / by_axis)
+        stored = np.clip(steps, -QUANT_MAX, QUANT_MAX)
+    integers, axis = stored.astype(np.int8), graph.channel_axis(layer)
+    # A batch of one matrix, [1, ..., K, N], is read as that matrix. onnxruntime's own
+    # quantizer, and so ModelOpt, puts scales along axis 1, K: no kernel takes those
     if layer.op_type == "MatMul" and integers.ndim > 2:
         if step.size > 1 and along != integers.ndim - 1:
             return None

@@ -61,10 +61,9 @@ def test_a_branch_in_place_of_its_if_knows_its_shapes_and_the_other_is_gone() ->
 
 
 X, Y = var("x"), var("y")
-ONCE = Fusion(
-    "Relu of Relu", op("Relu", op("Relu", X)), lambda m, kit: kit.put("Relu", [m[X]])
-)
-DROP = Fusion("Mul", op("Mul", X, Y), lambda m, kit: kit.put("Abs", [m[X]]))
+TWICE = op("Relu", op("Relu", X))
+ONCE = Fusion("Relu of Relu", TWICE, lambda m, kit: kit.replace_by("Relu", [m[X]]))
+DROP = Fusion("Mul", op("Mul", X, Y), lambda m, kit: kit.replace_by("Abs", [m[X]]))
 
 
 def test_a_dead_reader_hides_no_pattern() -> None:

@@ -135,7 +135,7 @@ def test_a_pattern_ends_in_an_operator() -> None:
         fuse(graph_of("y = Relu(x)"), [nothing], by="test")
 
 
-ONCE = Fusion("Relu of Relu", TWICE, lambda m, kit: kit.put("Relu", [m[X]]))
+ONCE = Fusion("Relu of Relu", TWICE, lambda m, kit: kit.replace_by("Relu", [m[X]]))
 
 
 def test_what_a_rewrite_refuses_is_counted_with_its_reason() -> None:
@@ -159,8 +159,8 @@ def test_a_fusion_may_complete_another() -> None:
 def test_a_fused_operator_takes_the_place_and_its_domain_is_imported() -> None:
     model = graph_of("a = HardSigmoid(x)", "y = Mul(x, a)")
     gate = op("Mul", X, op("HardSigmoid", X))
-    fused = Fusion("gate", gate, lambda m, kit: kit.put("Gate", [m[X]], domain="mine"))
-    assert fuse(model, [fused], by="test").changes == 1
+    one = Fusion("gate", gate, lambda m, k: k.replace_by("Gate", [m[X]], domain="mine"))
+    assert fuse(model, [one], by="test").changes == 1
     (node,) = model.graph
     assert (node.domain, node.op_type) == ("mine", "Gate")
     assert model.graph.opset_imports["mine"] == 1
