@@ -13,8 +13,13 @@ from me2e_compress.calibration.calibrator import Calibrator
 from me2e_compress.calibration.dataset import CalibrationSet, draw
 from me2e_compress.calibration.exchange import pick_ranges, read_cache
 from me2e_compress.calibration.observers import OBSERVERS
-from me2e_compress.calibration.ranges import Ranges, rms_of
-from me2e_compress.calibration.review import RangeFinding, missing_ranges, review
+from me2e_compress.calibration.ranges import (
+    RangeFinding,
+    Ranges,
+    missing_ranges,
+    review,
+    rms_of,
+)
 from me2e_compress.commands.checks import (
     model_path,
     output_path,

@@ -20,7 +20,7 @@ from me2e_compress.base.errors import (
     RecipeError,
 )
 from me2e_compress.base.listener import SILENT, Listener
-from me2e_compress.calibration.review import NOT_FINITE
+from me2e_compress.calibration.ranges import NOT_FINITE
 from me2e_compress.commands.checks import (
     load_map,
     model_path,

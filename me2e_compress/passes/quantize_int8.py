@@ -13,8 +13,7 @@ from me2e_compress.base.display import plural
 from me2e_compress.base.errors import FramesError, PreconditionError
 from me2e_compress.base.registry import IN_TEXT
 from me2e_compress.calibration.calibrator import Calibrator
-from me2e_compress.calibration.ranges import Ranges
-from me2e_compress.calibration.review import review
+from me2e_compress.calibration.ranges import Ranges, review
 from me2e_compress.passes.base import Context, Pass, PassResult
 from me2e_compress.quantization.decision import (
     METADATA,

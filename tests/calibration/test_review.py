@@ -22,8 +22,7 @@ from me2e_compress.calibration.observers import (
     scale_of,
     within,
 )
-from me2e_compress.calibration.ranges import Activity, Ranges
-from me2e_compress.calibration.review import review
+from me2e_compress.calibration.ranges import Activity, Ranges, review
 from me2e_compress.calibration.statistics import Statistics
 from me2e_compress.graph import infer_shapes
 from me2e_compress.operators.kernels.kernel import BINS
