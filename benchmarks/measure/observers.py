@@ -6,7 +6,7 @@
 ``outliers`` gives TCP and VAD-tiny of models/, whose weights are random, outliers of
 trained size, and prints the SQNR of every output on held-out frames under each method.
 ``scenes`` prints how far ranges of the driver differ between recordings, and between a
-few scenes and all: the sources of two constants of ``calibration/review.py``.
+few scenes and all: the sources of two constants of ``calibration/ranges.py``.
 """
 
 import argparse

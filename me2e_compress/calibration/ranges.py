@@ -240,7 +240,7 @@ ROUND_CREST = 254
 # one of 35 % (benchmarks/measure/observers.py).
 FEW_SCENES = 8
 
-NOT_FINITE = "Runtimes answer it each in their own way: guard what makes it"
+GUARD_ADVICE = "Runtimes answer it each in their own way: guard what makes it"
 
 # Number of tensors that a line lists
 _MOST_NAMES = 5
@@ -361,7 +361,9 @@ def review(ranges: Ranges) -> tuple[RangeFinding, ...]:
     ]
     # The whole recording
     if text := ranges.not_finite:
-        findings.append(RangeFinding("not finite", "warning", text, advice=NOT_FINITE))
+        findings.append(
+            RangeFinding("not finite", "warning", text, advice=GUARD_ADVICE)
+        )
     if ranges.scenes is not None and ranges.scenes < FEW_SCENES:
         text = f"{plural(ranges.frames, 'frame')} in {plural(ranges.scenes, 'scene')}"
         advice = (

@@ -20,7 +20,7 @@ from me2e_compress.base.errors import (
     RecipeError,
 )
 from me2e_compress.base.listener import SILENT, Listener
-from me2e_compress.calibration.ranges import NOT_FINITE
+from me2e_compress.calibration.ranges import GUARD_ADVICE
 from me2e_compress.commands.checks import (
     load_map,
     model_path,
@@ -131,7 +131,7 @@ class CompressResult(Result):
             (
                 *(() if self.loss is None else self.loss.alerts()),
                 *filter(None, ["" if self.int8 is None else self.int8.why_empty]),
-                *(n for s in self.report.steps for n in s.notes if NOT_FINITE in n),
+                *(n for s in self.report.steps for n in s.notes if GUARD_ADVICE in n),
                 *(f"lint: {line}" for line in wrong),
             ),
             error,
