@@ -21,27 +21,25 @@ from me2e_compress.calibration.observers import DEFAULT_METHOD, OBSERVERS
 from me2e_compress.calibration.ranges import Ranges
 from me2e_compress.calibration.statistics import (
     NOT_FINITE,
+    READINGS,
     Floats,
+    Probe,
+    Reading,
     Statistics,
     check_finite,
     checksum,
     exponents_of,
     first_bad_node,
     index_inputs,
+    insert_probes,
     is_not_finite,
     rebinned,
+    shared_constant,
 )
 from me2e_compress.graph.nodes import makers_of, reads_of
 from me2e_compress.operators import OWN_DOMAIN
 from me2e_compress.operators.kernels.kernel import BINS
 from me2e_compress.runtime.frames import Array
-from me2e_compress.runtime.probing import (
-    READINGS,
-    Probe,
-    Reading,
-    insert_probes,
-    shared_constant,
-)
 from me2e_compress.runtime.providers import CPU, Provider
 from me2e_compress.runtime.runnable import why_unsupported
 from me2e_compress.runtime.session import DTYPES, Session, feed_forward

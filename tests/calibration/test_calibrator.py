@@ -15,9 +15,8 @@ from me2e_compress.calibration.calibrator import Calibrator, Extremes
 from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.calibration.observers import OBSERVERS
 from me2e_compress.calibration.ranges import Ranges
-from me2e_compress.calibration.statistics import Statistics
+from me2e_compress.calibration.statistics import Probe, Statistics, insert_probes
 from me2e_compress.runtime.frames import Array, Frame
-from me2e_compress.runtime.probing import Probe, insert_probes
 from me2e_compress.runtime.providers import CPU, CpuProvider, Provider
 from me2e_compress.runtime.session import Session, replay
 from tests.support.frames import record

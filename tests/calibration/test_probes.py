@@ -11,8 +11,8 @@ from me2e_compress.calibration.calibrator import (
     schedule_probes,
 )
 from me2e_compress.calibration.dataset import CalibrationSet
+from me2e_compress.calibration.statistics import READINGS, insert_probes
 from me2e_compress.operators.kernels.kernel import BINS
-from me2e_compress.runtime.probing import READINGS, insert_probes
 from me2e_compress.runtime.session import Session
 from tests.support.frames import record
 from tests.support.nets import conv_attention, image, parsed
