@@ -69,6 +69,7 @@ BRAKE: Colour = (220, 32, 36)
 INFRACTION: Colour = (208, 16, 32)
 INK: Colour = (40, 44, 52)
 PAPER: Colour = (255, 255, 255)
+SCALE_BAR_M = 10.0
 STATES: dict[SignalState, Colour] = {
     SignalState.RED: (220, 32, 36),
     SignalState.YELLOW: (232, 172, 16),
@@ -179,7 +180,12 @@ class RoutePicture:
                 view.disc(point, PLAN, 3.0)
         for event in self.infractions(index):
             view.cross(event)
-        return view.picture.reduce(FINE)
+        # A bar of ten metres in the corner
+        reduced = view.picture.reduce(FINE)
+        bottom, length = reduced.height - 12, round(SCALE_BAR_M * view.scale / FINE)
+        ImageDraw.Draw(reduced).line((10, bottom, 10 + length, bottom), INK, 2)
+        write(reduced, (12, bottom - 18), f"{SCALE_BAR_M:g} m", INK, 13, PAPER)
+        return reduced
 
 
 class View:

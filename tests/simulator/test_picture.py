@@ -10,6 +10,7 @@ from me2e_compress.base.errors import EvaluationError
 from me2e_compress.simulator.camera_rig import CAMERA_NAMES
 from me2e_compress.simulator.pictures import (
     EGO,
+    INK,
     PLAN,
     TRAIL,
     Moment,
@@ -78,6 +79,9 @@ def test_the_plan_lies_ahead_of_the_ego() -> None:
     scale = view.shape[0] / 72.0  # the ego stands 50 m below the upper edge
     assert rows.min() == pytest.approx((50 - 24) * scale, abs=4)
     assert columns.mean() == pytest.approx(view.shape[1] / 2, abs=2)
+    # the bar in the corner is ten metres long
+    bar = (view[-13:-10, :200] == INK).all(axis=2).any(axis=0)
+    assert bar.sum() == pytest.approx(10 * scale, abs=2)
     # a moment may have none
     bare = replace(moment(0), plan=None)
     frame = picture(bare).frame(0)
