@@ -120,10 +120,12 @@ class RouteInfo(Protocol):
     @property
     def id(self) -> str:
         """Return the route's name, unique in its set."""
+        ...
 
     @property
     def seed(self) -> int:
         """Return the seed of all randomness on the route, the policy's included."""
+        ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -182,10 +184,12 @@ class Policy(Protocol):
     @property
     def needs_images(self) -> bool:
         """Whether the cameras must be rendered."""
+        ...
 
     @property
     def privileged(self) -> bool:
         """Whether it gets ground truth: `Observation.scene` and `Observation.world`."""
+        ...
 
     def reset(self, route: RouteInfo) -> None:
         """Prepare for a route: reset recurrent state to its initial value.
@@ -200,6 +204,7 @@ class Policy(Protocol):
         `Trajectory` of waypoints with their times. Numbers are floating point and
         finite. The run time counts only where latency is measured.
         """
+        ...
 
 
 @runtime_checkable
@@ -209,10 +214,12 @@ class HostedPolicy(Policy, Protocol):
     @property
     def host_iterations(self) -> int:
         """Return the solver's iterations; 0 if there was nothing to do."""
+        ...
 
     @property
     def host_cells(self) -> int:
         """Return the number of occupied cells taken into account."""
+        ...
 
 
 # Check a policy's answer, and bring it into one form.

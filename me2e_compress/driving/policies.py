@@ -36,6 +36,7 @@ class SizedPolicy(Policy, Protocol):
     @property
     def image_size(self) -> tuple[int, int]:
         """Rows and columns of each camera."""
+        ...
 
 
 @dataclass(frozen=True)

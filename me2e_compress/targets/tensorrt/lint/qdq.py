@@ -91,7 +91,7 @@ def channel_scales(node: ir.Node) -> Iterator[str]:
 def weight_axes(node: ir.Node) -> Iterator[str]:
     """Check that scales of a weight run along the axis of its output channels."""
     scale = graph.static_shape(node.inputs[1])
-    if not scale or scale == (1,) or len(scale) > 1 or not _is_weight(node):
+    if scale is None or len(scale) != 1 or scale == (1,) or not _is_weight(node):
         return
     if "axis" not in node.attributes:
         yield "no axis: ONNX takes 1, TensorRT takes 0"
