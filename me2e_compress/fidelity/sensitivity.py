@@ -333,7 +333,7 @@ def write_recipe(
         options = [
             "[[pass]]",
             'name = "quantize-int8"',
-            f"modules = [{', '.join(map(toml_string, choice.modules))}]",
+            f"scheme = [{', '.join(map(toml_string, choice.modules))}]",
             f"rules = {toml_string(rules)}",
             f"target = {toml_string(target)}",
         ]
