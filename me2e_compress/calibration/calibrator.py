@@ -267,7 +267,7 @@ class _Job:
             "list of inputs and outputs": [*blank.inputs, *blank.outputs],
             "optimization level": settings.optimize,
             "provider": settings.provider.name,
-            "kind of statistics": "counts" if counting else "extremes",
+            "kind of statistics": "both" if counting else "extremes",
         }
         self.checkpoint = CalibrationCheckpoint(settings.checkpoint, key)
         self.done, results, self.state = self.checkpoint.read()
