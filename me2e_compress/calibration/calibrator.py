@@ -93,8 +93,8 @@ class ExtremesAndCounts:
         row = shared_constant(where, np.array([-1], np.int64), "row")
         flat = ir.node("Reshape", [value, row])
         inputs = [flat.outputs[0], nodes[0].outputs[0], nodes[1].outputs[0]]
-        for each, dims in zip(inputs, ([None], [], []), strict=True):
-            each.dtype, each.shape = ir.DataType.FLOAT, ir.Shape(dims)
+        for tensor, dims in zip(inputs, ([None], [], []), strict=True):
+            tensor.dtype, tensor.shape = ir.DataType.FLOAT, ir.Shape(dims)
         count = ir.node("Histogram", inputs, domain=OWN_DOMAIN)
         return [*nodes, flat, count], [*readings, count.outputs[0]]
 

@@ -139,7 +139,7 @@ def histogram(dialect: Dialect, random: Random) -> Drawn:
     if random.integers(2):
         values = np.ldexp(1.0, random.integers(-130, 127, values.size))
     values = np.append(values, 0).astype(np.float32)
-    low, high = (np.asarray(each) for each in (values.min(), values.max()))
+    low, high = (np.asarray(value) for value in (values.min(), values.max()))
     return {"X": values, "low": low, "high": high}, {}
 
 

@@ -47,7 +47,7 @@ class HoistLinear(Pass):
         if opset < OLDEST_OPSET:
             return PassResult(model, 0)
         # Nodes that nothing reads would hold on to what they read
-        unread = remove_dead(model.graph)  # it would hold on to what it reads
+        unread = remove_dead(model.graph)
         names, macs_before = value_names(model.graph), _macs(model)
         bodies, products, others = list(graphs_of(model.graph)), 0, 0
         for _ in range(ROUNDS):
