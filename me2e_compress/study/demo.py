@@ -155,7 +155,7 @@ class DriverDemo:
         words = ("me2e-compress", "demo", "-o", str(self.out))
         written = write_study(result, self.out, words, force=self.force)
         ending = (
-            f"{self._small} is yours; {written.report} tells all of it.",
+            f"{self._small} is yours; {written.report} tells how it drives.",
             f"Its int8 is for {DEFAULT_TARGET}, which drives here. For TensorRT:",
             f"  me2e-compress compress {DRIVER} -r {RECIPE} --target"
             f" tensorrt --frames {self._frames} -o {DRIVER}.trt.onnx",
