@@ -121,7 +121,6 @@ OPERATORS: Registry[Operator] = Registry(
         "bev-pool": f"{_HERE}.birds_eye_view:BEVPool",
         "multi-head-attention": f"{_HERE}.multi_head_attention:FusedMultiHeadAttention",
         "deformable-convolution": f"{_HERE}.convolutions:DeformableConvolution",
-        "winograd-convolution": f"{_HERE}.convolutions:WinogradConvolution",
         "histogram": f"{_HERE}.histogram:Histogram",
     },
 )

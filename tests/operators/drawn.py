@@ -123,16 +123,6 @@ def convolution(dialect: Dialect, random: Random) -> Drawn:
     return arrays, dict(zip((a.name for a in dialect.attributes), values, strict=True))
 
 
-def winograd(dialect: Dialect, random: Random) -> Drawn:
-    batch, deep, out, high, wide = random.integers(1, 6, 5)
-    pads = tuple(int(each) for each in random.integers(1, 3, 4))
-    return single(
-        X=random.normal(size=(batch, deep, high, wide)),
-        W=random.normal(size=(out, deep, 3, 3)),
-        B=random.normal(size=out),
-    ), {"pads": pads, "relu": int(random.integers(2))}
-
-
 def histogram(dialect: Dialect, random: Random) -> Drawn:
     """Draw numbers with a reach at, below or above a power of two, or none at all."""
     values = random.normal(size=random.integers(0, 400)) * 10 ** random.uniform(-35, 35)
@@ -153,6 +143,5 @@ DRAWS: dict[str, Callable[[Dialect, Random], Drawn]] = {
     "bev-pool": pool,
     "multi-head-attention": attention,
     "deformable-convolution": convolution,
-    "winograd-convolution": winograd,
     "histogram": histogram,
 }

@@ -9,7 +9,7 @@ API_VERSION = 17  # the first with `KernelContext_ParallelFor`: onnxruntime 1.17
 OP_VERSION = 16  # the first with `KernelComputeV2`, which returns a status
 
 # Functions of `OrtApi` by offset: those that Python calls, and those of kernels
-CREATE_DOMAIN, ADD_OP, ADD_DOMAIN, CREATE_MEMORY = 26, 27, 28, 69
+CREATE_DOMAIN, ADD_OP, ADD_DOMAIN = 26, 27, 28
 CALLED_BY_KERNELS = (
     0,  # CreateStatus
     90,  # KernelContext_GetInput
@@ -21,21 +21,14 @@ CALLED_BY_KERNELS = (
     62,  # GetDimensions
     99,  # ReleaseTensorTypeAndShapeInfo
     274,  # KernelContext_ParallelFor
-    253,  # KernelContext_GetAllocator
-    75,  # AllocatorAlloc
-    76,  # AllocatorFree
-    132,  # ReleaseAllocator
 )
 
 # Words of a kernel's state: the addresses of those functions, that of its own `block`,
-# which `ParallelFor` calls, what describes the memory of the CPU, and the addresses of
-# up to 16 error messages
+# which `ParallelFor` calls, and the addresses of up to 16 error messages
 CREATE_STATUS, GET_INPUT, GET_OUTPUT, GET_DATA, GET_INFO, GET_TYPE = range(6)
-GET_RANK, GET_DIMS, RELEASE_INFO, PARALLEL_FOR, GET_ALLOCATOR = range(6, 11)
-ALLOCATE, FREE, RELEASE_ALLOCATOR, BLOCK, MEMORY, MESSAGES = range(11, 17)
+GET_RANK, GET_DIMS, RELEASE_INFO, PARALLEL_FOR, BLOCK, MESSAGES = range(6, 12)
 STATE_WORDS = MESSAGES + 16
 
-ARENA, DEFAULT = 1, 0  # `OrtArenaAllocator` and `OrtMemTypeDefault`
 INVALID_ARGUMENT = 2  # `ORT_INVALID_ARGUMENT`
 
 # `ONNXTensorElementDataType`; `ANY` leaves the check to the kernel

@@ -124,23 +124,11 @@ def _operator(kernel: CompiledKernel, compute: int, block: int, base: int) -> An
     # The state of its kernels follows the struct
     api = _api(base)
     state = [api[place] for place in abi.CALLED_BY_KERNELS]
-    state += [block, _memory(base), *map(ctypes.addressof, texts)]
+    state += [block, *map(ctypes.addressof, texts)]
     for index, word in enumerate(state):
         written[STATE_OFFSET // 8 + index] = word
     _KEPT.extend((name, texts, callbacks, written))
     return written
-
-
-@functools.cache
-def _memory(base: int) -> int:
-    """Return onnxruntime's description of the CPU's memory."""
-    create = ctypes.CFUNCTYPE(_POINTER, _INT, _INT, _POINTER)
-    made = _POINTER()
-    create(_api(base)[abi.CREATE_MEMORY])(
-        abi.ARENA, abi.DEFAULT, ctypes.addressof(made)
-    )
-    assert made.value is not None
-    return made.value
 
 
 def _answer(result: Any, function: Callable[..., Any], *arguments: Any) -> Any:

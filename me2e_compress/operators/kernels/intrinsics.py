@@ -1,7 +1,7 @@
 """Functions that kernels call: addresses, C functions, memory, inputs and outputs.
 
-Memory is that of the stack or of the session's arena. It is not that of
-``KernelContext_GetScratchBuffer``, which nothing ever frees on the CPU.
+Memory is that of the stack. Nothing ever frees that of
+``KernelContext_GetScratchBuffer`` on the CPU.
 """
 
 from collections.abc import Callable
@@ -140,32 +140,3 @@ def create_output(t: Any, context: int, dims: Any, rank: int, to: int) -> Word:
     if status == 0:
         call(t[abi.GET_DATA], slot[0], to, 0, 0, 0)
     return status
-
-
-LINE = 64  # bytes of a cache line, on which memory begins
-
-_slots = stack(types.int64, 2)
-
-
-@compiled
-def allocate_memory(t: Any, context: int, size: int, to: Any) -> Word:
-    """Allocate arena memory: write three words, its address first; return a status."""
-    slots = _slots()
-    at = address_of(slots)
-    status = call(t[abi.GET_ALLOCATOR], context, t[abi.MEMORY], at, 0, 0)
-    if status != 0:
-        return status
-    status = call(t[abi.ALLOCATE], slots[0], size + LINE, at + 8, 0, 0)
-    if status != 0:
-        call(t[abi.RELEASE_ALLOCATOR], slots[0], 0, 0, 0, 0)
-        return status
-    to[0] = (slots[1] + LINE - 1) // LINE * LINE
-    to[1], to[2] = slots[0], slots[1]
-    return 0
-
-
-@compiled
-def free_memory(t: Any, memory: Any) -> None:
-    """Free the three words of memory that :func:`allocate_memory` wrote."""
-    call(t[abi.FREE], memory[1], memory[2], 0, 0, 0)
-    call(t[abi.RELEASE_ALLOCATOR], memory[1], 0, 0, 0, 0)

@@ -2,7 +2,7 @@
 
 import dataclasses
 
-from me2e_compress.operators.kernels.abi import ANY, FLOAT, INT8, INT64, UINT8
+from me2e_compress.operators.kernels.abi import ANY, FLOAT, INT8, UINT8
 
 
 @dataclasses.dataclass(frozen=True)
@@ -64,11 +64,6 @@ _ATTENTION = (
     " [N,K,M,D], with one key at least",
     f"a head has more than {WIDEST_HEAD} channels",
 )
-_WINOGRAD = (
-    "the inputs have not the ranks that they must: X 4, W 4, B 1, options 1",
-    "the inputs do not fit each other: they must be X [N,C,H,W], W [3,3,C,K], B [K] and"
-    " options [5], and the image with its pads at least 2 x 2",
-)
 
 
 def _deformable(
@@ -90,12 +85,6 @@ KERNELS = (
     *_deformable("MultiScaleDeformableAttention", "deformable_kernel", 2, _DEFORMABLE),
     *_deformable("RawDeformableAttention", "raw_attention_kernel", 4, _RAW),
     CompiledKernel(ATTENTION, "attention_kernel", (FLOAT, FLOAT, FLOAT), _ATTENTION),
-    CompiledKernel(
-        "WinogradConvolution",
-        "winograd_kernel",
-        (FLOAT, FLOAT, FLOAT, INT64),
-        _WINOGRAD,
-    ),
     CompiledKernel(
         "Histogram",
         "histogram_kernel",

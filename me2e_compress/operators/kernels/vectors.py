@@ -69,14 +69,6 @@ class Vectors:
         else:
             self._masked("store", ir.VoidType(), [vector, at, INT(4), mask])
 
-    def fetch(self, place: Any) -> None:
-        """Begin to bring what is there into the caches; nothing need be there."""
-        kind = ir.FunctionType(ir.VoidType(), [place.type, INT, INT, INT])
-        function = cgutils.get_or_insert_function(
-            self.builder.module, kind, "llvm.prefetch.p0"
-        )
-        self.builder.call(function, [place, INT(0), INT(3), INT(1)])
-
     def _masked(self, name: str, result: Any, arguments: list[Any]) -> Any:
         kind = ir.FunctionType(result, [value.type for value in arguments])
         name = f"llvm.masked.{name}.v{self.lanes}f32.p0"
@@ -110,11 +102,6 @@ class Vectors:
         """Return one - two."""
         return self.builder.fsub(one, two, flags=_FAST)
 
-    def plus(self, one: Any, factor: float, two: Any) -> Any:
-        """Return one + factor * two."""
-        scaled = self.builder.fmul(self.spread(factor), two, flags=_FAST)
-        return self.add(one, scaled)
-
     def times(self, factor: float, one: Any) -> Any:
         """Return factor * one."""
         return self.builder.fmul(self.spread(factor), one, flags=_FAST)
@@ -147,33 +134,6 @@ class Vectors:
     def choose(self, one: Any, two: Any, lanes: Sequence[int]) -> Any:
         """Return lanes of two vectors, those of the second counted from 16."""
         return self.builder.shuffle_vector(one, two, self.whole(list(lanes)))
-
-    def take_apart(self, v: Sequence[Any]) -> tuple[Any, ...]:
-        """Return every fourth of 64 numbers, from the first, second, third, fourth."""
-        pairs = [
-            self.choose(v[2 * half], v[2 * half + 1], range(part, 32, 2))
-            for part in range(2)
-            for half in range(2)
-        ]
-        return tuple(
-            self.choose(pairs[2 * odd], pairs[2 * odd + 1], range(second, 32, 2))
-            for second in range(2)
-            for odd in range(2)
-        )
-
-    def put_together(self, v: Sequence[Any]) -> tuple[Any, ...]:
-        """Undo :meth:`take_apart`."""
-        even = [self.choose(v[0], v[2], _between(half)) for half in range(2)]
-        odd = [self.choose(v[1], v[3], _between(half)) for half in range(2)]
-        return tuple(
-            self.choose(even[k // 2], odd[k // 2], _between(k % 2)) for k in range(4)
-        )
-
-
-def _between(half: int) -> list[int]:
-    """Return the lanes that put one half of two vectors between each other."""
-    first = half * LANES // 2
-    return [lane for k in range(LANES // 2) for lane in (first + k, LANES + first + k)]
 
 
 @contextmanager

@@ -14,10 +14,6 @@ from me2e_compress.graph.rewrite import remove_dead, replace_value, value_names
 from me2e_compress.operators import OWN_DOMAIN, FusedCall
 from me2e_compress.passes.base import Context, Pass, PassResult
 from me2e_compress.passes.fuse_kernels.attention import fuse_attention
-from me2e_compress.passes.fuse_kernels.convolution import (
-    fuse_convolution,
-    fuse_rectified_convolution,
-)
 from me2e_compress.passes.fuse_kernels.grid_sample import fuse_grid_sample
 from me2e_compress.passes.fuse_kernels.raw_attention import fuse_raw_attention
 
@@ -31,11 +27,9 @@ Fuser = Callable[[ir.Node, FusedCall], ir.Value | None]
 
 # Fusers by the type of the last node of their pattern.
 _FUSERS: Mapping[str, Fuser] = {
-    "Conv": fuse_convolution,
     "GridSample": fuse_grid_sample,
     "MatMul": fuse_attention,
     "MultiScaleDeformableAttention": fuse_raw_attention,
-    "Relu": fuse_rectified_convolution,
 }
 
 
@@ -47,9 +41,9 @@ class FuseKernels(Pass):
 
     Result:  y = me2e::MultiHeadAttention(q, k, v)
 
-    Likewise 3x3 convolutions (by Winograd's algorithm), GridSample of feature maps, and
-    the sums, softmax and mask in front of deformable attention, which its kernel reads
-    unrepeated (``me2e::RawDeformableAttention``).
+    Likewise GridSample of feature maps, and the sums, softmax and mask in front of
+    deformable attention, which its kernel reads unrepeated
+    (``me2e::RawDeformableAttention``).
 
     It stands last in a recipe, behind quantization: what is int8 stays as it is. The
     bodies of the fused nodes are the standard operators that they replace, so a file
