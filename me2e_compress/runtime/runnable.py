@@ -82,8 +82,9 @@ def unknown_nodes(model: ir.Model) -> Iterator[ir.Node]:
             domain = "" if is_standard(node) else node.domain
             if (domain, node.op_type) in known:
                 continue
-            # Nodes in the toolkit's own domain are included, whether they have a body
-            if node.op_identifier() not in model.functions or domain == OWN_DOMAIN:
+            # Own nodes are included even with a body, but those of older versions
+            known_here = domain == OWN_DOMAIN and is_fused(node)
+            if node.op_identifier() not in model.functions or known_here:
                 yield node
 
 

@@ -78,6 +78,20 @@ def test_a_session_outlives_its_graph(model: ir.Model) -> None:
     assert np.array_equal(session.run(image())["y"], first)
 
 
+def test_an_own_node_of_an_older_version_runs_by_its_body() -> None:
+    text = """<ir_version: 10, opset_import: ["" : 17, "me2e" : 1]>
+    m (float[2] x) => (float[2] y) { y = me2e.Gone(x) }
+    <opset_import: ["" : 17], domain: "me2e">
+    Gone (a) => (b) { b = Neg(a) }"""
+    model = ir.from_onnx_text(text)
+    feeds = {"x": np.array([1, 2], np.float32)}
+
+    np.testing.assert_array_equal(Session(model).run(feeds)["y"], -feeds["x"])
+    model.functions.clear()
+    with pytest.raises(GraphError, match="no operator me2e::Gone"):
+        Session(model)
+
+
 def test_weights_of_a_body_that_lie_in_a_file_are_found(tmp_path: Path) -> None:
     big = ", ".join("1" for _ in range(600))
     text = f"""
