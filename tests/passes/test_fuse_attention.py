@@ -1,5 +1,8 @@
 """Attention becomes one node with a kernel, in every layout; near misses stay."""
 
+import re
+from unittest.mock import Mock
+
 import numpy as np
 import onnx_ir as ir
 import pytest
@@ -7,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from me2e_compress.operators import find
-from me2e_compress.passes.fuse_kernels import FuseKernels
+from me2e_compress.passes.fuse_kernels import FuseKernels, attention
 from me2e_compress.runtime import runnable
 from me2e_compress.runtime.session import Session
 from tests.passes.small import apply, compute, fed, ops, read
@@ -63,6 +66,43 @@ SCALED = {
     "w = Softmax(b)",
     "none": "b = MatMul(qt, kt) w = Softmax(b)",
 }
+
+
+@pytest.fixture(autouse=True)
+def open_gate(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    if "gate" not in request.node.name:
+        monkeypatch.setattr(attention, "pays", Mock(return_value=True))
+
+
+@pytest.mark.parametrize(
+    ("layout", "sizes", "is_fused"),
+    [
+        ("side by side", (9, 70, 2, 16), True),
+        ("heads in the batch", (9, 70, 2, 16), False),  # most of a vector is empty
+        ("heads in the batch", (48, 70, 2, 16), True),
+        ("side by side", (150, 64, 2, 128), False),  # wide heads, few keys
+        ("side by side", (150, 256, 2, 128), True),
+        ("heads in the batch", (300, 256, 2, 16), False),
+        ("heads in the batch", (512, 512, 2, 16), True),  # scores leave the cache
+    ],
+)
+def test_the_gate_knows_sizes(
+    layout: str, sizes: tuple[int, int, int, int], is_fused: bool
+) -> None:
+    text = HEAD + turned(layout).replace("BODY", SCALED["query"] + " z = MatMul(w, vt)")
+    dims = dict(zip((str(n) for n in (Q, K, H, C)), map(str, sizes), strict=True))
+    # the first of a row of rows is the batch, 2 as well
+    ports = re.compile(r"float\[(1,|2,)([\d,]+)\]")
+    text = ports.sub(
+        lambda m: f"float[{m[1]}{','.join(dims[d] for d in m[2].split(','))}]", text
+    )
+
+    result = apply(
+        FuseKernels(), read(text.replace("SCALE", "1").replace("TIMES", "1"))
+    )
+
+    assert result.changes == is_fused
+    assert is_fused or "its nodes are as fast" in result.notes[0]
 
 
 def written(layout: str, scaled_by: str = "query", scale: float = C**-0.5) -> ir.Model:

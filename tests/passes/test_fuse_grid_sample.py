@@ -1,6 +1,7 @@
 """GridSample as deformable attention of rows of channels, against float64."""
 
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import onnx_ir as ir
@@ -9,13 +10,40 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from me2e_compress.operators.grid_sampler import grid_sample_array
-from me2e_compress.passes.fuse_kernels import FuseKernels
+from me2e_compress.passes.fuse_kernels import FuseKernels, grid_sample
 from me2e_compress.passes.fused_nodes import ExpandOperators
 from tests.passes.small import apply, compute, ops, read
 
 RANDOM = np.random.default_rng(7)
 KERNEL = "MultiScaleDeformableAttention"
 MODES = {"bilinear": 0, "nearest": 1}
+
+
+@pytest.fixture(autouse=True)
+def open_gate(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    if "gate" not in request.node.name:
+        monkeypatch.setattr(grid_sample, "pays", Mock(return_value=True))
+
+
+@pytest.mark.parametrize(
+    ("mode", "channels", "side", "points", "rows", "is_fused"),
+    [
+        ("nearest", 16, 16, 768, True, True),
+        ("bilinear", 16, 16, 768, True, False),  # few channels
+        ("bilinear", 64, 16, 768, True, True),
+        ("nearest", 64, 100, 16, False, False),  # all of a large map is turned
+        ("nearest", 64, 100, 10000, False, True),
+    ],
+)
+def test_the_gate_knows_sizes(
+    mode: str, channels: int, side: int, points: int, rows: bool, is_fused: bool
+) -> None:
+    shape = (side, side, channels) if rows else (channels, side, side)
+    body = (ROWS if rows else "m = Identity(x) ") + sample(mode) + " y = Neg(s)"
+    image, out = ",".join(map(str, (1, *shape))), f"1,{channels},1,{points}"
+    result = apply(FuseKernels(), model_of(image, f"1,1,{points},2", body, out))
+    assert result.changes == is_fused
+    assert is_fused or "its nodes are as fast" in result.notes[0]
 
 
 def model_of(

@@ -131,7 +131,7 @@ def fused(c: Case, model: ir.Model) -> list[ir.Node]:
         over_levels=st.booleans(),
         masked=st.booleans(),
         scale=st.sampled_from([1.0, 0.5]),
-    )
+    ).filter(lambda case: case.points > 1)
 )
 def test_operands_are_read_before_they_are_repeated(case: Case) -> None:
     (node,) = fused(case, model_of(case))
@@ -142,6 +142,15 @@ def test_operands_are_read_before_they_are_repeated(case: Case) -> None:
     scores = rows * c.heads * c.levels * c.points
     near, mask = 2 * rows * c.cameras * c.pillars, rows * c.cameras
     assert counts == [near, 2 * scores, scores, mask if c.masked else 1]
+
+
+@pytest.mark.parametrize(("each", "kind"), [(1, OWN), (2, RAW)])
+def test_one_point_of_a_level_does_not_pay(each: int, kind: str) -> None:
+    case = Case(pillars=1, each=each)
+
+    (node,) = fused(case, model_of(case))
+
+    assert node.op_type == kind
 
 
 @pytest.mark.parametrize(

@@ -29,12 +29,14 @@ _ROWS = {3: [1, 0, 2], 4: [0, 2, 1, 3]}
 # The order of one that turns the keys as well.
 _KEYS = {3: [1, 2, 0], 4: [0, 2, 3, 1]}
 
-# Queries and keys from which the kernel is faster than onnxruntime's three nodes:
-# 0.6 to 0.9 of their time at 100 keys, the same at 32, on AMD Zen 5 with one thread.
+# Queries and keys below which there is next to nothing to gain
 LEAST_QUERIES, LEAST_KEYS = 8, 64
 
 WIDEST = 128
-"""Channels of a head up to which it is; with 256, it takes the same time."""
+"""Channels of a head up to which it is measured."""
+
+# What the kernel may take of the time of the nodes, by the model of `pays`
+_WORTH = 0.95
 
 _FLOAT = ir.DataType.FLOAT
 _Shape = tuple[int, ...]
@@ -68,7 +70,46 @@ def fuse_attention(node: ir.Node, call: FusedCall) -> ir.Value | None:
         return None
     if call.opset < OLDEST_OPSET:
         raise PreconditionError(f"fused nodes need opset {OLDEST_OPSET} or later")
-    return _fused(call, attention, _checked(attention, softmax))
+    shape = _checked(attention, softmax)
+    reads = _rows_behind(attention, len(shape))
+    (*_, queries, channels), keys = shape, static_shape(attention.turned_key) or ()
+    heads = math.prod(shape[:-2])
+    if not pays(queries, keys[-1], heads, channels, rows=bool(reads)):
+        sizes = f"{queries} queries, {keys[-1]} keys, {heads} heads of {channels}"
+        raise PreconditionError(f"its nodes are as fast: {sizes}")
+    return _fused(call, attention, shape, reads)
+
+
+def pays(queries: int, keys: int, heads: int, channels: int, *, rows: bool) -> bool:
+    """Return whether the kernel is faster than the nodes.
+
+    ``rows``: Transposes take the heads from rows into the batch and back, which the
+    kernel does not need. The numbers are nanoseconds on one core of an AMD EPYC (Zen
+    4), fitted to 131 shapes, each measured twice (``benchmarks.measure.fusions``): 1 to
+    1,024 queries, 4 to 768 keys, 4 heads of 16 and of 128 channels, 8 of 32.
+    """
+    scores, padded = queries * keys, 16 * math.ceil(queries / 16)  # whole vectors
+    far = 0.2 * (scores > 1 << 17)  # in onnxruntime they are stored: 512 kB of a head
+    nodes = scores * (0.04 * channels + 0.2 + far) + 36 * queries
+    if rows:
+        nodes += queries * (0.74 * channels + 5.6) + keys * (0.82 * channels + 5)
+    else:  # only the keys are turned
+        nodes += 0.25 * keys * channels
+    kernel = padded * (keys * (0.035 * channels + 0.29) + 0.0014 * channels**2)
+    kernel += (1.26 * queries + 0.22 * keys) * channels
+    return 5_800 + heads * kernel < _WORTH * (6_300 + 2_800 * rows + heads * nodes)
+
+
+def _rows_behind(attention: _Attention, rank: int) -> list[ir.Value | None]:
+    """Return what Transposes take the heads of all three from, or nothing."""
+    turns = [maker(value, "Transpose") for value in attention[:3]]
+    orders = [_ROWS.get(rank), _KEYS.get(rank), _ROWS.get(rank)]
+    reads = [
+        turn.inputs[0]
+        for turn, order in zip(turns, orders, strict=True)
+        if turn is not None and order and permutation_of(turn) == order
+    ]
+    return reads if len(reads) == len(turns) else []
 
 
 def _match(node: ir.Node, softmax: ir.Node) -> _Attention | None:
@@ -134,19 +175,17 @@ def _checked(attention: _Attention, softmax: ir.Node) -> _Shape:
     return query
 
 
-def _fused(call: FusedCall, attention: _Attention, shape: _Shape) -> ir.Value:
+def _fused(
+    call: FusedCall,
+    attention: _Attention,
+    shape: _Shape,
+    reads: list[ir.Value | None],
+) -> ir.Value:
     """Write attention of the rows that Transposes read, or of heads in the batch."""
     # softmax(s q k) = softmax(f q k / sqrt(C)) with f = s sqrt(C)
     rank, width = len(shape), shape[-1]
     factor = attention.scale * math.sqrt(width)
-    turns = [maker(value, "Transpose") for value in attention[:3]]
-    orders = [_ROWS.get(rank), _KEYS.get(rank), _ROWS.get(rank)]
-    reads = [
-        turn.inputs[0]
-        for turn, order in zip(turns, orders, strict=True)
-        if turn is not None and order and permutation_of(turn) == order
-    ]
-    if len(reads) == len(turns):
+    if reads:
         rows = [_viewed(call, read, -2) for read in reads]
         result = _attention(call, rows, factor, shape[-3])
         split = call.reshape(result, static_shape(reads[0]) or ())
@@ -158,8 +197,9 @@ def _fused(call: FusedCall, attention: _Attention, shape: _Shape) -> ir.Value:
         return call.transpose(split, _ROWS[rank])
     # Heads are in the batch already: only the keys are turned, [.., K, C]
     last = [*range(rank - 2), rank - 1, rank - 2]
-    if turns[1] is not None and permutation_of(turns[1]) == last:
-        key = turns[1].inputs[0]
+    turn = maker(attention.turned_key, "Transpose")
+    if turn is not None and permutation_of(turn) == last:
+        key = turn.inputs[0]
     else:
         key = call.transpose(attention.turned_key, last)
     operands = (attention.query, key, attention.value)

@@ -24,6 +24,10 @@ from me2e_compress.passes.fuse_operators.fused_form import (
 )
 from me2e_compress.passes.fuse_operators.views import View, operands, sources
 
+# Points of a level: with one, the kernel takes up to 1.4 times as long as the nodes,
+# with two 0.7 to 1.2 (one core of an AMD EPYC, Zen 4; `benchmarks.measure.fusions`)
+LEAST_POINTS = 2
+
 BATCH, QUERY, HEAD, LEVEL, POINT = "batch", "query", "head", "level", "point"
 # The axes of locations, which are in 0..1: not the ``xy`` of a grid's in -1..1.
 XY = "x, y"
@@ -116,6 +120,8 @@ def _match(node: ir.Node) -> _Match | None:
     if shape[:5] != static_shape(weights):
         raise PreconditionError("its weights have another shape than its locations")
     sizes = _Sizes(*shape[:5])
+    if sizes.points < LEAST_POINTS:
+        raise PreconditionError("its nodes are as fast: one point for each level")
     at = View(locations, (*sizes.weights, whole(XY, 2)))
     share = View(weights, sizes.weights)
     plain = _Match(sizes, None, at, None, ((),) * 5, (share,), 1.0)
