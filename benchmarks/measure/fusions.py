@@ -14,7 +14,7 @@ import argparse
 import contextlib
 import dataclasses
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
 from itertools import product
 from unittest import mock
@@ -69,7 +69,7 @@ class Pattern:
     """
 
     name: str
-    inputs: dict[str, tuple[int, ...]]
+    inputs: Mapping[str, tuple[int, ...]]
     body: str
     constants: str
     output: tuple[int, ...]
