@@ -9,6 +9,7 @@ two solids share columns of an image and their edges contradict it, the edges wi
 """
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import cv2
 import numpy as np
@@ -21,7 +22,7 @@ from me2e_compress.simulator.camera_rig import (
     fixed_point,
 )
 from me2e_compress.simulator.cameras.solids import Solid
-from me2e_compress.simulator.cameras.template import FIRST_LAMP
+from me2e_compress.simulator.cameras.template import FIRST_LAMP, Template
 from me2e_compress.simulator.plane_geometry import Floats
 from me2e_compress.simulator.scene import Ego
 
@@ -57,7 +58,8 @@ def painting_order(right: Floats, forward: Floats, visible: Flags) -> tuple[Ints
     wide = high - low > np.pi  # a footprint across the line straight behind
     apart = (low[:, None] > high) | (high[:, None] < low)
     shared = (~apart | wide[:, None] | wide) & (camera[:, None] == camera)
-    first, second = np.nonzero(np.triu(shared, 1))
+    first, second = np.nonzero(shared)
+    first, second = first[first < second], second[first < second]
     if len(first) == 0:
         return camera, solid
     before, after = _hides(x, y, first, second)
@@ -131,19 +133,21 @@ class Painter:
         # which solids each camera may see, in painting order
         x, y, heading = np.array([s.pose for s in solids]).T
         poses = np.column_stack([ego.seen(x, y), heading - ego.heading])  # (solids, 3)
-        corners, footprints = _place(solids, poses)
+        shapes = _shapes(tuple((s.template, s.size) for s in solids))
+        turns = np.stack([np.cos(poses[:, 2]), np.sin(poses[:, 2]), *poses[:, :2].T])
+        corners = _placed(shapes.corners, turns.take(shapes.owner, axis=1))
+        footprints = _placed(shapes.footprints, turns)
         camera, solid = painting_order(*self._views(footprints))
         # their faces that look at the camera, inside its frustum
-        view, face = _spread(np.array([len(s.colours) for s in solids]), solid)
-        placed = corners[:, :, face]  # (3, 4, faces) in the ego frame
+        view, face = _spread(shapes.counts, solid)
+        placed = corners.take(face, axis=2)  # (3, 4, faces) in the ego frame
         right, forward = self._right_and_forward(placed, camera[view])
         points = np.stack([right, CAMERA_HEIGHT_M - placed[2], forward])
         visible = self._visible(points, camera[view])
-        points, view, face = points[:, :, visible], view[visible], face[visible]
+        points, view, face = points.take(visible, 2), view[visible], face[visible]
         # details that are large enough to be seen
         pixels = self._project(points, camera[view])
-        details = np.concatenate([s.template.details for s in solids])[face]
-        lamps = np.concatenate([s.template.slots for s in solids])[face] >= FIRST_LAMP
+        details, lamps = shapes.details[face], shapes.lamps[face]
         sides = (pixels.max(axis=1) - pixels.min(axis=1)).max(axis=0)
         keep = np.flatnonzero(~details | (sides > LEAST_PX[lamps.astype(int)]))
         view, face = view[keep], face[keep]
@@ -151,7 +155,7 @@ class Painter:
         away = poses[solid, :2] - self.rig.positions[camera, :2]
         return Faces(
             cameras=camera,
-            polygons=self._polygons(points[..., keep], pixels[..., keep], camera),
+            polygons=self._polygons(points.take(keep, 2), pixels.take(keep, 2), camera),
             colours=np.concatenate([s.colours for s in solids])[face],
             lamps=lamps[keep],
             details=details[keep],
@@ -170,11 +174,10 @@ class Painter:
 
     def _right_and_forward(self, points: Floats, camera: Ints) -> tuple[Floats, Floats]:
         """Convert x and y (points[0], points[1]) of the ego frame to cameras' axes."""
-        dx, dy = (points[i] - self.rig.positions[camera, i] for i in (0, 1))
-        axes = self.rig.rotations[camera]  # rows: right, down, forward
-        right = axes[..., 0, 0] * dx + axes[..., 0, 1] * dy
-        forward = axes[..., 2, 0] * dx + axes[..., 2, 1] * dy
-        return right, forward
+        dx, dy = (points[i] - self.rig.positions[:, i].take(camera) for i in (0, 1))
+        (rx, ry), (fx, fy) = self.rig.rotations[:, ::2, :2].transpose(1, 2, 0)
+        right = rx.take(camera) * dx + ry.take(camera) * dy
+        return right, fx.take(camera) * dx + fy.take(camera) * dy
 
     def _visible(self, points: Floats, camera: Ints) -> Ints:
         """Return the indices of the faces [3, 4, M] that a camera sees."""
@@ -185,7 +188,7 @@ class Painter:
         volume = volume + y * (az * bx - ax * bz) + z * (ax * by - ay * bx)
         front = np.flatnonzero(volume < 0.0)
         # and lie in its frustum
-        right, down, depth = points[:, :, front]
+        right, down, depth = points.take(front, axis=2)
         centre_column, horizon = self.rig.centre_px
         slope = depth / self.rig.focals_px[camera[front]]
         outside = (depth < NEAR_M).all(axis=0)
@@ -224,20 +227,41 @@ def draw(images: Bytes, faces: Faces, colours: Bytes) -> None:
         fill(planes[camera], polygon, colour, cv2.LINE_AA, SUBPIXEL_BITS)
 
 
-def _place(solids: list[Solid], poses: Floats) -> tuple[Floats, Floats]:
-    """Return the corners [3, 4, N] of all faces and the footprints [2, 4, S]."""
-    sizes = np.array([solid.size for solid in solids]).T
-    owner = np.repeat(np.arange(len(solids)), [len(s.colours) for s in solids])
-    unit = np.concatenate([s.template.corners for s in solids], axis=2)
-    corners = unit * sizes[:, None, owner]
-    rectangles = np.stack([s.template.footprint for s in solids], axis=2)
-    footprints = rectangles * sizes[:2, None]
-    cos, sin = np.cos(poses[:, 2]), np.sin(poses[:, 2])
-    for points, who in ((corners, owner), (footprints, slice(None))):
-        x = cos[who] * points[0] - sin[who] * points[1] + poses[who, 0]
-        y = sin[who] * points[0] + cos[who] * points[1] + poses[who, 1]
-        points[0], points[1] = x, y
-    return corners, footprints
+@dataclass(frozen=True, eq=False)
+class _Shapes:
+    """What some solids have alike in every frame, each in its own frame, in metres."""
+
+    corners: Floats  # (3, 4, faces)
+    footprints: Floats  # (2, 4, solids)
+    owner: Ints  # (faces,) index of the solid
+    counts: Ints  # (solids,) faces of each
+    details: Flags  # (faces,)
+    lamps: Flags  # (faces,)
+
+
+@lru_cache(maxsize=4)  # the solids near the ego are mostly those of the frame before
+def _shapes(solids: tuple[tuple[Template, tuple[float, float, float]], ...]) -> _Shapes:
+    """Join solids, each a template and its length, width and height (m)."""
+    templates, sizes = [one for one, _ in solids], np.array([m for _, m in solids]).T
+    counts = np.array([len(one.slots) for one in templates])
+    owner = np.repeat(np.arange(len(solids)), counts)
+    return _Shapes(
+        np.concatenate([one.corners for one in templates], axis=2)
+        * sizes[:, None, owner],
+        np.stack([one.footprint for one in templates], axis=2) * sizes[:2, None],
+        owner,
+        counts,
+        np.concatenate([one.details for one in templates]),
+        np.concatenate([one.slots for one in templates]) >= FIRST_LAMP,
+    )
+
+
+def _placed(points: Floats, turns: Floats) -> Floats:
+    """Return points [2 or 3, 4, N], turned by N cosines and sines and moved by x, y."""
+    (cos, sin, x, y), placed = turns, points.copy()
+    placed[0] = cos * points[0] - sin * points[1] + x
+    placed[1] = sin * points[0] + cos * points[1] + y
+    return placed
 
 
 def _spread(counts: Ints, solid: Ints) -> tuple[Ints, Ints]:

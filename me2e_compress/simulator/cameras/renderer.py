@@ -1,7 +1,7 @@
 """The six cameras of one route: sky, ground and solids, then weather and sensor."""
 
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache, cached_property
 
 import cv2
 import numpy as np
@@ -171,16 +171,16 @@ class Sky:
 
     def paint(self, images: Bytes, heading: float) -> None:
         """Fill the sky rows of uint8 [6, H, W, 3] for an ego heading in radians."""
-        first, texels = self._strip
-        images[:, :first] = ZENITH
-        turned = texels + round(heading / (2 * np.pi) * COLUMNS) % COLUMNS
-        pixels = self._panorama.take(turned).view(np.uint8)
+        first, texels, zenith = self._strip
+        images[:, :first] = zenith
+        turned = round(heading / (2 * np.pi) * COLUMNS) % COLUMNS
+        pixels = _panorama()[turned:].take(texels).view(np.uint8)
         strip = cv2.cvtColor(pixels.reshape(-1, self.rig.width, 4), cv2.COLOR_RGBA2RGB)
         images[:, first : self.height] = strip.reshape(*texels.shape, 3)
 
     @cached_property
-    def _strip(self) -> tuple[int, npt.NDArray[np.intp]]:
-        """First row, and the panorama's texel of each pixel [6, R, W] at heading 0."""
+    def _strip(self) -> tuple[int, npt.NDArray[np.intp], Bytes]:
+        """First row, its texels [6, R, W] at heading 0, and the rows above it."""
         focal = self.rig.focals_px[:, None]
         centre_column, horizon = self.rig.centre_px
         tangent = (np.arange(self.rig.width) + 0.5 - centre_column) / focal
@@ -192,34 +192,36 @@ class Sky:
         yaw = np.deg2rad([camera.yaw_deg for camera in CAMERAS])[:, None]
         azimuth = (yaw - np.arctan(tangent)) / (2 * np.pi) % 1.0
         column = (azimuth * COLUMNS).astype(np.intp)
-        return first, row * (2 * COLUMNS) + column[:, None, :]
+        zenith = np.tile(np.array(ZENITH, np.uint8), (first, self.rig.width, 1))
+        return first, row * (2 * COLUMNS) + column[:, None, :], zenith
 
-    @cached_property
-    def _panorama(self) -> npt.NDArray[np.uint32]:
-        """[ROWS * 2 * COLUMNS] RGBA texels, twice around: no index needs to wrap."""
-        rng = np.random.default_rng(0)
-        # a gradient from haze to zenith
-        elevation = TALLEST * (1.0 - (np.arange(ROWS) + 0.5) / ROWS)[:, None]
-        share = np.sqrt(elevation / TALLEST)[..., None]
-        sky = (1 - share) * np.array(HAZE, float) + share * np.array(ZENITH, float)
-        picture = np.repeat(sky, COLUMNS, axis=1)
-        # hills, then trees, antialiased along their skylines
-        layers = (
-            (HILLS, 0.045, 0.035, (2, 3, 5, 9)),
-            (TREES, 0.014, 0.012, (7, 23, 61, 137)),
-        )
-        angle = np.arange(COLUMNS) / COLUMNS * 2 * np.pi
-        for colour, mean, spread, waves in layers:
-            # waves around the circle with seeded phases, [COLUMNS] in -1 .. 1
-            phases = rng.uniform(0, 2 * np.pi, len(waves))
-            terms = [np.sin(n * angle + p) for n, p in zip(waves, phases, strict=True)]
-            skyline = mean + spread * np.mean(terms, axis=0)
-            covered = (skyline - elevation) * ROWS / TALLEST + 0.5
-            alpha = np.clip(covered, 0.0, 1.0)[..., None]
-            picture = (1 - alpha) * picture + alpha * np.array(colour, float)
-        rounded = np.rint(np.concatenate([picture, picture], axis=1)).astype(np.uint8)
-        texels = np.asarray(cv2.cvtColor(rounded, cv2.COLOR_RGB2RGBA), np.uint8)
-        return texels.reshape(-1).view(np.uint32)
+
+@cache
+def _panorama() -> npt.NDArray[np.uint32]:
+    """[ROWS * 2 * COLUMNS] RGBA texels, twice around: no index needs to wrap."""
+    rng = np.random.default_rng(0)
+    # a gradient from haze to zenith
+    elevation = TALLEST * (1.0 - (np.arange(ROWS) + 0.5) / ROWS)[:, None]
+    share = np.sqrt(elevation / TALLEST)[..., None]
+    sky = (1 - share) * np.array(HAZE, float) + share * np.array(ZENITH, float)
+    picture = np.repeat(sky, COLUMNS, axis=1)
+    # hills, then trees, antialiased along their skylines
+    layers = (
+        (HILLS, 0.045, 0.035, (2, 3, 5, 9)),
+        (TREES, 0.014, 0.012, (7, 23, 61, 137)),
+    )
+    angle = np.arange(COLUMNS) / COLUMNS * 2 * np.pi
+    for colour, mean, spread, waves in layers:
+        # waves around the circle with seeded phases, [COLUMNS] in -1 .. 1
+        phases = rng.uniform(0, 2 * np.pi, len(waves))
+        terms = [np.sin(n * angle + p) for n, p in zip(waves, phases, strict=True)]
+        skyline = mean + spread * np.mean(terms, axis=0)
+        covered = (skyline - elevation) * ROWS / TALLEST + 0.5
+        alpha = np.clip(covered, 0.0, 1.0)[..., None]
+        picture = (1 - alpha) * picture + alpha * np.array(colour, float)
+    rounded = np.rint(np.concatenate([picture, picture], axis=1)).astype(np.uint8)
+    texels = np.asarray(cv2.cvtColor(rounded, cv2.COLOR_RGB2RGBA), np.uint8)
+    return texels.reshape(-1).view(np.uint32)
 
 
 class Cameras:

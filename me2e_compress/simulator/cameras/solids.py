@@ -1,8 +1,8 @@
 """From a scene to the solids that the painter draws."""
 
 import math
-from dataclasses import dataclass
 from functools import cache
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -333,8 +333,7 @@ STATE_LAMPS = {
 }
 
 
-@dataclass(frozen=True, slots=True)
-class Solid:
+class Solid(NamedTuple):
     """A template, painted and placed in the world."""
 
     template: Template
@@ -360,30 +359,31 @@ def solids_of(scene: Scene) -> list[Solid]:
 
 
 def _actor_solids(actor: Actor, time_us: int) -> list[Solid]:
-    # lamps that are on at this instant
-    lit: list[Slot] = []
-    if actor.braking:
-        lit += [Slot.TAIL_LAMP, Slot.THIRD_LAMP]
-    if actor.indicator and time_us // BLINK_US % 2 == 0:
-        left = actor.indicator > 0
-        lit.append(Slot.INDICATOR_LEFT if left else Slot.INDICATOR_RIGHT)
-    if actor.kind is ActorKind.EMERGENCY and time_us // BEACON_US % 2 == 0:
-        lit.append(Slot.BEACON)
-    # one solid per piece of the actor's shape
+    # one solid per piece of the actor's shape, with the lamps that are on now
+    shown = actor.indicator if time_us // BLINK_US % 2 == 0 else 0
+    flashes = actor.kind is ActorKind.EMERGENCY and time_us // BEACON_US % 2 == 0
+    pose = actor.x, actor.y, actor.heading
+    size = actor.length, actor.width, actor.height
+    pieces = _pieces(actor.kind, actor.id, actor.braking, shown, flashes)
+    return [Solid(template, colours, pose, size) for template, colours in pieces]
+
+
+@cache
+def _pieces(
+    kind: ActorKind, number: int, braking: bool, indicator: int, flashes: bool
+) -> list[tuple[Template, npt.NDArray[np.float64]]]:
+    """Return the pieces of an actor's shape with the colours of their faces."""
+    lit: tuple[Slot, ...] = (Slot.TAIL_LAMP, Slot.THIRD_LAMP) if braking else ()
+    if indicator:
+        lit += (Slot.INDICATOR_LEFT if indicator > 0 else Slot.INDICATOR_RIGHT,)
+    if flashes:
+        lit += (Slot.BEACON,)
     # its colour, by its kind or id, is the same in every frame
-    people = actor.kind in (ActorKind.PEDESTRIAN, ActorKind.BICYCLE)
+    people = kind in (ActorKind.PEDESTRIAN, ActorKind.BICYCLE)
     choice = CLOTHES if people else PAINTS
-    paint = FIXED_PAINT.get(actor.kind, choice[actor.id * 5 % len(choice)])
-    stripe = STRIPES.get(actor.kind, DIM[Slot.STRIPE])
-    return [
-        Solid(
-            template,
-            _colours(template, paint, stripe, tuple(lit)),
-            (actor.x, actor.y, actor.heading),
-            (actor.length, actor.width, actor.height),
-        )
-        for template in TEMPLATES[actor.kind]
-    ]
+    paint = FIXED_PAINT.get(kind, choice[number * 5 % len(choice)])
+    stripe = STRIPES.get(kind, DIM[Slot.STRIPE])
+    return [(one, _colours(one, paint, stripe, lit)) for one in TEMPLATES[kind]]
 
 
 @cache
