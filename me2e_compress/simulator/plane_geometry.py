@@ -120,7 +120,7 @@ class RoutePath:
             high = max(high, low + 1)
         start, direction = self.points[low:high], self._direction[low:high]
         dx, dy = x - start[:, 0], y - start[:, 1]
-        along = np.clip(dx * direction[:, 0] + dy * direction[:, 1], 0.0, SPACING_M)
+        along = (dx * direction[:, 0] + dy * direction[:, 1]).clip(0.0, SPACING_M)
         miss_x = dx - along * direction[:, 0]
         miss_y = dy - along * direction[:, 1]
         i = int(np.argmin(miss_x * miss_x + miss_y * miss_y))
@@ -145,7 +145,7 @@ class RoutePath:
 
     def command_at(self, s_m: float) -> Command:
         """Return the navigation command at an arc length."""
-        return Command(self.commands[int(np.clip(s_m, 0, len(self.commands) - 1))])
+        return Command(self.commands[int(min(max(s_m, 0), len(self.commands) - 1))])
 
     @cached_property
     def curvature(self) -> Floats:

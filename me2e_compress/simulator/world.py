@@ -62,6 +62,7 @@ class World:
         self._road = TrafficRoad(stage.network, rules)
         self._road.vehicles = [stage.ego]
         self._next_decision_us = 0
+        self._still = list[Actor]()  # static objects: they stay, where they are
         # State of the checks
         self.outside_m = 0.0  # from the ego's centre to the nearest lane, 0 inside
         self.outside_distance_m = 0.0  # driven while that exceeded `TOLERANCE_M`
@@ -108,13 +109,11 @@ class World:
 
     def scene(self) -> Scene:
         """Return a frozen snapshot, right-handed."""
-        bodies = [*self.stage.bodies, *self.stage.static_objects]
-        return Scene(
-            self.time_us,
-            self.stage.ego.snapshot(),
-            tuple(_actor(body) for body in bodies),
-            tuple(signal.snapshot() for signal in self.stage.regulators),
-        )
+        stage = self.stage
+        self._still += map(_actor, stage.static_objects[len(self._still) :])
+        actors = (*map(_actor, stage.bodies), *self._still)
+        signals = tuple(signal.snapshot() for signal in stage.regulators)
+        return Scene(self.time_us, stage.ego.snapshot(), actors, signals)
 
     def step(self, control: Control) -> None:
         """Advance by one frame.
@@ -198,17 +197,7 @@ class World:
 
 
 def _actor(body: Car | Walker | StaticObject) -> Actor:
-    pose = body.pose
-    return Actor(
-        body.id,
-        body.kind,
-        pose.x,
-        pose.y,
-        pose.heading,
-        float(body.speed),
-        float(body.LENGTH),
-        float(body.WIDTH),
-        float(body.height),
-        bool(body.braking),
-        body.indicator,
-    )
+    x, y = body.position.tolist()
+    motion = x, -y, -float(body.heading), float(body.speed)
+    size = float(body.LENGTH), float(body.WIDTH), float(body.height)
+    return Actor(body.id, body.kind, *motion, *size, bool(body.braking), body.indicator)

@@ -15,11 +15,7 @@ from me2e_compress.evaluators.highway.observe import ObservationBuilder, cameras
 from me2e_compress.evaluators.highway.runner import EndingRules
 from me2e_compress.runtime.frames import Array, Frame
 from me2e_compress.simulator.camera_rig import CameraRig
-from me2e_compress.simulator.routes import (
-    EXPERT_S,
-    Route,
-    load_routes,
-)
+from me2e_compress.simulator.routes import EXPERT_S, Route, load_routes
 from me2e_compress.simulator.scenarios.builders import stage_of
 from me2e_compress.simulator.world import World
 

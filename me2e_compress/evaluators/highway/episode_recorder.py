@@ -184,12 +184,7 @@ def _infraction(kind: InfractionKind, event: Event, world: World) -> Infraction:
     number = "" if event.actor_id is None else f"{event.actor_id}"
     detail = f"{partner}{number}".strip() or event.detail
     infraction = Infraction(
-        kind,
-        event.time_us,
-        event.x,
-        event.y,
-        detail,
-        ego_speed_mps=event.ego_speed_mps,
+        kind, event.time_us, event.x, event.y, detail, ego_speed_mps=event.ego_speed_mps
     )
     # Contact and fault follow from the scene of the collision
     if kind in COLLISIONS:
@@ -253,11 +248,8 @@ def conflicts_of(scenes: Sequence[Scene]) -> ConflictRecord:
             for ego_at, at, angle in _same_place(egos, actors[own], frame[own]):
                 time_us = max(ego_at, at) * FRAME_US
                 pet_s = abs(ego_at - at) * FRAME_US / 1e6
-                encounters.append(
-                    Encounter(
-                        number, kind, time_us, pet_s, round(angle, 3), ego_at < at
-                    )
-                )
+                met = number, kind, time_us, pet_s, round(angle, 3), ego_at < at
+                encounters.append(Encounter(*met))
     encounters.sort(key=lambda met: (met.time_us, met.actor))
     return ConflictRecord(
         _known(nearest, math.inf), _known(soonest, TTC_HORIZON_S), tuple(encounters)

@@ -10,12 +10,7 @@ from me2e_compress.base.extras import require_extra
 from me2e_compress.base.listener import Listener
 from me2e_compress.driving.contract import RouteInfo
 from me2e_compress.driving.policies import Driver, opened
-from me2e_compress.evaluators.contract import (
-    ABILITIES,
-    Drive,
-    Engine,
-    Evaluator,
-)
+from me2e_compress.evaluators.contract import ABILITIES, Drive, Engine, Evaluator
 from me2e_compress.evaluators.highway.drivers import image_size_of
 from me2e_compress.evaluators.highway.engine import LocalEngine
 from me2e_compress.evaluators.results import log_cost

@@ -77,12 +77,12 @@ class ObservationBuilder:
 
     def observe(self, scene: Scene) -> Observation:
         """Return the observation at a scene; the CAN bus counts from the last call."""
-        images = self.cameras.render(scene) if self.cameras is not None else None
+        shown = self.cameras if self.policy.needs_images else None
         can_bus = can_bus_of(scene.ego, self._last)
         self._last = scene.ego
         return Observation(
             scene.time_us,
-            images if self.policy.needs_images else None,
+            None if shown is None else shown.render(scene),
             self.rig.lidar2img,
             can_bus,
             int(self.world.path.command_at(self.world.ego_s)),
@@ -94,13 +94,13 @@ class ObservationBuilder:
         )
 
 
-# Actors that a tracker would follow
-ROAD_USERS = {*ActorKind} - {ActorKind.DOOR, ActorKind.CONE, ActorKind.BARRIER}
+# Actors that no tracker would follow
+THINGS = ActorKind.DOOR, ActorKind.CONE, ActorKind.BARRIER
 
 
 def road_users(scene: Scene) -> npt.NDArray[np.float64]:
     """Return [N, 2] positions of road users, metres in the ego frame."""
-    places = [(actor.x, actor.y) for actor in scene.actors if actor.kind in ROAD_USERS]
+    places = [(actor.x, actor.y) for actor in scene.actors if actor.kind not in THINGS]
     return scene.ego.seen(*np.array(places, np.float64).reshape(-1, 2).T)
 
 
@@ -111,11 +111,6 @@ def can_bus_of(ego: Ego, last: Ego | None) -> npt.NDArray[np.float32]:
 
 def motion_of(ego: Ego) -> EgoKinematics:
     """Return the ego's place and motion."""
-    return EgoKinematics(
-        ego.x,
-        ego.y,
-        ego.heading,
-        ego.speed_mps,
-        (ego.acceleration_mps2, ego.lateral_acceleration_mps2, 0.0),
-        (0.0, 0.0, ego.yaw_rate_radps),
-    )
+    pushes = ego.acceleration_mps2, ego.lateral_acceleration_mps2, 0.0
+    turns = 0.0, 0.0, ego.yaw_rate_radps
+    return EgoKinematics(ego.x, ego.y, ego.heading, ego.speed_mps, pushes, turns)

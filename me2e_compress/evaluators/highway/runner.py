@@ -102,10 +102,7 @@ class Listeners:
 
 
 def drive(
-    route: Route,
-    policy: Policy,
-    conditions: Drive,
-    listeners: Listeners = Listeners(),
+    route: Route, policy: Policy, conditions: Drive, listeners: Listeners = Listeners()
 ) -> Episode:
     """Drive a route to its end and return the record.
 
@@ -121,11 +118,7 @@ def drive(
 
 class _Drive:
     def __init__(
-        self,
-        route: Route,
-        policy: Policy,
-        conditions: Drive,
-        listeners: Listeners,
+        self, route: Route, policy: Policy, conditions: Drive, listeners: Listeners
     ) -> None:
         # The world, its record, and the rules of latency
         self.route, self.policy, self.listeners = route, policy, listeners
@@ -140,8 +133,7 @@ class _Drive:
         self.cameras = None
         if policy.needs_images or listeners.on_moment is not None:
             self.cameras = cameras_of(world, rig, conditions.weather)
-        needed = self.cameras if policy.needs_images else None
-        self.observer = ObservationBuilder(world, policy, rig, needed)
+        self.observer = ObservationBuilder(world, policy, rig, self.cameras)
         self.plan: tuple[Ego, Plan] | None = None
 
     def run(self) -> Episode:

@@ -52,6 +52,9 @@ class _Body:
         self.LENGTH, self.WIDTH, self.height = size or DIMENSIONS[kind]
         self.diagonal = math.hypot(self.LENGTH, self.WIDTH)
 
+    def act(self, action: object = None) -> None:
+        """Decide nothing: the ego is driven from outside, walkers by scripts."""
+
 
 class EgoVehicle(_Body, Vehicle):  # type: ignore[misc]  # highway-env is untyped
     """The ego: highway-env's kinematic bicycle with lag, grip and no reverse gear."""
@@ -69,9 +72,6 @@ class EgoVehicle(_Body, Vehicle):  # type: ignore[misc]  # highway-env is untype
         self.yaw_rate_radps = 0.0
         self.steering_rad = 0.0
         self._thrust_mps2 = 0.0
-
-    def act(self, action: object = None) -> None:
-        """Do nothing: the ego is driven from outside through `wanted`."""
 
     def step(self, dt: float) -> None:
         """Advance by ``dt`` seconds."""
@@ -107,19 +107,11 @@ class EgoVehicle(_Body, Vehicle):  # type: ignore[misc]  # highway-env is untype
 
     def snapshot(self) -> Ego:
         """Return the state, right-handed."""
-        pose, speed = self.pose, float(self.speed)
-        return Ego(
-            pose.x,
-            pose.y,
-            pose.heading,
-            speed,
-            self.acceleration_mps2,
-            speed * self.yaw_rate_radps,
-            self.yaw_rate_radps,
-            self.steering_rad,
-            float(self.LENGTH),
-            float(self.WIDTH),
-        )
+        pose, speed, yaw_rate = self.pose, float(self.speed), self.yaw_rate_radps
+        accelerations = self.acceleration_mps2, speed * yaw_rate
+        turning = yaw_rate, self.steering_rad
+        motion = pose.x, pose.y, pose.heading, speed, *accelerations, *turning
+        return Ego(*motion, float(self.LENGTH), float(self.WIDTH))
 
 
 class Walker(_Body, Vehicle):  # type: ignore[misc]  # highway-env is untyped
@@ -137,37 +129,36 @@ class Walker(_Body, Vehicle):  # type: ignore[misc]  # highway-env is untyped
         self.top_speed_mps = speed_mps
         self.going = self.crosses = False
         self.walked_m = 0.0
-        legs = np.hypot(*np.diff(line, axis=0).T)
-        self._arc = np.concatenate([[0.0], np.cumsum(legs)])
+        legs = np.diff(line, axis=0)
+        self._arc = np.concatenate([[0.0], np.cumsum(np.hypot(*legs.T))])
         self._ends = self._arc.tolist()
-        self._columns = line[:, 0].tolist(), line[:, 1].tolist()
+        # Of each leg: where it begins, its direction, and its heading
+        ways = np.hstack([line[:-1], legs / np.diff(self._arc)[:, None]]).tolist()
+        headings = (-math.atan2(dy, dx) for dx, dy in legs.tolist())
+        self._legs = [*zip(ways, headings, strict=True)]
 
     @property
     def done(self) -> bool:
         """Whether the end of the line is reached."""
         return bool(self.walked_m >= self._ends[-1])
 
-    def act(self, action: object = None) -> None:
-        """Do nothing: only `going` matters."""
-
     def step(self, dt: float) -> None:
         """Advance by ``dt`` seconds; walking speed is reached within 0.5 s."""
-        target = self.top_speed_mps if self.going and not self.done else 0.0
+        ends, top = self._ends, self.top_speed_mps
+        target = top if self.going and self.walked_m < ends[-1] else 0.0
         if target == self.speed == 0.0:
             return
-        change = 2 * max(self.top_speed_mps, 1.0) * dt
+        change = 2 * max(top, 1.0) * dt
         self.speed += min(max(target - self.speed, -change), change)
-        self.walked_m = min(self.walked_m + self.speed * dt, self._ends[-1])
+        self.walked_m = min(self.walked_m + self.speed * dt, ends[-1])
         if self.done:
             self.speed = 0.0
         # where it is on its line, and the direction there, in plain floats
-        ends, (xs, ys) = self._ends, self._columns
         leg = min(max(bisect.bisect_right(ends, self.walked_m) - 1, 0), len(ends) - 2)
-        dx, dy = xs[leg + 1] - xs[leg], ys[leg + 1] - ys[leg]
-        self.heading = -math.atan2(dy, dx)
-        length, along = ends[leg + 1] - ends[leg], self.walked_m - ends[leg]
-        x, y = dx / length * along + xs[leg], dy / length * along + ys[leg]
-        self.position = flip(xs[-1], ys[-1]) if self.done else flip(x, y)
+        (x, y, way_x, way_y), self.heading = self._legs[leg]
+        along = self.walked_m - ends[leg]
+        x, y = way_x * along + x, way_y * along + y
+        self.position = flip(*self.line[-1]) if self.done else flip(x, y)
 
     def rest(self) -> Floats:
         """Return [M, 2], the rest of its line from its position on."""
@@ -176,7 +167,7 @@ class Walker(_Body, Vehicle):  # type: ignore[misc]  # highway-env is untyped
 
 
 class StaticObject(_Body, Obstacle):  # type: ignore[misc]  # highway-env is untyped
-    """A static object: parked car, door, cone, barrier."""
+    """A static object: parked car, door, cone, barrier. It never moves."""
 
     def __init__(
         self, id: int, kind: ActorKind, pose: Pose, size: Size | None = None

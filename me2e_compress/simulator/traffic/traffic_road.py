@@ -29,6 +29,7 @@ SETTLED_M = 30.0
 SLOWEST_MPS = 1.0
 FORESEEN_S = (1.0, 2.0, 3.0)  # when drivers foresee people who cross, seconds from now
 INSIDE_M, ALONG_RAD = 0.6, 0.3  # the ego nearer is wholly in a lane
+Pair = tuple[RoadObject, RoadObject]
 BESIDE_M = 0.25  # two bodies closer than this sideways are in each other's way
 
 
@@ -238,25 +239,21 @@ class TrafficRoad(Road):  # type: ignore[misc]  # highway-env is untyped
         for vehicle in self.vehicles:
             vehicle.step(dt)
 
-    def touching(self) -> list[tuple[RoadObject, RoadObject]]:
+    def touching(self) -> list[Pair]:
         """Return the pairs that overlap now and of which at least one moves."""
-        bodies = [*self.vehicles, *self.objects]
-        if not any(body.speed > 0 for body in self.vehicles):
-            return []
-        boxes = np.array([body.box for body in bodies], np.float64)
-        x, y = boxes[:, 0], boxes[:, 1]
-        reach = np.array([body.diagonal / 2 for body in bodies])
-        moves = np.array([body.speed > 0 for body in bodies])
-        dx, dy, room = x[:, None] - x, y[:, None] - y, reach[:, None] + reach
+        bodies, pairs = [*self.vehicles, *self.objects], list[Pair]()
         # pairs close enough by their diagonals, then the exact test
-        near = dx * dx + dy * dy < room * room
-        near &= moves[:, None] | moves[None]
-        first, second = np.nonzero(np.triu(near, 1))
-        hit = overlaps(boxes[first], boxes[second])
-        pairs = list[tuple[RoadObject, RoadObject]]()
-        for i, j in zip(first[hit].tolist(), second[hit].tolist(), strict=True):
+        x, y = np.concatenate([body.position for body in bodies]).reshape(-1, 2).T
+        reach = np.array([body.diagonal / 2 for body in bodies])
+        dx, dy, room = x[:, None] - x, y[:, None] - y, reach[:, None] + reach
+        for i, j in np.argwhere(dx * dx + dy * dy < room * room).tolist():
+            one, other = bodies[i], bodies[j]
+            if i >= j or (one.speed <= 0 and other.speed <= 0):
+                continue
             # people step aside for each other, and round things
-            people = [isinstance(body, Walker) for body in (bodies[i], bodies[j])]
-            if not (all(people) or (any(people) and bodies[j] in self.objects)):
-                pairs.append((bodies[i], bodies[j]))
+            people = [isinstance(body, Walker) for body in (one, other)]
+            if all(people) or (any(people) and other in self.objects):
+                continue
+            if overlaps(np.array(one.box), np.array(other.box)):
+                pairs.append((one, other))
         return pairs
