@@ -48,9 +48,7 @@ if TYPE_CHECKING:  # what a type checker sees; at run time names load when asked
     from me2e_compress.commands.plan import plan as plan
     from me2e_compress.commands.profile import profile as profile
     from me2e_compress.commands.score import score as score
-    from me2e_compress.commands.search import (
-        measure_sensitivity as measure_sensitivity,
-    )
+    from me2e_compress.commands.search import measure_sensitivity as measure_sensitivity
     from me2e_compress.commands.search import search as search
     from me2e_compress.graph.modules.module_map import ModuleMap as ModuleMap
     from me2e_compress.manager import PassManager as PassManager

@@ -98,8 +98,7 @@ class Registry(Generic[T]):
         name, known = cls.name, [field.name for field in fields_of(cls)]
         if unknown := [option for option in options if option not in known]:
             there = ", ".join(known) or "none"
-            line = f"{name} has no option {unknown[0]!r}; it has {there}"
-            raise self.error(line)
+            raise self.error(f"{name} has no option {unknown[0]!r}; it has {there}")
         # pydantic checks every option by the type of its field
         try:
             made: T = _adapter(cls).validate_python(dict(options))

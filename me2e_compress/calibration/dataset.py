@@ -446,5 +446,4 @@ def hold_out(
         return whole, whole
     # A third of the frames is for measuring
     measured = spread(whole, max(1, min(most, -(-len(whole) // 3))), run)
-    others = sorted(set(whole.places) - set(measured.places))
-    return whole.part(others), measured
+    return whole.part(sorted(set(whole.places) - set(measured.places))), measured

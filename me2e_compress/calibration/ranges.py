@@ -127,8 +127,7 @@ class Ranges:
         if not path.is_file():
             raise FramesError(f"{path}: no such ranges file")
         with documents.reading(path, FramesError, "not ranges"):
-            content = documents.read_bytes(path)
-            ranges = pydantic.TypeAdapter(cls).validate_json(content)
+            ranges = pydantic.TypeAdapter(cls).validate_json(documents.read_bytes(path))
         # Bounds must be finite and in order.
         for name, (low, high) in ranges.tensors.items():
             if not -LARGEST <= low <= high <= LARGEST:  # NaN too

@@ -65,8 +65,7 @@ def write_recording(
     _check_replaceable(partial, PROGRESS)
     described = dict[str, object](about)
     if pixels:
-        entry = PixelInputs(inputs=dict(pixels))
-        described["pixels"] = entry.model_dump(mode="json")
+        described["pixels"] = PixelInputs(inputs=dict(pixels)).model_dump(mode="json")
     draft = _Draft(partial, described, key)
     try:
         # Resume at the first scene that is not complete.

@@ -156,11 +156,7 @@ def frames(
 
 
 def plan(
-    model: str,
-    /,
-    *,
-    output: Output | None = None,
-    options: PlanOptions | None = None,
+    model: str, /, *, output: Output | None = None, options: PlanOptions | None = None
 ) -> None:
     """Show which nodes become int8, which stay float, by which rule, and why.
 

@@ -139,9 +139,7 @@ def calibrate(
                 assert part is not None
                 method = options.method or prepared.method
                 calibrator = Calibrator(
-                    method,
-                    checkpoint=checkpoint,
-                    provider=options.runs_on,
+                    method, checkpoint=checkpoint, provider=options.runs_on
                 )
                 report = listener.counting("calibrate", method)
                 statistics = calibrator.collect(

@@ -219,9 +219,7 @@ class ModelCheck(Result):
 
 
 def check_model(
-    policy: str | Path,
-    options: GraphOptions | None = None,
-    listener: Listener = SILENT,
+    policy: str | Path, options: GraphOptions | None = None, listener: Listener = SILENT
 ) -> ModelCheck:
     """Check whether a policy could drive: open it, match its ports, run it on zeros.
 

@@ -15,12 +15,7 @@ from me2e_compress.base.display import (
     table,
 )
 from me2e_compress.base.errors import GraphError
-from me2e_compress.commands.checks import (
-    load_graph,
-    load_map,
-    model_path,
-    shortcomings,
-)
+from me2e_compress.commands.checks import load_graph, load_map, model_path, shortcomings
 from me2e_compress.commands.options import InspectOptions
 from me2e_compress.commands.result import Result, View
 from me2e_compress.driving.adapter.outputs import write_port_metadata

@@ -208,11 +208,7 @@ def import_profile(
         if written is not None:
             trace.save(written)
     return ProfileResult(
-        source,
-        trace,
-        written,
-        operators_us=imported.layers_us,
-        budget_ms=budget_ms,
+        source, trace, written, operators_us=imported.layers_us, budget_ms=budget_ms
     )
 
 

@@ -82,10 +82,7 @@ class Drive:
 
     @classmethod
     def of_words(
-        cls,
-        latency_model: str = "drop",
-        dt_ms: float = 50.0,
-        weather: str = "",
+        cls, latency_model: str = "drop", dt_ms: float = 50.0, weather: str = ""
     ) -> Self:
         """Parse the options that the command, a study's file and Python share.
 

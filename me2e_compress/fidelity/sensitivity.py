@@ -16,12 +16,7 @@ from me2e_compress.base.display import format_significant
 from me2e_compress.base.documents import toml_string
 from me2e_compress.base.errors import EvaluationError
 from me2e_compress.calibration.ranges import Ranges
-from me2e_compress.fidelity.compare import (
-    Fidelity,
-    OutputFidelity,
-    Reference,
-    SetTally,
-)
+from me2e_compress.fidelity.compare import Fidelity, OutputFidelity, Reference, SetTally
 from me2e_compress.graph.modules.module_map import ModuleMap
 from me2e_compress.quantization.decision import (
     RESIDUAL,

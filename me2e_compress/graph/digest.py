@@ -61,8 +61,7 @@ def _hash_attribute(hasher: "hashlib.blake2b", attribute: ir.Attr) -> None:
         for graph in attribute.as_graphs():
             _hash_graph(hasher, graph)
     elif attribute.type == ir.AttributeType.TENSOR:
-        tensor = attribute.value  # as_tensor() checks a protocol: slow
-        hasher.update(digest_of_tensor(tensor))
+        hasher.update(digest_of_tensor(attribute.value))  # as_tensor() checks it: slow
     elif attribute.type == ir.AttributeType.TENSORS:
         for tensor in attribute.as_tensors():
             hasher.update(digest_of_tensor(tensor))

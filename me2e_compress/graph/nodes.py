@@ -275,8 +275,7 @@ def permutation_of(node: ir.Node) -> list[int] | None:
 
 def overflow(numbers: Numbers, stored: Array) -> bool:
     """Return whether numbers are too large for the type of a stored array."""
-    limit = np.finfo(stored.dtype.name).max
-    return not np.all(np.abs(numbers) <= limit)
+    return not np.all(np.abs(numbers) <= np.finfo(stored.dtype.name).max)
 
 
 def constant_values(model: ir.Model) -> frozenset[ir.Value]:

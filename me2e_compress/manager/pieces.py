@@ -149,8 +149,7 @@ def piece_errors(
 
 def _called(outputs: Outputs, steps: Sequence[Jump]) -> list[str]:
     """Return what messages call each output of a graph with operands of steps."""
-    names = operand_names(steps)
-    return [names.get(name, name) for name in outputs]
+    return list(map(operand_names(steps).get, outputs, outputs))
 
 
 def _add_errors(

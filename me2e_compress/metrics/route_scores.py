@@ -271,9 +271,7 @@ def at_fault_collision(episode: Episode) -> bool | None:
     """Return whether a collision was the ego's fault, None if unknown."""
     collisions = (one for one in episode.infractions if one.kind in COLLISIONS)
     faults = [collision.at_fault for collision in collisions]
-    if any(faults):
-        return True
-    return None if None in faults else False
+    return True if any(faults) else None if None in faults else False
 
 
 def _smallest(

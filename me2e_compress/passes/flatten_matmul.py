@@ -140,9 +140,7 @@ def _flatten(call: FusedCall) -> ir.Node | None:
     forms = [_form(*way, all_axes=every) for way in ways for every in (False, True)]
     best = min(filter(None, forms), key=lambda form: form.price, default=None)
     now = small_products(*shapes) / SMALL_PRODUCTS_PER_NODE
-    if best is None or best.price >= now:
-        return None
-    return _write(call, best)
+    return None if best is None or best.price >= now else _write(call, best)
 
 
 def _form(

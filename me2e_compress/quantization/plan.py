@@ -81,8 +81,7 @@ def find_groups(
         nodes = dict.fromkeys(name for value in read for name in readers[value])
         tensors = tuple(str(value.name) for value in read)
         if len(tensors) > 1:
-            name = head.name or tensors[0]
-            groups.append(ScaleGroup(name, tensors, tuple(nodes)))
+            groups.append(ScaleGroup(head.name or tensors[0], tensors, tuple(nodes)))
     return tuple(groups)
 
 

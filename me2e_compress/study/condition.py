@@ -9,11 +9,7 @@ from pydantic import ConfigDict, with_config
 
 from me2e_compress.base.errors import EvaluationError, StudyError
 from me2e_compress.base.text import name_in
-from me2e_compress.driving.latency import (
-    LATENCY_SOURCES,
-    LatencySource,
-    with_draws,
-)
+from me2e_compress.driving.latency import LATENCY_SOURCES, LatencySource, with_draws
 from me2e_compress.evaluators import Drive
 
 TRACE = "trace"  # the latency of each model's own trace, times the device scale

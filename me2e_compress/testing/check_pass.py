@@ -42,8 +42,7 @@ def check_pass(
     has_examples = "Given:" in text and "Result:" in text
     require(has_examples, f"{cls.__name__}'s docstring lacks Given: and Result:")
     for field in dataclasses.fields(cls):
-        message = f"{cls.__name__}'s docstring lacks {field.name}"
-        require(field.name in text, message)
+        require(field.name in text, f"{cls.__name__}'s docstring lacks {field.name}")
     # a graph as a pass sees it: imported, shapes inferred
     context = context if context is not None else Context(map_of(model, None))
     ready = model.clone()

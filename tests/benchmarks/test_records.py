@@ -10,11 +10,7 @@ from statistics import mean
 
 import pytest
 
-from benchmarks.measure.intervals import (
-    KeptDrive,
-    intra_type_correlation,
-    kept_drives,
-)
+from benchmarks.measure.intervals import KeptDrive, intra_type_correlation, kept_drives
 from benchmarks.measure.road import drives_of, means_of
 from benchmarks.paper.drives import KeptFacts
 from benchmarks.paper.evidence import NOISE

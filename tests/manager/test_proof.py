@@ -11,11 +11,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from me2e_compress.base.errors import VerificationError
-from me2e_compress.manager import (
-    PassManager,
-    Verification,
-    pass_manager,
-)
+from me2e_compress.manager import PassManager, Verification, pass_manager
 from me2e_compress.manager.verification_inputs import (
     EQUAL_SIZES,
     VerificationInputs,

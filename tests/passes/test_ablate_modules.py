@@ -7,11 +7,7 @@ import numpy as np
 import onnx_ir as ir
 import pytest
 
-from me2e_compress.base.errors import (
-    FramesError,
-    ModuleMapError,
-    PreconditionError,
-)
+from me2e_compress.base.errors import FramesError, ModuleMapError, PreconditionError
 from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.graph import provenance
 from me2e_compress.passes.ablate_modules import AblateModules

@@ -6,14 +6,7 @@ import numpy as np
 import pytest
 
 from me2e_compress.passes.fuse_basic import FuseBasic
-from tests.passes.small import (
-    apply,
-    fuse_basic,
-    normal,
-    ops,
-    preserved,
-    read,
-)
+from tests.passes.small import apply, fuse_basic, normal, ops, preserved, read
 
 IMAGE = "float[1,4,6,6]"
 

@@ -27,10 +27,7 @@ def planned(text: str, shapes: Mapping[str, tuple[int, ...]], rules: str) -> Qua
 PRODUCT = "p = MatMul(lidar2img, points)"
 PROJECTIONS = {
     "batched": ("float[6,4,4] lidar2img, float[6,4,200] points", PRODUCT),
-    "one column a point": (
-        "float[1,6,1,4,4] lidar2img, float[50,4,1] points",
-        PRODUCT,
-    ),
+    "one column a point": ("float[1,6,1,4,4] lidar2img, float[50,4,1] points", PRODUCT),
     "expanded": (
         "float[1,6,4,4] lidar2img, float[1,6,50,4,1] points",
         "u = Unsqueeze(lidar2img, two) e = Expand(u, all) p = MatMul(e, points)",

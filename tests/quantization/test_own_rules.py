@@ -139,11 +139,7 @@ def between(costs: float, readers: set[ir.Node], *makers: ir.Node) -> Border:
     ("saved", "borders", "lost"),
     [
         # a slow layer between fast ones stays int8
-        (
-            {A: 9.0, B: -1.0, C: 9.0},
-            (between(1.0, {B}, A), between(1.0, {C}, B)),
-            {},
-        ),
+        ({A: 9.0, B: -1.0, C: 9.0}, (between(1.0, {B}, A), between(1.0, {C}, B)), {}),
         # layers that only pay each other go together
         (
             {A: 1.0, B: 1.0, C: 9.0},
@@ -155,9 +151,7 @@ def between(costs: float, readers: set[ir.Node], *makers: ir.Node) -> Border:
     ],
 )
 def test_layers_that_lose_go(
-    saved: dict[ir.Node, float],
-    borders: tuple[Border, ...],
-    lost: dict[ir.Node, str],
+    saved: dict[ir.Node, float], borders: tuple[Border, ...], lost: dict[ir.Node, str]
 ) -> None:
     losses = Costs("", saved, borders).losses(list(saved) or [A])
 

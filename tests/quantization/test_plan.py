@@ -9,11 +9,7 @@ from me2e_compress.commands.outcome import float_bytes
 from me2e_compress.graph.modules.module_map import Module, ModuleMap
 from me2e_compress.passes import Context
 from me2e_compress.passes.quantize_int8 import QuantizeInt8
-from me2e_compress.quantization.decision import (
-    Decision,
-    QuantScheme,
-    load_plan,
-)
+from me2e_compress.quantization.decision import Decision, QuantScheme, load_plan
 from me2e_compress.quantization.plan import make_plan, tensors_of
 from me2e_compress.quantization.rules import RuleSet
 from me2e_compress.quantization.rules.rule_sets import PaperRules, SafeRules

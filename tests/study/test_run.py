@@ -16,13 +16,7 @@ from me2e_compress.evaluators.results import ResultsFolder
 from me2e_compress.manager import recipe
 from me2e_compress.metrics.route_summary import RouteSummary
 from me2e_compress.metrics.scores import score
-from me2e_compress.study import (
-    StudyResult,
-    Timing,
-    Variant,
-    load_study,
-    run_study,
-)
+from me2e_compress.study import StudyResult, Timing, Variant, load_study, run_study
 from me2e_compress.study.definition import FramesToRecord
 from me2e_compress.study.drive_record import DriveRecord, compare_pairs
 from me2e_compress.study.study_result import pair_table

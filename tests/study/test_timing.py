@@ -101,10 +101,7 @@ def test_a_model_that_joins_later_is_measured_with_the_others(
 
 
 def test_what_was_measured_otherwise_is_measured_again(
-    ours: Study,
-    paced: list[list[str]],
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
+    ours: Study, paced: list[list[str]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Other samples, threads, frames or models, or another machine."""
     clock_of(ours, tmp_path)
@@ -127,10 +124,7 @@ def test_what_was_measured_otherwise_is_measured_again(
 
 
 def test_a_kill_while_traces_are_written_leaves_no_set(
-    ours: Study,
-    paced: list[list[str]],
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
+    ours: Study, paced: list[list[str]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     save, saved = LatencyTrace.save, list[Path]()
 

@@ -21,14 +21,7 @@ import numpy as np
 import onnx_ir as ir
 
 from me2e_compress.base.errors import GraphError
-from me2e_compress.graph.nodes import (
-    FLOATS,
-    Array,
-    Numbers,
-    array_of,
-    is_read,
-    maker,
-)
+from me2e_compress.graph.nodes import FLOATS, Array, Numbers, array_of, is_read, maker
 
 # The standard operators whose operands may be swapped, up to rounding
 _IN_ANY_ORDER = frozenset(
@@ -111,8 +104,7 @@ class OperatorPattern(Pattern):
         if node is None or value.index() != 0:
             return
         for operands in self._orders(node):
-            goals = tuple(zip(self.inputs, operands, strict=True))
-            yield Way(goals, (node,))
+            yield Way(tuple(zip(self.inputs, operands, strict=True)), (node,))
 
     def _orders(self, node: ir.Node) -> Iterator[tuple[ir.Value, ...]]:
         inputs = list(node.inputs)

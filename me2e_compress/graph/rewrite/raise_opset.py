@@ -35,8 +35,7 @@ def raise_opset(model: ir.Model, opset: int, by: str) -> tuple[int, str]:
     """Convert a graph to a newer opset: see :func:`write_in`."""
     if opset > (known := onnx.defs.onnx_opset_version()):
         return 0, f"onnx {onnx.__version__} converts to {known} at most"
-    before = min(opset, opset_of(model))
-    return write_in(model, before, opset, by)
+    return write_in(model, min(opset, opset_of(model)), opset, by)
 
 
 def write_in(
@@ -83,8 +82,7 @@ def write_in(
     for body, _ in bodies(model):
         for domain in STANDARD:
             if imported := body.opset_imports.get(domain, 0):
-                new = converted_opset(imported, before, opset)
-                body.opset_imports[domain] = new
+                body.opset_imports[domain] = converted_opset(imported, before, opset)
     return len(made) + 1, ""
 
 

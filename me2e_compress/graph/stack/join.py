@@ -270,8 +270,7 @@ def _misfit(port_out: SessionPort, port_in: SessionPort) -> bool:
 
 def _form(port: SessionPort) -> str:
     """Describe type and shape: ``float [1, 6, 2]``."""
-    element = port.type.removeprefix("tensor(").removesuffix(")")
-    return f"{element} {list(port.shape)}"
+    return f"{port.type.removeprefix('tensor(').removesuffix(')')} {list(port.shape)}"
 
 
 def _metadata(parts: Parts) -> dict[str, str]:

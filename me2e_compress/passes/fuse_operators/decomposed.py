@@ -187,8 +187,7 @@ def _weighted(samples: View) -> tuple[View, View]:
     layout = aligned(samples.layout, shape)
     if any(digit.axis == CHANNEL for digit in flat(layout)):
         raise PreconditionError("the weights differ from channel to channel")
-    product = dataclasses.replace(samples, value=node.outputs[0])
-    return product, View(other, layout)
+    return dataclasses.replace(samples, value=node.outputs[0]), View(other, layout)
 
 
 def _total(product: View, kinds: tuple[str, ...]) -> tuple[View, bool]:

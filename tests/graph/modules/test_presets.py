@@ -41,11 +41,7 @@ TCP = {
 
 CASES = [
     (preset, path, module)
-    for preset, table in (
-        ("vad", VAD),
-        ("uniad", UNIAD),
-        ("tcp", TCP),
-    )
+    for preset, table in (("vad", VAD), ("uniad", UNIAD), ("tcp", TCP))
     for path, module in table.items()
 ]
 
