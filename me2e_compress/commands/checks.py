@@ -18,6 +18,8 @@ import errno
 import fcntl
 import functools
 import hashlib
+import itertools
+import json
 import os
 import signal
 import tempfile
@@ -35,16 +37,18 @@ from me2e_compress.base.atomic import is_marked, write_bytes
 from me2e_compress.base.display import plural
 from me2e_compress.base.errors import GraphError
 from me2e_compress.base.listener import Listener
-from me2e_compress.calibration.dataset import CalibrationSet, npz_bytes
+from me2e_compress.calibration.dataset import CalibrationSet, load_arrays, npz_bytes
 from me2e_compress.commands import opening_main
 from me2e_compress.commands.options import GraphOptions
 from me2e_compress.driving.adapter.outputs import state_and_plan, write_port_metadata
 from me2e_compress.graph.modules.assign import map_of
 from me2e_compress.graph.modules.module_map import ModuleMap
-from me2e_compress.graph.nodes import is_read, is_standard, nodes_of, opset_of
+from me2e_compress.graph.nodes import draws, is_read, is_standard, nodes_of, opset_of
 from me2e_compress.graph.opset import read_as
+from me2e_compress.graph.recurrence import recurrent_inputs
 from me2e_compress.graph.runtime_operators import has_operator
 from me2e_compress.graph.shapes import unshaped_plugins
+from me2e_compress.manager.verification_inputs import Answers
 from me2e_compress.operators.kernels.trampoline import why_not
 from me2e_compress.runtime.children import run_script
 from me2e_compress.runtime.frames import Frames
@@ -182,7 +186,7 @@ def check_output(outputs: Sequence[Path | None], inputs: Iterable[Given]) -> Non
             is named twice, or its folder does not exist.
     """
     named = dict[Path, Path]()
-    # a model may be named by many variants, and is loaded to find its weights
+    # a model may be named by many variants, and is loaded, once, to find its weights
     read = dict.fromkeys(Path(each) for each in inputs if each is not None)
     # an output must be a regular file in an existing folder, and named once
     for output in filter(None, outputs):
@@ -194,9 +198,9 @@ def check_output(outputs: Sequence[Path | None], inputs: Iterable[Given]) -> Non
             raise GraphError(f"{output} is a device or a pipe: name a file")
         if named.setdefault(real_path(output), output) is not output:
             raise GraphError(f"{output} is named for two outputs: choose another name")
-        # no input may be overwritten
-        for given in read:
-            _check_input(output, given)
+    # no input may be overwritten
+    for given in read:
+        _check_input(list(named.values()), given)
 
 
 def check_folder(
@@ -221,21 +225,24 @@ def real_path(path: Path) -> Path:
     return Path(os.path.realpath(path))
 
 
-def _check_input(output: Path, source: Path) -> None:
+def _check_input(outputs: Sequence[Path], source: Path) -> None:
     """Raise a GraphError for an output that would change an input."""
-    if source.is_dir():
-        inside = real_path(output).parent == real_path(source)
-        if inside and (output.suffix == ".npz" or output.name == "scenes.json"):
-            raise GraphError(
-                f"{output} would be a frame of the input: choose another name"
-            )
-    elif output.exists() and source.is_file():
-        if output.samefile(source):
-            raise GraphError(
-                f"{output} is the input: choose another name for the output"
-            )
-        if any(output.samefile(file) for file in _weight_files(source)):
-            raise GraphError(f"{output} holds the weights of {source}: not written")
+    weights: Sequence[Path] | None = None
+    for output in outputs:
+        if source.is_dir():
+            inside = real_path(output).parent == real_path(source)
+            if inside and (output.suffix == ".npz" or output.name == "scenes.json"):
+                raise GraphError(
+                    f"{output} would be a frame of the input: choose another name"
+                )
+        elif output.exists() and source.is_file():
+            if output.samefile(source):
+                raise GraphError(
+                    f"{output} is the input: choose another name for the output"
+                )
+            weights = list(_weight_files(source)) if weights is None else weights
+            if any(output.samefile(file) for file in weights):
+                raise GraphError(f"{output} holds the weights of {source}: not written")
 
 
 def _weight_files(given: Path) -> Iterator[Path]:
@@ -336,8 +343,12 @@ def try_first(
     listener: Listener,
     file: Path | None = None,
     provider: Provider = CPU,
+    count: int = 1,
+    answers: Answers | None = None,
 ) -> None:
-    """Open a graph in another process, and run its first frame, if it is new here.
+    """Open a graph in another process, and run it on frames, if it is new here.
+
+    It is run on the first ``count``, of one scene; ``answers`` gets what it gave.
 
     A graph that onnxruntime refuses, or that cannot be read, passes: whoever opens it
     next reports why. Only the plain CPU is tried: what other providers do to a graph
@@ -352,7 +363,8 @@ def try_first(
     if provider != CPU:
         return
     begun = perf_counter()
-    frame = next(iter(frames or ()), None)
+    shown = list(itertools.islice(frames or (), count))
+    shown[1:] = itertools.takewhile(lambda frame: not frame.starts_scene, shown[1:])
     try:
         file = source if isinstance(source, Path) else file
         model = graph.load(source) if isinstance(source, Path) else source
@@ -366,7 +378,7 @@ def try_first(
     key = (graph.digest(model), ort.__version__, CPU.native, *CPU.left_out, kernels)
     folder = platformdirs.user_cache_path("me2e-compress") / "opened"
     verdict = folder / hashlib.sha256("\n".join(key).encode()).hexdigest()
-    step = b"opened" if frame is None else b"ran"
+    step = b"ran" if shown else b"opened"
     with contextlib.suppress(OSError):
         if verdict.read_bytes() in (step, b"ran"):
             return
@@ -376,16 +388,22 @@ def try_first(
         if file is None or ready is not model:
             file = Path(scratch) / "model.onnx"
             graph.save(ready, file)
-        inputs = Path(scratch) / "frame.npz"
-        if frame is not None:
-            inputs.write_bytes(npz_bytes(frame.arrays))
-        words = [str(file), str(inputs), kernels, *CPU.left_out]
+        for index, frame in enumerate(shown):
+            Path(scratch, f"{index}.npz").write_bytes(npz_bytes(frame.arrays))
+        pairs = json.dumps(recurrent_inputs(model) if shown else {})
+        words = [str(file), scratch, pairs, kernels, *CPU.left_out]
         done = run_script(_SCRIPT, words)
+        lines = done.stdout.splitlines()
+        if answers is not None and "plain" not in lines and _runs_as_here(model):
+            names = [str(value.name) for value in model.graph.outputs]
+            written = [Path(scratch, f"{at}.out.npz") for at in range(len(shown))]
+            arrays = [load_arrays(each) for each in written if each.is_file()]
+            made = [dict(zip(names, each.values(), strict=True)) for each in arrays]
+            answers[key[0]] = list(zip(shown, made, strict=False))
     # Exit codes that the script does not give itself mean a crash.
     if done.returncode not in _REFUSED:
         last = (done.stdout.split() or ["start"])[-1]
         raise GraphError(f"{name}: onnxruntime {_end(done.returncode)} at step {last}")
-    lines = done.stdout.splitlines()
     if "plain" in lines and done.returncode == 0:
         why = lines[lines.index("plain") - 1]
         listener.on_warning(
@@ -397,6 +415,17 @@ def try_first(
             folder.mkdir(parents=True, exist_ok=True)
             write_bytes(verdict, step)
     listener.on_progress(STAGE, 1, 1, f"{name}: {perf_counter() - begun:.1f} s")
+
+
+def _runs_as_here(model: ir.Model) -> bool:
+    """Return whether sessions of ours answer what the script does, run after run.
+
+    Not with quantizers, random numbers, or a state that only a session knows.
+    """
+    ports = (*model.graph.inputs, *model.graph.outputs)
+    return not any(
+        "uantizeLinear" in node.op_type or draws(node) for node in nodes_of(model)
+    ) and all(isinstance(p.type, ir.TensorType) and p.shape is not None for p in ports)
 
 
 @dataclasses.dataclass(frozen=True)

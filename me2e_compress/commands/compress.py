@@ -47,7 +47,7 @@ from me2e_compress.graph.shapes import records_shapes, without_inferable_shapes
 from me2e_compress.manager import PassManager, Report
 from me2e_compress.manager import recipe as recipes
 from me2e_compress.manager.pass_manager import pause_collector
-from me2e_compress.manager.verification_inputs import seeded_frame
+from me2e_compress.manager.verification_inputs import Answers, seeded_frames
 from me2e_compress.passes import Context, Pass
 from me2e_compress.passes.fix_shapes import with_sizes
 from me2e_compress.passes.freeze_inputs import advice
@@ -284,15 +284,18 @@ def compress(
         modules = load_map(options.module_map, loaded)
         seen = split_frames(source, loaded, frames, passes, options.measure_frames)
         start, provider = cpu_seconds(), options.runs_on
+        # the proof reads what the graphs answer as they are opened apart
+        checked, answers = options.verify_frames, Answers()
         first = partial(try_first, listener=listener, provider=provider)
+        first = partial(first, count=max(1, checked), answers=answers)
         shown: Frames | None = seen.calibration or seen.samples
-        if shown is None and options.verify_frames:
-            shown = seeded_frame(loaded, options.seed)
+        if shown is None and checked:
+            shown = seeded_frames(loaded, options.seed, checked)
         first(loaded, source.name, shown, file=source)
         # apply the passes, and refuse a result that is unproven or not int8
         context = Context(modules, seen.calibration, options.seed, provider)
-        checked = options.verify_frames
-        manager = PassManager(passes, checked, output.parent, seen.samples, first)
+        folder = output.parent
+        manager = PassManager(passes, checked, folder, seen.samples, first, answers)
         report = manager.run(loaded, context, partial(listener.on_progress, "passes"))
         int8 = Int8Outcome.of(report, context)
         _check_int8(report, int8, options, listener)
@@ -302,7 +305,11 @@ def compress(
         loss = measure_loss(report, provider, seen, Floor(options.floor), listener)
         linted = lint_written(report.model, passes, output, options.target)
         seconds = cpu_seconds() - start
-        made = _write(report, source, output, int8, loss, seconds, linted, shaped)
+        sizes = file_bytes(source), 0
+        made = CompressResult(
+            source, output, report, {}, *sizes, int8, loss, seconds, linted
+        )
+        made = _write(made, shaped=shaped)
         placed = () if int8 is None or int8.slow_here else report.lossy
         if shown is None or provider.native != CPU.native or not placed:
             return made
@@ -338,20 +345,12 @@ def sidecar(output: Path, what: str) -> Path:
     return output.with_name(f"{output.stem}.{what}.json")
 
 
-def _write(
-    report: Report,
-    source: Path,
-    output: Path,
-    int8: Int8Outcome | None,
-    loss: MeasuredLoss | None,
-    seconds: float,
-    linted: LintResult | None,
-    shaped: bool,
-) -> CompressResult:
+def _write(result: CompressResult, *, shaped: bool) -> CompressResult:
     """Write the graph and its plan, then the report, which vouches for both.
 
     Only a graph whose source has them (``shaped``) gets shapes that can be inferred.
     """
+    report, source, output = result.report, result.source, result.output
     model = with_own_domains(report.model)
     model = model if shaped else without_inferable_shapes(model)
     plan = plan_of(report.model)  # before writing: metadata may be malformed
@@ -359,11 +358,8 @@ def _write(
         graph.save(model, output)
         if plan is not None:
             save_plan(plan, sidecar(output, "plan"))
-        sizes = graph.file_bytes(source), graph.file_bytes(output)
-        grown = size_note(source, output)
-        result = CompressResult(
-            source, output, report, {}, *sizes, int8, loss, seconds, linted, grown
-        )
+        size, larger = file_bytes(output), size_note(source, output)
+        result = dataclasses.replace(result, output_bytes=size, larger=larger)
         record = report.record(source, output) | result.findings()
         write_document(sidecar(output, "report"), record, indent=2)
     return dataclasses.replace(result, record=record)

@@ -25,9 +25,10 @@ from me2e_compress.manager.equivalence import TryFirst
 from me2e_compress.manager.recipe import to_text
 from me2e_compress.manager.report import LossyPass, Report, Step, Verification
 from me2e_compress.manager.verification_inputs import (
+    Answers,
     VerificationInputs,
     resize_as,
-    seeded_frame,
+    seeded_frames,
 )
 from me2e_compress.passes.base import Context, Pass
 from me2e_compress.passes.import_normalize import ImportNormalize, needs_import
@@ -52,6 +53,7 @@ class PassManager:
             none; None makes seeded inputs up then.
         try_first: called with a graph, its name and frames before it is run on them;
             may refuse it.
+        answers: what graphs answered on frames, which others know or may ask.
     """
 
     passes: tuple[Pass, ...]
@@ -59,6 +61,7 @@ class PassManager:
     reproducers: Path | None = None
     samples: CalibrationSet | None = None
     try_first: TryFirst | None = None
+    answers: Answers = dataclasses.field(default_factory=dict, compare=False)
 
     def run(
         self, model: ir.Model, context: Context, progress: Progress | None = None
@@ -189,8 +192,9 @@ class _Run:
         # what onnxruntime dies of is refused here, not merely unproven
         if self.manager.try_first is not None:
             what = f"the graph after {stretch[-1][0].name}"
-            seeded = seeded_frame(model, self.context.seed)
-            self.manager.try_first(model, what, self._frames() or seeded)
+            seed, count = self.context.seed, self.manager.verify_frames
+            shown = self._frames() or seeded_frames(model, seed, count)
+            self.manager.try_first(model, what, shown)
         check, runnable, inputs = self._compare(stretch, model)
         self.verifications.append(check)
         if check.passed or inputs is None:
@@ -220,6 +224,7 @@ class _Run:
                 inputs = VerificationInputs.of(
                     before, frames, context.seed, count, context.provider
                 )
+                inputs = dataclasses.replace(inputs, answers=self.manager.answers)
                 check = equivalence.verify(names, before, model, inputs)
             except (GraphError, PreconditionError) as error:
                 reason = reason or str(error)

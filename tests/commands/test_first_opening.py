@@ -3,6 +3,7 @@
 import gc
 import subprocess
 import weakref
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -19,6 +20,7 @@ from me2e_compress.commands.compress import compress
 from me2e_compress.graph.modules.module_map import ModuleMap
 from me2e_compress.manager import PassManager
 from me2e_compress.manager.recipe import parse
+from me2e_compress.manager.verification_inputs import Answers, VerificationInputs
 from me2e_compress.passes import Context
 from me2e_compress.runtime.children import run_script
 from me2e_compress.runtime.frames import Array, Frame
@@ -127,6 +129,52 @@ def test_seeded_inputs_are_run_apart_too(opened: Path, tmp_path: Path) -> None:
     )
     with pytest.raises(GraphError, match=r"import-normalize: onnxruntime dies of it"):
         manager.run(graph.load(model), Context(ModuleMap.whole()))
+
+
+SUM = """<ir_version: 8, opset_import: ["" : 17]>
+    sum (float[1] x, float[1] prev_s) => (float[1] y, float[1] next_s)
+    <float one = {1.0}> { next_s = Add(x, prev_s) z = Abs(x) y = Mul(z, next_s) }"""
+
+
+def answers_apart(text: str) -> tuple[ir.Model, list[Frame], Answers]:
+    """What a graph answered apart to at most three of frames in two scenes."""
+    arrays = ({"x": np.array([value], np.float32)} for value in range(1, 5))
+    frames = [Frame(at, at in (0, 2), dict(each)) for at, each in enumerate(arrays)]
+    model, known = ir.from_onnx_text(text), Answers()
+    try_first(model, "m", frames, listener=SILENT, count=3, answers=known)
+    return model, frames, known
+
+
+@pytest.mark.usefixtures("opened")
+def test_a_proof_runs_no_graph_on_frames_that_it_answered_apart(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A state goes on from frame to frame; nothing is known of the second scene."""
+    model, frames, known = answers_apart(SUM)
+    others = [frames[0], replace(frames[1], arrays={"x": np.ones(1, np.float32)})]
+    scenes = [frames[0], replace(frames[1], starts_scene=True)]
+    for shown, sums in ((frames, [1, 6, 9, 28]), (others, [1, 2]), (scenes, [1, 4])):
+        inputs = VerificationInputs(shown, "recorded", answers=known)
+        assert [each["y"].item() for each in inputs.run(model)] == sums
+    monkeypatch.delattr("me2e_compress.manager.verification_inputs.Session")
+    inputs = VerificationInputs(frames[:2], "recorded", answers=known)
+    assert [each["y"].item() for each in inputs.run(model)] == [1, 6]
+    with pytest.raises(NameError):
+        next(iter(inputs.run(model, optimize=False)))
+
+
+@pytest.mark.usefixtures("opened")
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ("z = Abs(x)", "z = RandomNormalLike(x)"),
+        ("z = Abs(x)", "q = QuantizeLinear(x, one) z = DequantizeLinear(q, one)"),
+        ("(float[1] y", "(float[] y"),
+    ],
+)
+def test_what_a_session_may_answer_otherwise_is_not_kept(old: str, new: str) -> None:
+    """Random numbers, int8, and a state that only a session may know."""
+    assert not answers_apart(SUM.replace(old, new))[2]
 
 
 HALF = """<ir_version: 10, opset_import: ["" : 23]>
