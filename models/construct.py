@@ -2,6 +2,7 @@
 
 from typing import TYPE_CHECKING, Any, cast
 
+from models.lead.config import CONFIGS as LEAD_CONFIGS
 from models.stacks import TCP, Stack
 from models.synthetic_frames import frames
 from models.uniad.config import CONFIGS
@@ -27,6 +28,10 @@ def construct(
 
         (heads,) = spec.heads
         model = Tcp(cast("ActionHeads", heads))
+    elif spec.name in LEAD_CONFIGS:
+        from models.lead.stack import TransfuserV6
+
+        model = TransfuserV6(LEAD_CONFIGS[spec.name])
     elif spec.name in CONFIGS:
         from models.uniad.stack import UniadTiny
 
@@ -43,13 +48,19 @@ def draw(spec: Stack, sampling: "Sampling", seed: int) -> "nn.Module":
     """Build a module with weights of a seed; the same seed gives the same bytes."""
     import torch
 
-    from models.drawing import rendered
+    from models.drawing import rendered, rendered_inputs
 
-    model: Any = construct(spec, sampling, trained=False)  # one of three classes
+    model: Any = construct(spec, sampling, trained=False)  # one of four classes
     if spec.name == TCP.name:
         from models.tcp import stack as tcp
 
         tcp.initialise(model, rendered(spec, seed), seed)
+    elif spec.name in LEAD_CONFIGS:
+        from models.lead import stack as lead
+
+        names = "rgb", "rasterized_lidar"
+        images, rasters = rendered_inputs(spec, names, seed, stride=1)
+        lead.initialise(model, images, rasters, seed)
     elif spec.name in CONFIGS:
         from models.uniad import initialise as uniad
 

@@ -14,6 +14,7 @@ import re
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -44,10 +45,12 @@ class Gains:
         by_name: standard deviation of an output for a unit input, by a pattern of the
             name: the first match counts; 1.4 (ReLU, He et al. 2015) if none matches.
         last_norm: pattern of the normalisations that end a residual block.
+        embeddings: pattern of the parameters that are drawn as embeddings are.
     """
 
     by_name: Sequence[tuple[str, float]]
     last_norm: str
+    embeddings: str = "_embeds"
 
     def of(self, name: str) -> float:
         """Return the gain of a parameter."""
@@ -79,7 +82,7 @@ def _drawn(
         if name.endswith("bias"):
             return noise
         return (1 + noise) * (RESIDUAL_SCALE if re.search(gains.last_norm, name) else 1)
-    if isinstance(owner, nn.Embedding) or "_embeds" in name:
+    if isinstance(owner, nn.Embedding) or re.search(gains.embeddings, name):
         return noise * EMBEDDING_STD
     if name.endswith("sampling_offsets.bias"):
         return _spread(parameter) + noise * BIAS_STD
@@ -111,13 +114,13 @@ def _spread(bias: Tensor) -> Tensor:
     return (directions[:, None] * steps[:, None]).flatten()
 
 
-def take_statistics(backbone: nn.Module, images: Tensor) -> Tensor:
-    """Set batch normalisations to statistics of images; return the features."""
+def take_statistics(backbone: nn.Module, *inputs: Tensor) -> Any:
+    """Set batch normalisations to statistics of inputs; return what it answers."""
     norms = [each for each in backbone.modules() if isinstance(each, nn.BatchNorm2d)]
     for norm in norms:
         norm.train()
         norm.momentum = 1.0
-    features: Tensor = backbone(images)
+    features = backbone(*inputs)
     for norm in norms:
         norm.eval()
         norm.momentum = 0.1
@@ -153,9 +156,20 @@ def _normalised(module: nn.Module, x: Tensor) -> Tensor:
 
 def rendered(spec: Stack, seed: int, stride: int = CALIBRATION_STRIDE) -> Tensor:
     """Return images of several scenes, [N, 3, H, W], with every ``stride``-th pixel."""
-    made = frames(spec, CALIBRATION_FRAMES, seed, scene_length=1)
-    images = [torch.from_numpy(frame["img"])[..., ::stride, ::stride] for frame in made]
-    return torch.cat([each.reshape(-1, *each.shape[-3:]) for each in images])
+    (images,) = rendered_inputs(spec, (spec.image_input,), seed, stride)
+    return images
+
+
+def rendered_inputs(
+    spec: Stack, names: Sequence[str], seed: int, stride: int = CALIBRATION_STRIDE
+) -> list[Tensor]:
+    """Return inputs that are maps of several scenes; see `rendered`."""
+    made = list(frames(spec, CALIBRATION_FRAMES, seed, scene_length=1))
+    maps = (
+        [torch.from_numpy(frame[name])[..., ::stride, ::stride] for frame in made]
+        for name in names
+    )
+    return [torch.cat([x.reshape(-1, *x.shape[-3:]) for x in each]) for each in maps]
 
 
 @contextmanager

@@ -32,7 +32,7 @@ from me2e_compress.shipped.drivers import write_model_file
 from models.construct import construct, draw
 from models.dialect import in_dialect
 from models.published_weights import PublishedWeights, published_weights
-from models.stacks import STACKS, TCP, Stack, find
+from models.stacks import STACKS, Stack, find
 
 if TYPE_CHECKING:
     from torch import Tensor, nn
@@ -88,9 +88,10 @@ def export(
     """
     # Refuse what no exporter can write
     spec = find(stack).with_heads(heads)
-    if opset not in OPSETS:
+    least = max(OPSETS[0], spec.least_opset)
+    if opset not in OPSETS[least - OPSETS[0] :]:
         raise GraphError(
-            f"cannot export {stack} at opset {opset}: {OPSETS[0]} to {OPSETS[-1]} work"
+            f"cannot export {stack} at opset {opset}: {least} to {OPSETS[-1]} work"
         )
     if fused and opset == DYNAMO_OPSET:
         raise GraphError(
@@ -129,7 +130,7 @@ def build(
             attention.
     """
     spec = find(stack).with_heads(heads)
-    if fused and spec.name == TCP.name:
+    if fused and spec.sees != "surround":
         raise GraphError(f"{stack} has no deformable attention: no plugin fits it")
     # The opset decides how features are sampled
     native: Sampling = "operator" if opset >= GRID_SAMPLE_OPSET else "gather"
@@ -145,7 +146,7 @@ def trace(spec: Stack, model: "nn.Module", opset: int) -> onnx.ModelProto:
     """Trace a module with example inputs and return the graph."""
     import torch
 
-    with _quiet_exporter(), torch.no_grad():
+    with _quiet_exporter(), _written_out(), torch.no_grad():
         write_graph = _by_dynamo if opset == DYNAMO_OPSET else _by_torchscript
         graph = write_graph(spec, model, opset)
     written = {entry.domain: entry.version for entry in graph.opset_import}
@@ -203,11 +204,28 @@ def example(spec: Stack) -> "tuple[Tensor, ...]":
 
 
 @contextmanager
+def _written_out() -> Iterator[None]:
+    """Keep torch's attention from its one operator for inference, which ONNX lacks."""
+    import torch
+
+    fast = torch.backends.mha.get_fastpath_enabled()
+    torch.backends.mha.set_fastpath_enabled(False)
+    try:
+        yield
+    finally:
+        torch.backends.mha.set_fastpath_enabled(fast)
+
+
+@contextmanager
 def _quiet_exporter() -> Iterator[None]:
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", "You are using the legacy TorchScript")
         warnings.filterwarnings("ignore", category=DeprecationWarning, module="torch")
         warnings.filterwarnings("ignore", ".*LeafSpec.* is deprecated")
+        # Sizes and widths, which are fixed
+        fixed = "Converting a tensor to a Python"
+        for module in (r"models\.lead", r"torch\.nn\.functional"):
+            warnings.filterwarnings("ignore", fixed, module=module)
         with _quiet_registry():
             yield
 

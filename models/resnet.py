@@ -56,9 +56,9 @@ class Block(nn.Module):
 class ResNet(nn.Module):
     """Maps images to the feature maps of all stages; each stage doubles ``width``."""
 
-    def __init__(self, width: int = STEM, *, bottleneck: bool) -> None:
+    def __init__(self, width: int = STEM, *, bottleneck: bool, inputs: int = 3) -> None:
         super().__init__()
-        self.conv1 = nn.Conv2d(3, width, 7, 2, 3, bias=False)
+        self.conv1 = nn.Conv2d(inputs, width, 7, 2, 3, bias=False)
         self.bn1 = nn.BatchNorm2d(width)
         self.relu = nn.ReLU()
         self.maxpool = nn.MaxPool2d(3, 2, 1)
@@ -75,9 +75,14 @@ class ResNet(nn.Module):
                 channels = self.channels[number - 1]
             self.add_module(f"layer{number}", stage)
 
+    def stem(self, images: Tensor) -> Tensor:
+        """Map [N, C, H, W] to [N, width, H / 4, W / 4]."""
+        out: Tensor = self.maxpool(self.relu(self.bn1(self.conv1(images))))
+        return out
+
     def stages(self, images: Tensor) -> list[Tensor]:
         """Map [N, 3, H, W] to C2, C3 and so on, of strides 4, 8 and so on."""
-        x = self.maxpool(self.relu(self.bn1(self.conv1(images))))
+        x = self.stem(images)
         maps: list[Tensor] = []
         for number in range(1, len(self.channels) + 1):
             x = self.get_submodule(f"layer{number}")(x)

@@ -7,6 +7,7 @@ from typing import Literal
 
 from me2e_compress.base.errors import GraphError
 from models.bev.sizes import CAMERAS, EMBED
+from models.lead import config as lead
 from models.uniad.config import CONFIGS, MEMORY, UniadConfig
 from models.vad.config import VadConfig
 
@@ -33,6 +34,9 @@ IMAGENET = ImageNorm(
 CAFFE = ImageNorm(mean=(103.53, 116.28, 123.675), std=(1.0, 1.0, 1.0), order="bgr")
 """The same means in the form of Caffe's networks."""
 
+GREY_LEVELS = ImageNorm(mean=(0.0, 0.0, 0.0), std=(1.0, 1.0, 1.0), order="rgb")
+"""Of a stack that normalises inside."""
+
 
 @dataclass(frozen=True)
 class Stack:
@@ -51,7 +55,10 @@ class Stack:
             row of the plan that is driven without a command.
         image: normalisation of the image input.
         dtypes: element type of the inputs that are not float32.
-        sees: the six cameras one by one, or three of them as one wide image.
+        sees: the six cameras one by one, or three of them as one wide image, or that
+            and a LiDAR.
+        image_input: name of the image input.
+        least_opset: the first that has all its operators.
         scale: relative to the cameras' 1600 x 900 images.
         straight_on: the command that follows the lane, for stacks with commands.
     """
@@ -66,7 +73,9 @@ class Stack:
     image: ImageNorm
     dtypes: Mapping[str, Literal["int64"]] = field(default_factory=dict)
     other_outputs: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
-    sees: Literal["surround", "strip"] = "surround"
+    sees: Literal["surround", "strip", "strip and lidar"] = "surround"
+    image_input: str = "img"
+    least_opset: int = 13
     plan_step_s: float | None = None
     scale: float = 0.4
     straight_on: int = 0
@@ -102,7 +111,7 @@ class Stack:
             plan["step_s"] = self.plan_step_s
         # Conventions of the image input
         image = {
-            "input": "img",
+            "input": self.image_input,
             "mean": self.image.mean,
             "std": self.image.std,
             "order": self.image.order,
@@ -204,6 +213,49 @@ TCP = Stack(
 """OpenDriveLab/TCP, whose control head gives Beta distributions, and Bench2DriveZoo,
 branch tcp/admlp, where it scores 39 actions. Outputs are named as there."""
 
+
+def lead_stack(name: str) -> Stack:
+    """Return the interface of TransFuser v6 at the size of that name."""
+    config = lead.CONFIGS[name]
+    return Stack(
+        name=name,
+        inputs={
+            "rgb": (1, 3, *config.image_hw),
+            "rasterized_lidar": (1, 1, *config.raster_hw),
+            "speed": (1,),
+            "command": (1, lead.COMMANDS),
+            **dict.fromkeys(lead.TARGET_POINTS, (1, 2)),
+        },
+        outputs=(
+            "pred_route",
+            "pred_future_waypoints",
+            "pred_target_speed_distribution",
+            "pred_target_speed_scalar",
+            "pred_semantic",
+            "pred_bev_semantic",
+            "center_heatmap_pred",
+            "wh_pred",
+            "offset_pred",
+            "yaw_class_pred",
+            "yaw_res_pred",
+            "velocity_pred",
+        ),
+        recurrent={},
+        plan="pred_future_waypoints",
+        plan_deltas=False,
+        heads={},
+        image=GREY_LEVELS,
+        sees="strip and lidar",
+        plan_step_s=lead.WAYPOINT_S,
+        image_input="rgb",
+        least_opset=14,
+    )
+
+
+LEAD, LEAD_TINY = (lead_stack(name) for name in lead.CONFIGS)
+"""autonomousvision/lead, TransFuser v6, and the same small, for tests; inputs and
+outputs are named as there. Attention of torch's own needs opset 14."""
+
 UNIAD_COUNTS = ("obj_idxes", "disappear_time", "save_period", "max_obj_id")
 UNIAD_OUTPUTS = (
     "all_cls_scores",
@@ -282,7 +334,8 @@ UNIAD_TRT = uniad_stack("uniad-trt", CONFIGS["uniad-trt"], 0.25, 2)
 """NVIDIA/DL4AGX, uniad-trt: the tiny model of its TensorRT export, for nuScenes."""
 
 STACKS: dict[str, Stack] = {
-    stack.name: stack for stack in (VAD_TINY, UNIAD_TINY, UNIAD_TRT, TCP)
+    stack.name: stack
+    for stack in (VAD_TINY, UNIAD_TINY, UNIAD_TRT, TCP, LEAD, LEAD_TINY)
 }
 """Those that are exported with weights of a seed or of a checkpoint."""
 

@@ -1,15 +1,17 @@
-"""Synthetic calibration frames: random scenes of a moving world, six cameras."""
+"""Synthetic calibration frames: random scenes of a moving world, as stacks see it."""
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
 
 from me2e_compress.base.errors import FramesError
+from models.lead.config import TARGET_POINTS
 from models.stacks import Stack
 from models.synthetic_cameras import LIDAR_HEIGHT_M, SCALE, render, rig
+from models.synthetic_lidar import raster
 from models.synthetic_world import (
     FRAME_S,
     EgoPose,
@@ -23,14 +25,16 @@ Frame = dict[str, NDArray[np.float32 | np.int64]]
 SENSOR_NOISE = 2.0
 """Standard deviation of pixel noise, in 1 / 255."""
 
-STRIP_HW = (256, 900)
-
 FRONT, FRONT_LEFT, FRONT_RIGHT = 0, 1, 2
 """Indices of cameras among the six."""
 
 CUTS = ((FRONT_LEFT, 0, 1400), (FRONT, 200, 1400), (FRONT_RIGHT, 200, 1600))
 """Camera, first and last column of 1600, from left to right (Bench2DriveZoo, branch
 tcp/admlp, team_code/tcp_b2d_agent.py): 4000 columns, before they are made 900."""
+
+SQUARES = ((FRONT_LEFT, 350, 1250), (FRONT, 350, 1250), (FRONT_RIGHT, 350, 1250))
+"""The middle of each: LEAD's cameras are square (autonomousvision/lead,
+config_base.py)."""
 
 TARGET_S = 4.0
 """How far ahead of the vehicle its target point is."""
@@ -67,6 +71,9 @@ def frames(
                 image = _normalise(spec, strip(seen)[None], noise)
                 yield {"img": image, "state": state, "target_point": target}
                 continue
+            if spec.sees == "strip and lidar":
+                yield _strip_and_lidar(spec, world, step, seen, noise)
+                continue
             known: Frame = {
                 "img": _normalise(spec, seen, noise)[None],
                 "lidar2img": lidar2img,
@@ -76,6 +83,33 @@ def frames(
             }
             wanted = spec.inputs.keys() - spec.recurrent.keys()
             yield {name: value for name, value in known.items() if name in wanted}
+
+
+def _strip_and_lidar(
+    spec: Stack,
+    world: SyntheticWorld,
+    step: int,
+    seen: NDArray[np.uint8],
+    noise: np.random.Generator,
+) -> Frame:
+    """Return what LEAD sees, and its route as three points."""
+    seconds = step * FRAME_S
+    now = world.ego(seconds)
+    wide = strip(seen, SQUARES, spec.inputs["rgb"][-2:])[None]
+    hw = spec.inputs["rasterized_lidar"][-2:]
+    # Where the vehicle is to be, was, and is to be after that
+    points: Frame = {}
+    for name, away in zip(TARGET_POINTS, (1, -1, 2), strict=True):
+        there = world.ego(seconds + away * TARGET_S)
+        right, ahead = now.to_lidar(there.x, there.y)
+        points[name] = np.array([[ahead, right]], np.float32)
+    return {
+        "rgb": _normalise(spec, wide, noise),
+        "rasterized_lidar": raster(now, world.boxes_at(seconds), hw, noise)[None, None],
+        "speed": np.array([world.speed_mps + world.accel_mps2 * seconds], np.float32),
+        "command": _follow_lane(),
+        **points,
+    }
 
 
 def _normalise(
@@ -89,7 +123,7 @@ def _normalise(
     std = np.array(spec.image.std, np.float32)
     if spec.image.order == "bgr":
         pixels = pixels[..., ::-1]
-    out = np.zeros((len(seen), 3, *spec.inputs["img"][-2:]), np.float32)
+    out = np.zeros((len(seen), 3, *spec.inputs[spec.image_input][-2:]), np.float32)
     height, width = seen.shape[1:3]
     out[:, :, :height, :width] = ((pixels - mean) / std).transpose(0, 3, 1, 2)
     return out
@@ -125,12 +159,16 @@ def _can_bus(world: SyntheticWorld, step: int) -> NDArray[np.float32]:
     return out
 
 
-def strip(seen: NDArray[np.uint8]) -> NDArray[np.float32]:
-    """Join three of six images: [6, 360, 640, 3] to [256, 900, 3] grey levels."""
-    parts = [seen[i, :, round(a * SCALE) : round(b * SCALE)] for i, a, b in CUTS]
+def strip(
+    seen: NDArray[np.uint8],
+    cuts: Sequence[tuple[int, int, int]] = CUTS,
+    hw: tuple[int, ...] = (256, 900),
+) -> NDArray[np.float32]:
+    """Join three of six images, [6, 360, 640, 3] to [h, w, 3] grey levels."""
+    parts = [seen[i, :, round(a * SCALE) : round(b * SCALE)] for i, a, b in cuts]
     wide = np.concatenate(parts, axis=1).astype(np.float32)
-    rows = interpolation(wide.shape[0], STRIP_HW[0])
-    columns = interpolation(wide.shape[1], STRIP_HW[1])
+    rows = interpolation(wide.shape[0], hw[0])
+    columns = interpolation(wide.shape[1], hw[1])
     shrunk: NDArray[np.float32] = np.einsum(
         "hr,rwc,vw->hvc", rows, wide, columns, optimize=True
     )
@@ -156,6 +194,10 @@ def route_state(
     right, ahead = now.to_lidar(there.x, there.y)
     target = np.array([[ahead, right]], np.float32)
     speed = world.speed_mps + world.accel_mps2 * step * FRAME_S
-    command = np.eye(COMMANDS, dtype=np.float32)[FOLLOW_LANE : FOLLOW_LANE + 1]
     first = np.array([[speed / SPEED_UNIT_MPS]], np.float32)
-    return np.concatenate([first, target, command], 1), target
+    return np.concatenate([first, target, _follow_lane()], 1), target
+
+
+def _follow_lane() -> NDArray[np.float32]:
+    """Return the command as TCP and LEAD take it, one-hot."""
+    return np.eye(COMMANDS, dtype=np.float32)[FOLLOW_LANE : FOLLOW_LANE + 1]

@@ -121,6 +121,7 @@ def test_metadata_says_what_the_file_is(graph: onnx.ModelProto) -> None:
         ("vad-tiny", 19, "opset 19: 13 to 18 work"),
         ("vad-huge", 17, "no stack 'vad-huge': there are vad-tiny"),
         ("highway", 17, "no stack 'highway'"),
+        ("lead-tiny", 13, "opset 13: 14 to 18 work"),
     ],
 )
 def test_what_no_exporter_writes_is_refused(
