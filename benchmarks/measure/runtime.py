@@ -1,22 +1,25 @@
 """A model on this CPU in every runtime at hand, in one interleaved run.
 
     python -m benchmarks.measure.runtime OUT [--peer-python PYTHON] [--rounds 5]
-        [--threads 2] [--frames 1] [--only "ours, int8;PyTorch, eager"]
-        [--freeze-inputs] [--with torch.compile] [--prepare]
-        [--stack vad-tiny|vad-tiny-original|uniad-tiny|tcp|deformable-detr]
+        [--threads 2] [--frames 8] [--only "ours, exact;OpenVINO, bfloat16"]
+        [--freeze-inputs] [--with torch.compile] [--prepare] [--stack NAME]
 
 One frame of a stack at its published size, recurrent state at zeros: a process a row,
 in turn, round by round, so that whatever else runs on the machine falls on all rows.
 The table gives least and median CPU time of all runs and of all threads together, the
-clock, the largest resident set, the least SQNR over the outputs and that of the plan
-(against onnxruntime on the file as exported), and the share of what the processor
-could do: the time that the file's MACs take at the rate of onnxruntime's own products
-of 2,048 x 2,048 (float32, and uint8 by int8 for what is int8) over the time they took.
+clock, the largest resident set, what its file took to be made (CPU s), and the share of
+what the processor could do: the time that the file's MACs take at the rate of
+onnxruntime's own products of 2,048 x 2,048 (float32, and uint8 by int8 for what is
+int8) over the time they took. Its SQNR, and that of a second table, output by output,
+is of all held-out frames together, against onnxruntime on the file as exported; an
+output of whole numbers has none.
 
-OpenVINO runs in PYTHON, which needs ``openvino`` and numpy; int8 there is the file of
-onnxruntime.quantization. A runtime that is missing or refuses a file is named below
-the table. Files stay in OUT and are not made again; ``--prepare`` writes them, and
-measures nothing.
+OpenVINO and NNCF run in PYTHON; without that option the command makes a virtual
+environment of pinned versions in OUT (:mod:`benchmarks.tools.peer_environment`). NNCF
+quantizes the exported file, by its defaults and as a user of transformers would by hand
+(:mod:`benchmarks.tools.quantize_nncf`). A runtime that is missing or refuses a file is
+named below the tables. Files stay in OUT and are not made again; ``--prepare`` writes
+them, and measures nothing.
 
 The cameras' matrices are an input. With ``--freeze-inputs`` they are constants, for
 every file: others read the exported file after our passes ``freeze-inputs`` and
@@ -24,8 +27,8 @@ every file: others read the exported file after our passes ``freeze-inputs`` and
 that against the file as exported.
 
 ``vad-tiny-original`` is VAD-tiny as the published code writes it
-(:mod:`benchmarks.subjects.original_patterns`); ``deformable-detr`` needs transformers
-and has no PyTorch row.
+(:mod:`benchmarks.subjects.original_patterns`); ``deformable-detr`` needs transformers;
+it and ``highway``, the driver that ships, have no PyTorch row.
 """
 
 import argparse
@@ -49,13 +52,16 @@ from benchmarks.subjects.runtime_files import (
     PLANS,
     REFERENCE,
     TORCH,
+    WITHOUT_TORCH,
     Entry,
-    first_frame,
     made,
+    made_cpu_s,
     path_of,
     static,
+    whole_frames,
 )
 from benchmarks.subjects.subject import Subject
+from benchmarks.tools.peer_environment import peer_python, peer_versions
 from benchmarks.tools.processes import answer, in_turn
 from me2e_compress import graph
 from me2e_compress.manager.report import versions
@@ -75,17 +81,18 @@ class Row:
 
 
 def run(
-    subject: Subject, entry: Entry, given: argparse.Namespace
+    subject: Subject, entry: Entry, given: argparse.Namespace, *, answers: bool
 ) -> dict[str, Any] | str:
-    """Run an entry in a process of its own; return why it did not, if so."""
-    peer = entry.engine.startswith("openvino")
-    python = str(given.peer_python if peer else sys.executable)
+    """Run an entry in a process of its own; return why it did not, if so.
+
+    ``answers`` keeps what it answers to all frames.
+    """
+    python = str(given.peer_python if entry.peer else sys.executable)
     stack = entry.engine in TORCH
     target = subject.name if stack else str(path_of(subject, entry))
-    out = answers_of(subject, entry)
-    command = [python, "-W", "ignore", *(() if peer else ("-m",))]
-    command += ["benchmarks/tools/run_one.py" if peer else "benchmarks.tools.run_one"]
-    command += [entry.engine, target, str(first_frame(subject)), str(out)]
+    command = [python, "-W", "ignore", "-m", "benchmarks.tools.run_one"]
+    command += [entry.engine, target, str(whole_frames(subject))]
+    command += ["--out", str(answers_of(subject, entry))] if answers else []
     command += ["--threads", str(given.threads), "--runs", str(given.runs)]
     return answer(command)
 
@@ -106,7 +113,7 @@ def measured(
             if name in failed:
                 continue
             print(f"  round {turn + 1}: {name}", file=sys.stderr, flush=True)
-            found = run(subject, entry, given)
+            found = run(subject, entry, given, answers=not turn)
             if isinstance(found, str):
                 failed[name] = found
                 continue
@@ -124,7 +131,9 @@ def fidelity(subject: Subject, entry: Entry, expected: Entry) -> dict[str, float
         np.load(answers_of(subject, entry)) as other,
     ):
         return {
-            output: sqnr_db(reference[output], other[output]) for output in reference
+            output: sqnr_db(array, other[output])
+            for output, array in reference.items()
+            if np.issubdtype(array.dtype, np.floating)
         }
 
 
@@ -177,29 +186,48 @@ def shares(
         yield name, (every - int8) / rates["float32"] + int8 / rates["int8"]
 
 
-def table(rows: dict[str, Row], floor: Mapping[str, float], plan: str) -> str:
+def table(
+    rows: dict[str, Row],
+    floor: Mapping[str, float],
+    made_s: Mapping[str, float],
+    plan: str,
+) -> str:
     """Write the table.
 
     Args:
-        rows: what was measured; the others are compared with the first.
+        rows: what was measured; the others are compared with the reference, or with
+            the first where that did not run.
         floor: least CPU seconds that the MACs of a row take, where they are known.
+        made_s: CPU seconds that the file of a row took, where it was made.
         plan: the output that is the plan; empty if there is none.
     """
-    eager = min(next(iter(rows.values())).cpu_s)
+    first = min(rows.get(REFERENCE, next(iter(rows.values()))).cpu_s)
     lines = [
-        "| | CPU s, least | median | x first row | wall s, least | peak MB"
-        " | worst SQNR, dB | plan, dB | share of peak |",
-        "|---|---:|---:|---:|---:|---:|---:|---:|---:|",
+        "| | CPU s, least | median | of float's | wall s, least | peak MB | made, CPU s"
+        " | SQNR dB, least | mean | plan | share of peak |",
+        "|---|---:|---:|---:|---:|---:|---:|---:|---:|---:|---:|",
     ]
     for name, row in rows.items():
         least, found = min(row.cpu_s), row.sqnr_db
         share = f"{floor[name] / least:.0%}" if name in floor else "-"
         at_plan = f"{found[plan]:.1f}" if plan else "-"
+        mean = statistics.fmean(found.values())
         lines.append(
-            f"| {name} | {least:.2f} | {statistics.median(row.cpu_s):.2f}"
-            f" | {eager / least:.2f} | {min(row.wall_s):.2f} | {row.peak_mb:.0f}"
-            f" | {min(found.values()):.1f} | {at_plan} | {share} |"
+            f"| {name} | {least:.4f} | {statistics.median(row.cpu_s):.4f}"
+            f" | {least / first:.2f} | {min(row.wall_s):.4f} | {row.peak_mb:.0f}"
+            f" | {made_s.get(name, '-')} | {min(found.values()):.1f} | {mean:.1f}"
+            f" | {at_plan} | {share} |"
         )
+    return "\n".join(lines)
+
+
+def outputs_table(rows: dict[str, Row]) -> str:
+    """Write the SQNR of every output, dB."""
+    outputs = list(next(iter(rows.values())).sqnr_db)
+    lines = ["| | " + " | ".join(outputs) + " |", "|---|" + "---:|" * len(outputs)]
+    for name, row in rows.items():
+        cells = (f"{row.sqnr_db[output]:.1f}" for output in outputs)
+        lines.append(f"| {name} | {' | '.join(cells)} |")
     return "\n".join(lines)
 
 
@@ -207,11 +235,11 @@ def parser() -> argparse.ArgumentParser:
     """Return what reads the command line."""
     found = argparse.ArgumentParser(description=__doc__)
     found.add_argument("out", type=Path)
-    found.add_argument("--peer-python", type=Path, default=Path(sys.executable))
+    found.add_argument("--peer-python", type=Path, help="has openvino, nncf, numpy")
     found.add_argument("--rounds", type=int, default=5)
     found.add_argument("--runs", type=int, default=2)
     found.add_argument("--threads", type=int, default=2)
-    found.add_argument("--frames", type=int, default=1)
+    found.add_argument("--frames", type=int, default=8, help="to calibrate on")
     found.add_argument("--only", default="", help="rows, joined by ;")
     found.add_argument("--freeze-inputs", action="store_true")
     found.add_argument(
@@ -226,9 +254,12 @@ def main() -> None:
     given = parser().parse_args()
     subject = subjects.make(given.stack, given.out, given.frames)
     entries = chosen(given)
+    peers = any(entry.peer for entry in entries.values())
+    if peers and given.peer_python is None:
+        given.peer_python = peer_python(given.out / "peer-python")
     failed: dict[str, str] = {}
     for name, entry in entries.items():
-        if (reason := made(subject, entry, given.frames)) is not None:
+        if reason := made(subject, entry, given.frames, given.peer_python):
             failed[name] = reason
     if not given.prepare:
         there = {name: each for name, each in entries.items() if name not in failed}
@@ -242,6 +273,8 @@ def chosen(given: argparse.Namespace) -> dict[str, Entry]:
     wanted = [each.strip() for each in given.only.split(";")] if given.only else []
     left_out = set(OPTIONAL.values()) - {OPTIONAL[each] for each in given.optional}
     entries = static(ENTRIES) if given.freeze_inputs else ENTRIES
+    if given.stack in WITHOUT_TORCH:
+        left_out |= {name for name, entry in entries.items() if entry.engine in TORCH}
     return {
         name: entry
         for name, entry in entries.items()
@@ -257,15 +290,22 @@ def show(
     # Where onnxruntime refuses what was exported, ours after the exact passes
     expected = ENTRIES["ours, exact" if REFERENCE in refused else REFERENCE]
     if not answers_of(subject, expected).is_file():
-        run(subject, expected, given)
+        run(subject, expected, given, answers=True)
     for name, row in rows.items():
         row.sqnr_db = fidelity(subject, entries[name], expected)
     rates = peaks()
+    peers = peer_versions(given.peer_python) if given.peer_python else ""
     print(
-        f"{processor()}, {given.threads} threads, {given.rounds} rounds; {versions()}"
+        f"{processor()}, {given.threads} threads, {given.rounds} rounds; {versions()};"
+        f" peers: {peers or 'none'}"
     )
     print(", ".join(f"{k}: {v / 1e9:.0f} GMAC/CPU s" for k, v in rates.items()) + "\n")
-    print(table(rows, dict(shares(subject, entries, rates)), PLANS[subject.name]))
+    seconds = made_cpu_s(subject)
+    files = {name: path_of(subject, entries[name]).name for name in rows}
+    made_s = {name: seconds[file] for name, file in files.items() if file in seconds}
+    floor = dict(shares(subject, entries, rates))
+    print(table(rows, floor, made_s, PLANS[subject.name]) + "\n")
+    print(outputs_table(rows))
     return refused
 
 

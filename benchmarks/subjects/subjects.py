@@ -4,7 +4,7 @@
 * ``bev-head``: see :mod:`benchmarks.subjects.bev_head`.
 * ``vad-tiny``: the reference stack.
 * ``vad-tiny-original``: the same, see :mod:`benchmarks.subjects.original_patterns`.
-* ``uniad-tiny``, ``tcp``: other stacks of models/.
+* ``uniad-tiny``, ``tcp``, ``lead``: other stacks of models/.
 * ``tcp-original``: with all eight outputs, see :mod:`benchmarks.subjects.original_tcp`.
 * ``highway``: the driver that ships; its frames need the extra ``highway``.
 * the models of :mod:`benchmarks.subjects.model_kinds`, which need transformers.
@@ -42,7 +42,9 @@ PRESETS = {
     "highway": "highway",
 }
 """Module maps of the stacks of models/."""
-SUBJECTS = ("resnet50", "bev-head", *PRESETS)
+WITHOUT_PRESET = ("lead",)
+"""Stacks of models/ that are one module."""
+SUBJECTS = ("resnet50", "bev-head", *PRESETS, *WITHOUT_PRESET)
 WHOLE = """
 [modules.network]
 role = "feature"
@@ -107,6 +109,9 @@ def _export(subject: Subject) -> None:
             write_source(subject.name, subject.source)
         preset = f"modules/presets/{PRESETS[subject.name]}.toml"
         text = (Path(graph.__file__).parent / preset).read_text("utf-8")
+    elif subject.name in WITHOUT_PRESET:
+        write_source(subject.name, subject.source)
+        text = WHOLE
     else:
         maker = {"resnet50": resnet50, "bev-head": bev_head}[subject.name]
         maker.export(subject.source)
@@ -117,7 +122,7 @@ def _export(subject: Subject) -> None:
 
 
 def _record(name: str, folder: Path, count: int, seed: int) -> None:
-    if name in PRESETS:
+    if name in (*PRESETS, *WITHOUT_PRESET):
         stack = ORIGINALS[name].OF if name in ORIGINALS else name
         write_frames(stack, folder, count, seed)
     elif name == "bev-head":
