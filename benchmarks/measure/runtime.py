@@ -4,15 +4,17 @@
         [--threads 2] [--frames 8] [--only "ours, exact;OpenVINO, bfloat16"]
         [--freeze-inputs] [--with torch.compile] [--prepare] [--stack NAME]
 
-One frame of a stack at its published size, recurrent state at zeros: a process a row,
-in turn, round by round, so that whatever else runs on the machine falls on all rows.
-The table gives least and median CPU time of all runs and of all threads together, the
-clock, the largest resident set, what its file took to be made (CPU s), and the share of
-what the processor could do: the time that the file's MACs take at the rate of
-onnxruntime's own products of 2,048 x 2,048 (float32, and uint8 by int8 for what is
-int8) over the time they took. Its SQNR, and that of a second table, output by output,
-is of all held-out frames together, against onnxruntime on the file as exported; an
-output of whole numbers has none.
+One frame of a stack at its published size, recurrent state at zeros, is timed: a
+process a row, in turn, round by round, so that whatever else runs on the machine falls
+on all rows. The table gives least and median CPU time of all runs and of all threads
+together, the clock, the largest resident set, what its file took to be made (CPU s),
+and the share of what the processor could do: the time that the file's MACs take at the
+rate of onnxruntime's own products of 2,048 x 2,048 (float32, and uint8 by int8 for what
+is int8) over the time they took. Its SQNR, and that of a second table, output by
+output, is of all held-out frames together, each with the state that the exported file
+gave, against onnxruntime on that file; an output of whole numbers has none, and the
+mean is of outputs that differ. Beside the plan's stands how far it moves at most, in
+its unit.
 
 OpenVINO and NNCF run in PYTHON; without that option the command makes a virtual
 environment of pinned versions in OUT (:mod:`benchmarks.tools.peer_environment`). NNCF
@@ -78,6 +80,7 @@ class Row:
     wall_s: list[float] = dataclasses.field(default_factory=list)
     peak_mb: float = 0.0
     sqnr_db: dict[str, float] = dataclasses.field(default_factory=dict)
+    plan_moves: float = math.nan
 
 
 def run(
@@ -124,17 +127,20 @@ def measured(
     return {name: row for name, row in rows.items() if name not in failed}, failed
 
 
-def fidelity(subject: Subject, entry: Entry, expected: Entry) -> dict[str, float]:
-    """Return the SQNR of every output against the file as exported, dB."""
+def judge(subject: Subject, row: Row, entry: Entry, expected: Entry) -> None:
+    """Set how far a row's outputs are from the file as exported."""
+    plan = PLANS[subject.name]
     with (
         np.load(answers_of(subject, expected)) as reference,
         np.load(answers_of(subject, entry)) as other,
     ):
-        return {
+        row.sqnr_db = {
             output: sqnr_db(array, other[output])
             for output, array in reference.items()
             if np.issubdtype(array.dtype, np.floating)
         }
+        if plan:
+            row.plan_moves = float(np.abs(reference[plan] - other[plan]).max())
 
 
 def sqnr_db(reference: Any, other: Any) -> float:
@@ -204,19 +210,20 @@ def table(
     first = min(rows.get(REFERENCE, next(iter(rows.values()))).cpu_s)
     lines = [
         "| | CPU s, least | median | of float's | wall s, least | peak MB | made, CPU s"
-        " | SQNR dB, least | mean | plan | share of peak |",
-        "|---|---:|---:|---:|---:|---:|---:|---:|---:|---:|---:|",
+        " | SQNR dB, least | mean | plan | plan moves | share of peak |",
+        "|---|---:|---:|---:|---:|---:|---:|---:|---:|---:|---:|---:|",
     ]
     for name, row in rows.items():
         least, found = min(row.cpu_s), row.sqnr_db
         share = f"{floor[name] / least:.0%}" if name in floor else "-"
         at_plan = f"{found[plan]:.1f}" if plan else "-"
-        mean = statistics.fmean(found.values())
+        finite = [db for db in found.values() if math.isfinite(db)]
+        mean = statistics.fmean(finite) if finite else math.inf
         lines.append(
             f"| {name} | {least:.4f} | {statistics.median(row.cpu_s):.4f}"
             f" | {least / first:.2f} | {min(row.wall_s):.4f} | {row.peak_mb:.0f}"
             f" | {made_s.get(name, '-')} | {min(found.values()):.1f} | {mean:.1f}"
-            f" | {at_plan} | {share} |"
+            f" | {at_plan} | {row.plan_moves:.3f} | {share} |"
         )
     return "\n".join(lines)
 
@@ -292,7 +299,7 @@ def show(
     if not answers_of(subject, expected).is_file():
         run(subject, expected, given, answers=True)
     for name, row in rows.items():
-        row.sqnr_db = fidelity(subject, entries[name], expected)
+        judge(subject, row, entries[name], expected)
     rates = peaks()
     peers = peer_versions(given.peer_python) if given.peer_python else ""
     print(

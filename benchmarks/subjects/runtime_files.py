@@ -9,6 +9,7 @@ import subprocess
 import sys
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -17,6 +18,8 @@ from benchmarks.subjects.subject import Subject
 from benchmarks.tools.processes import last_line
 from me2e_compress import graph
 from me2e_compress.manager import recipe
+from me2e_compress.runtime.frames import Array
+from me2e_compress.runtime.session import Session
 
 REFERENCE = "onnxruntime, as exported"
 TORCH = ("torch", "torch-compile")
@@ -228,18 +231,27 @@ def first_frame(subject: Subject) -> Path:
 
 
 def whole_frames(subject: Subject) -> Path:
-    """Write the frames that all run: recorded, their state at zeros."""
+    """Write the frames that all run: recorded, the first state at zeros.
+
+    Later ones have the state that the exported file answers, the same for all rows.
+    """
     folder = subject.folder / "measured"
     if folder.is_dir():
         return folder
-    inputs = graph.load(subject.source).graph.inputs
+    model = graph.load(subject.source)
+    fed_by = json.loads(model.metadata_props.get("me2e.recurrent", "{}"))
+    state: dict[str, Array] = {}
+    for value in model.graph.inputs:
+        shape = graph.static_shape(value) or ()
+        kind = np.float32 if value.dtype is None else value.dtype.numpy()
+        state[str(value.name)] = np.zeros(shape, kind)
+    session = Session(subject.source, release=True) if fed_by else None
     folder.mkdir()
-    for path in subject.held_out.glob("*.npz"):
+    for path in sorted(subject.held_out.glob("*.npz")):
         with np.load(path) as held:
-            arrays = dict(held)
-        for value in inputs:
-            shape = graph.static_shape(value) or ()
-            kind = np.float32 if value.dtype is None else value.dtype.numpy()
-            arrays.setdefault(str(value.name), np.zeros(shape, kind))
+            arrays: dict[str, Any] = state | dict(held)
         np.savez(folder / path.name, **arrays)
+        if session is not None:
+            outputs = session.run({name: arrays[name] for name in session.inputs})
+            state |= {name: outputs[output] for name, output in fed_by.items()}
     return folder

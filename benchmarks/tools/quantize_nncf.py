@@ -5,8 +5,8 @@
 
 By default it is ``nncf.quantize`` of the model and the frames alone. ``--by-hand`` is
 what its documentation tells users of transformers: that kind of model, asymmetric
-activations, and products of two activations, attention's and projections by cameras,
-named one by one and left out.
+activations, and products named one by one and left out: those of two activations, as in
+attention, and those over four numbers or fewer, which are coordinates.
 Prints one line of JSON: seconds of CPU, the largest resident set in MB, and how many
 products were left out.
 """
@@ -25,6 +25,9 @@ from benchmarks.tools.run_one import peak_mb
 PASSED_THROUGH = ("Convert", "Reshape", "Transpose", "Squeeze", "Unsqueeze")
 """What stands between weights and their product."""
 
+POINT = 4
+"""Numbers of a point in homogeneous coordinates."""
+
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
@@ -39,7 +42,7 @@ def main() -> None:
     files = sorted(given.folder.glob("*.npz"))[: given.frames]
     dataset = nncf.Dataset(files, lambda path: inputs(model, path))
     options: dict[str, Any] = {}
-    left_out = products_of_activations(model) if given.by_hand else []
+    left_out = delicate_products(model) if given.by_hand else []
     if given.by_hand:
         options = {
             "model_type": nncf.ModelType.TRANSFORMER,
@@ -66,14 +69,17 @@ def inputs(model: Any, path: Path) -> list[Any]:
     return arrays
 
 
-def products_of_activations(model: Any) -> list[str]:
-    """Name the products neither of whose sides is a weight."""
-    return [
-        node.get_friendly_name()
-        for node in model.get_ordered_ops()
-        if node.get_type_name() == "MatMul"
-        and not any(is_weight(node.input_value(side)) for side in (0, 1))
-    ]
+def delicate_products(model: Any) -> list[str]:
+    """Name the products neither of whose sides is a weight, and those of points."""
+    names = []
+    for node in model.get_ordered_ops():
+        if node.get_type_name() == "MatMul":
+            inner = -2 if node.get_attributes()["transpose_a"] else -1
+            length = node.input_value(0).get_partial_shape()[inner]
+            points = length.is_static and length.get_length() <= POINT
+            if points or not any(is_weight(node.input_value(i)) for i in (0, 1)):
+                names.append(node.get_friendly_name())
+    return names
 
 
 def is_weight(value: Any) -> bool:
