@@ -18,7 +18,7 @@ its unit.
 
 OpenVINO and NNCF run in PYTHON; without that option the command makes a virtual
 environment of pinned versions in OUT (:mod:`benchmarks.tools.peer_environment`). NNCF
-quantizes the exported file, by its defaults and as a user of transformers would by hand
+quantizes the exported file, by its defaults and as a user would by hand
 (:mod:`benchmarks.tools.quantize_nncf`). A runtime that is missing or refuses a file is
 named below the tables. Files stay in OUT and are not made again; ``--prepare`` writes
 them, and measures nothing.

@@ -4,9 +4,10 @@
         [--by-hand]
 
 By default it is ``nncf.quantize`` of the model and the frames alone. ``--by-hand`` is
-what its documentation tells users of transformers: that kind of model, asymmetric
-activations, and products named one by one and left out: those of two activations, as in
-attention, and those over four numbers or fewer, which are coordinates.
+what a user comes to: asymmetric activations (preset mixed), and products named one by
+one and left out: those of two activations, as in attention, and those over four numbers
+or fewer, which are coordinates. The model type transformer, which smooths activations
+into weights, is not: with it NNCF 3.4 moves the plan of the driver that ships by 998 m.
 Prints one line of JSON: seconds of CPU, the largest resident set in MB, and how many
 products were left out.
 """
@@ -45,7 +46,6 @@ def main() -> None:
     left_out = delicate_products(model) if given.by_hand else []
     if given.by_hand:
         options = {
-            "model_type": nncf.ModelType.TRANSFORMER,
             "preset": nncf.QuantizationPreset.MIXED,
             "ignored_scope": nncf.IgnoredScope(names=left_out),
         }
