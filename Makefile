@@ -61,7 +61,7 @@ $(VENV)/.demo: pyproject.toml constraints.txt | $(VENV)
 	touch $@
 
 $(VENV)/.test: pyproject.toml constraints.txt models/requirements.txt | $(VENV)
-	$(BIN)/python -m pip install -q -c constraints.txt -r models/requirements.txt -e '.[highway,fast,bench,ray,trt-check,test]'
+	$(BIN)/python -m pip install -q -c constraints.txt -r models/requirements.txt -e '.[highway,fast,bench,ray,openvino,trt-check,test]'
 	touch $@ $(VENV)/.demo
 
 $(VENV)/.docs: pyproject.toml constraints.txt | $(VENV)

@@ -11,6 +11,7 @@ MODULES = {
     "fast": ("numba", "llvmlite"),
     "ray": ("ray",),
     "bench": ("onnxslim",),
+    "openvino": ("openvino",),
     "trt-check": ("tensorrt_rtx",),
 }
 

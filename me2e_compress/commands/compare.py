@@ -56,7 +56,7 @@ class Comparison:
 
     fidelity: Fidelity
     liveness: Liveness | None  # None if it was not asked for
-    runtime: RuntimeLoss | None  # what onnxruntime's int8 answers otherwise, if any
+    runtime: RuntimeLoss | None  # what the runtime's int8 answers otherwise, if any
     # Of outputs that the metadata `me2e.sets` names and both graphs have
     agents: SetFidelity | None
 
@@ -198,7 +198,7 @@ def compare(
         sets = SetTally.of(left, right)
     except GraphError as error:
         raise GraphError(f"{paths[0]}: {error}") from error
-    # onnxruntime's int8, beside the nodes as they stand
+    # the runtime's int8, beside the nodes as they stand
     kernels, model = None, graphs[paths[1]].model
     if not options.as_it_stands and has_int8_kernels(model, provider):
         kernels = session(paths[1], stock=True)

@@ -169,7 +169,7 @@ def lint(
         findings = tuple(e for e in findings if e.rule != "kernel")
     # A graph that the rules refuse is not opened
     if not any(finding.severity == "error" for finding in findings):
-        if target.opens:
+        if target.runs_in == CPU.name:
             try_first(loaded, path.name, listener=listener, provider=provider)
         findings = worst_first((*findings, *target.read_back(loaded, provider)))
     build = check(loaded, options.sm) if options.trt_check else None
@@ -182,9 +182,9 @@ def with_target(model: ir.Model, options: LintOptions) -> LintOptions:
         plan = None if options.of_tensorrt else plan_of(model)
         written_for = "" if plan is None else plan.target
         options = dataclasses.replace(options, target=written_for or "tensorrt")
-    if options.runs_on != CPU and not _target_of(options).opens:
+    if options.runs_on != CPU and not _target_of(options).runs_in:
         raise RecipeError(
-            f"--provider is onnxruntime's: lint for {options.target} opens no session"
+            f"lint for {options.target} opens no session: --provider is of no use"
         )
     return options
 

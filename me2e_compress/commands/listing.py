@@ -152,6 +152,7 @@ def list_entries(kind: str | None = None) -> ListResult:
 
 _EXTRAS = (
     ("highway_env", "highway", "drive models in closed loop"),
+    ("openvino", "openvino", "run graphs in OpenVINO: --provider openvino"),
     ("tensorrt_rtx", "trt-check", "parse and build for TensorRT without a GPU"),
     ("onnxslim", "bench", "compare with onnxslim in the benchmarks"),
 )

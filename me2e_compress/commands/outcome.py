@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Self
@@ -27,7 +27,7 @@ from me2e_compress.passes.quantize_int8 import QuantizeInt8, Quantizer, quantize
 from me2e_compress.quantization.decision import FLOAT, QuantPlan, plan_of
 from me2e_compress.runtime.frames import Frames
 from me2e_compress.runtime.latency_trace import cpu_seconds
-from me2e_compress.runtime.providers import CPU, Provider
+from me2e_compress.runtime.providers import CPU, PROVIDERS, Provider
 from me2e_compress.runtime.session import Session
 from me2e_compress.shipped.drivers import frames_of
 from me2e_compress.targets import TARGETS
@@ -71,10 +71,16 @@ def float_bytes(model: ir.Model, plan: QuantPlan) -> dict[str, int]:
 
 LEAST_SHOWN = 10_000
 """Bytes of float weights from which on a rule is named."""
-_FOR_TENSORRT = (
-    "it is quantized in TensorRT's form, slow in onnxruntime's CPU: --target"
-    " onnxruntime writes what is fast here"
-)
+_SLOW_HERE = {
+    "tensorrt": (
+        "it is quantized in TensorRT's form, slow in onnxruntime's CPU: --target"
+        " onnxruntime writes what is fast here"
+    ),
+    "openvino": (
+        "it is quantized for OpenVINO, slow in onnxruntime's CPU: run it by --provider"
+        " openvino"
+    ),
+}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -118,14 +124,14 @@ class Int8Outcome:
         left = [each for each in layers if each.output not in placed]
         why = {each.output: f"target: {each.reason}" for each in plan.kept_float}
         kept = Counter(why.get(e.output, f"{e.rule}: {e.reason}") for e in left)
-        slow = plan.target == "tensorrt" and context.provider.native == CPU.native
+        slow = changes and context.provider.native == CPU.native
         return cls(
             name,
             changes,
             len(layers),
             dict(kept.most_common()),
             float_bytes(quantizer.before, plan),
-            _FOR_TENSORRT if changes and slow else None,
+            _SLOW_HERE.get(plan.target) if slow else None,
         )
 
     @property
@@ -355,6 +361,21 @@ def measure_loss(
     return dataclasses.replace(loss, seconds=cpu_seconds() - start)
 
 
+def runner_of(passes: Iterable[Pass], provider: Provider) -> Provider | None:
+    """Return what runs the int8 that passes wrote; None where it is not here."""
+    names = [
+        "cpu" if isinstance(each, LowerInt8) else TARGETS.parse(each.target).runs_in
+        for each in passes
+        if isinstance(each, LowerInt8 | QuantizeInt8)
+    ]
+    if not any(names):
+        return None
+    runner = PROVIDERS.parse(names[-1])
+    if runner.native == CPU.native:
+        return provider
+    return runner if runner.is_installed() else None
+
+
 def _compare(
     loss: MeasuredLoss,
     report: Report,
@@ -367,15 +388,11 @@ def _compare(
     before, after = report.lossy[0].before, report.model
     open_session = partial(Session, release=True, provider=provider)
     reference, session = open_session(before), open_session(after)
-    # a graph that was written for onnxruntime is run by its int8 kernels, too
+    # a graph is run by the int8 kernels of the runtime that it was written for, too
     kernels = None
-    written = any(
-        isinstance(each, LowerInt8)
-        or (isinstance(each, QuantizeInt8) and TARGETS.parse(each.target).opens)
-        for each in passes
-    )
-    if written and has_int8_kernels(after, provider):
-        kernels = open_session(after, stock=True)
+    runner = runner_of(passes, provider)
+    if runner is not None and has_int8_kernels(after, runner):
+        kernels = Session(after, release=True, stock=True, provider=runner)
     sets = SetTally.of(reference, session)
     comparison = compare_sessions(reference, session, frames, after, kernels, sets)
     if seen is not None:

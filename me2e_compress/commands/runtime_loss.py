@@ -1,17 +1,16 @@
-"""What onnxruntime's own int8 kernels answer otherwise than an int8 graph says."""
+"""What a runtime's own int8 kernels answer otherwise than an int8 graph says."""
 
 import dataclasses
 from collections.abc import Iterable, Iterator, Mapping
 
 import onnx_ir as ir
 
-from me2e_compress import graph
 from me2e_compress.fidelity.compare import Fidelity, SetFidelity, SetTally, Tally
 from me2e_compress.runtime.frames import Array, Frame
 from me2e_compress.runtime.providers import CPU, Provider
 from me2e_compress.runtime.runnable import int8_entry
 from me2e_compress.runtime.session import Session, replay
-from me2e_compress.targets.onnxruntime.lint_rules import int8_rewrites
+from me2e_compress.targets import TARGETS
 from me2e_compress.targets.quantized import describe_quantized
 
 NOISIER_DB = 6.0
@@ -29,17 +28,19 @@ _NAMED = 5
 
 @dataclasses.dataclass(frozen=True)
 class RuntimeLoss:
-    """How onnxruntime's int8 kernels compute an int8 graph on this processor.
+    """How a runtime's int8 kernels compute an int8 graph on this processor.
 
     Attributes:
         sqnr_db: SQNR of the outputs that they answer otherwise than the nodes, dB.
         nodes_db: SQNR of the same outputs by the nodes as they stand, dB.
         causes: layers, and what is done to them; none where no rule knows.
+        engine: what runs it.
     """
 
     sqnr_db: Mapping[str, float]
     nodes_db: Mapping[str, float]
     causes: tuple[str, ...] = ()
+    engine: str = CPU.engine
 
     def lines(self) -> Iterator[str]:
         """Yield what the runtime answers otherwise, and why; nothing if it does not."""
@@ -49,7 +50,7 @@ class RuntimeLoss:
             f"{name} {value:z.1f} dB (its nodes {self.nodes_db[name]:z.1f})"
             for name, value in self.sqnr_db.items()
         )
-        yield f"onnxruntime's int8 answers otherwise than the file: {outputs}"
+        yield f"{self.engine}'s int8 answers otherwise than the file: {outputs}"
         more = len(self.causes) - _NAMED
         for cause in self.causes[:_NAMED]:
             yield f"the runtime's, not the file's: {cause}"
@@ -58,7 +59,7 @@ class RuntimeLoss:
 
 
 class RuntimeTally:
-    """Compares a graph, as onnxruntime's int8 runs it, with a reference.
+    """Compares a graph, as a runtime's int8 runs it, with a reference.
 
     Args:
         session: the graph, with int8 kernels.
@@ -69,7 +70,7 @@ class RuntimeTally:
     def __init__(
         self, session: Session, frames: Iterable[Frame], sets: SetTally | None = None
     ) -> None:
-        self._answers = replay(session, frames)
+        self._answers, self._provider = replay(session, frames), session.provider
         self._sets = None if sets is None else SetTally(sets.outputs)
         self._tallies: dict[str, Tally] = {}
 
@@ -102,18 +103,19 @@ class RuntimeTally:
         ]
         if not noisier:
             return RuntimeLoss({}, {})
-        shaped = model.clone()
-        graph.infer_shapes(shaped)
-        causes = [f"{each.node}: {each.message}" for each in int8_rewrites(shaped)]
-        if not causes and int8_entry()[1] == "1":
+        # the rules of its target know the causes
+        known = TARGETS.parse(self._provider.target).lint(model)
+        causes = [f"{e.node}: {e.message}" for e in known if e.severity == "wrong"]
+        if not causes and self._provider == CPU and int8_entry()[1] == "1":
             causes = [_OVERFLOW]
         return RuntimeLoss(
             {name: runs[name] for name in noisier},
             {name: nodes[name] for name in noisier},
             tuple(causes),
+            self._provider.engine,
         )
 
 
 def has_int8_kernels(model: ir.Model, provider: Provider) -> bool:
-    """Return whether onnxruntime would run a graph by int8 kernels of its own."""
-    return provider.target == CPU.target and describe_quantized(model) is not None
+    """Return whether a provider runs a graph by int8 kernels that can be left out."""
+    return provider.target != "tensorrt" and describe_quantized(model) is not None

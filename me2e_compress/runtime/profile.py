@@ -52,7 +52,7 @@ def machine_text(threads: int, provider: Provider = CPU) -> str:
     """Describe what measures: processor, threads, a provider other than the CPU."""
     runs = "" if provider == CPU else f", {PROVIDERS.text(provider)}"
     on = plural(threads, "thread") if threads else "all threads"
-    return f"{processor()}, onnxruntime on {on}{runs}"
+    return f"{processor()}, {provider.engine} on {on}{runs}"
 
 
 def check_counts(samples: int, warm_up: int, frames: Frames) -> None:

@@ -3,10 +3,11 @@
 import abc
 import dataclasses
 import importlib.util
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import ClassVar, Literal, TypeAlias
 
+import onnx_ir as ir
 import onnxruntime as ort
 from onnxruntime.capi import onnxruntime_pybind11_state as _native  # pyright: ignore[reportAttributeAccessIssue]
 from pydantic import GetCoreSchemaHandler
@@ -15,6 +16,8 @@ from pydantic_core import CoreSchema
 from me2e_compress.base.errors import ProviderError
 from me2e_compress.base.registry import Registry
 from me2e_compress.graph.files import file_contains
+from me2e_compress.graph.recurrence import SessionPort
+from me2e_compress.runtime.frames import Array
 
 # Providers in onnxruntime's form; each runs what those before it cannot
 Chain: TypeAlias = list[str | tuple[str, dict[str, str]]]
@@ -35,6 +38,28 @@ _LIBRARY_ERRORS = (_native.Fail, _native.RuntimeException, RuntimeError)
 _ENTRY_POINT = b"RegisterCustomOps"  # of every library of onnxruntime operators
 
 
+class Engine(abc.ABC):
+    """An open graph: its ports and metadata, and what runs it."""
+
+    inputs: Mapping[str, SessionPort]
+    outputs: Mapping[str, SessionPort]
+    metadata: Mapping[str, str]
+
+    @abc.abstractmethod
+    def run(self, names: Sequence[str], inputs: Mapping[str, Array]) -> list[Array]:
+        """Run one inference, of all inputs, and return the named outputs.
+
+        An input that does not fit is a FramesError, a node that fails a GraphError.
+        """
+
+    def free_after_runs(self) -> None:  # noqa: B027
+        """Free working memory after every run from now on, where it can be."""
+
+    def end_profile(self) -> Path:
+        """Write the profile of its nodes; return the file."""
+        raise ProviderError("times of nodes are measured in onnxruntime alone")
+
+
 @dataclasses.dataclass(frozen=True)
 class Provider(abc.ABC):
     """An execution provider; the fields are its options.
@@ -43,6 +68,7 @@ class Provider(abc.ABC):
         name: its name on the command line.
         native: its name in onnxruntime.
         advice: what to do where it is not installed.
+        engine: what runs it, as traces name it.
         left_out: optimizations that are disabled for it.
         target: the target whose int8 format it runs.
 
@@ -53,6 +79,7 @@ class Provider(abc.ABC):
     name: ClassVar[str]
     native: ClassVar[str]
     advice: ClassVar[str]
+    engine: ClassVar[str] = "onnxruntime"
     left_out: ClassVar[tuple[str, ...]] = WRONG_FUSIONS
     target: ClassVar[str] = "onnxruntime"
     plugins: tuple[Path, ...] = dataclasses.field(default=(), kw_only=True)
@@ -90,6 +117,12 @@ class Provider(abc.ABC):
             except _LIBRARY_ERRORS as error:
                 line = " ".join(str(error).split())
                 raise ProviderError(f"plugins library {library}: {line}") from error
+
+    def open(
+        self, model: ir.Model | Path, threads: int, *, int8_kernels: bool
+    ) -> Engine | None:
+        """Open a graph in an engine of its own; None where onnxruntime runs it."""
+        return None
 
     @abc.abstractmethod
     def chain(self) -> Chain | None:
@@ -255,6 +288,7 @@ PROVIDERS: Registry[Provider] = Registry(
     {
         "cpu": f"{_HERE}:CpuProvider",
         "cuda": f"{_HERE}:CudaProvider",
+        "openvino": "me2e_compress.runtime.openvino:OpenVinoProvider",
         "tensorrt": f"{_HERE}:TensorRtProvider",
         "tensorrt-rtx": f"{_HERE}:TensorRtRtxProvider",
     },

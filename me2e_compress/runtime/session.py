@@ -23,7 +23,7 @@ from me2e_compress.graph.nodes import NATIVE, is_read
 from me2e_compress.graph.recurrence import SessionPort, not_fed_back, recurrence
 from me2e_compress.runtime.frames import Array, Frame
 from me2e_compress.runtime.kernel_types import float32_hint, nodes_without_kernel
-from me2e_compress.runtime.providers import CPU, Provider
+from me2e_compress.runtime.providers import CPU, Engine, Provider
 from me2e_compress.runtime.runnable import (
     QDQ_OFF,
     int8_entry,
@@ -309,23 +309,15 @@ class Session:
         if profiled is not None:
             options.enable_profiling = True
             options.profile_file_prefix = str(profiled / "nodes")
-        self._each_run = ort.RunOptions()
-        if release:
-            self._each_run.add_run_config_entry(_SHRINK, "cpu:0")
         # Open the graph, and read its ports and metadata
         self.last_us = 0
-        self._lent: Weights = {}
+        engine = provider.open(model, threads, int8_kernels=stock or int8_kernels)
         without = () if stock else None
-        if isinstance(model, ir.Model):
-            self._ort, self._lent = open_graph(model, options, provider, without)
-        else:
-            self._ort, self._lent = open_file(model, options, provider, without)
-        try:
-            self.inputs = _ports(self._ort.get_inputs())
-            self.outputs = _ports(self._ort.get_outputs())
-            stored: dict[str, str] = self._ort.get_modelmeta().custom_metadata_map
-        except UnicodeDecodeError as error:
-            raise GraphError(f"a name in the graph is not UTF-8: {error}") from error
+        self._engine = engine or _OnnxRuntime(model, options, provider, without)
+        if release:
+            self._engine.free_after_runs()
+        self.inputs, self.outputs = self._engine.inputs, self._engine.outputs
+        stored = self._engine.metadata
         self.metadata = {**stored, **(metadata or {})}
         self.recurrent = recurrence(self.metadata, self.inputs, self.outputs)
 
@@ -366,22 +358,56 @@ class Session:
                 f"{reason}"
             )
         names = list(self.outputs) if outputs is None else list(outputs)
+        inputs = {name: feeds[name] for name in self.inputs}
+        outputs_by_name = dict(zip(names, self._engine.run(names, inputs), strict=True))
+        self.last_us = (time.perf_counter_ns() - begun_ns) // 1_000
+        return outputs_by_name
+
+    def end_profile(self) -> Path:
+        """Write the profile; return its file, which has one event a line."""
+        return self._engine.end_profile()
+
+
+class _OnnxRuntime(Engine):
+    """Runs a graph in onnxruntime."""
+
+    def __init__(
+        self,
+        model: ir.Model | Path,
+        options: ort.SessionOptions,
+        provider: Provider,
+        without: Sequence[str] | None,
+    ) -> None:
+        self._each_run, self._lent = ort.RunOptions(), dict[str, ort.OrtValue]()
+        if isinstance(model, ir.Model):
+            self._ort, lent = open_graph(model, options, provider, without)
+        else:
+            self._ort, lent = open_file(model, options, provider, without)
+        self._lent.update(lent)
+        try:
+            self.inputs = _ports(self._ort.get_inputs())
+            self.outputs = _ports(self._ort.get_outputs())
+            self.metadata = self._ort.get_modelmeta().custom_metadata_map
+        except UnicodeDecodeError as error:
+            raise GraphError(f"a name in the graph is not UTF-8: {error}") from error
+
+    def free_after_runs(self) -> None:
+        self._each_run.add_run_config_entry(_SHRINK, "cpu:0")
+
+    def run(self, names: Sequence[str], inputs: Mapping[str, Array]) -> list[Array]:
         # Inputs that do not fit are the caller's fault, others the graph's.
         try:
-            inputs = {name: feeds[name] for name in self.inputs}
-            values = cast("list[Array]", self._ort.run(names, inputs, self._each_run))
+            return cast(
+                "list[Array]", self._ort.run(names, dict(inputs), self._each_run)
+            )
         except InvalidArgument as error:
             raise FramesError(
                 f"these inputs do not fit: {_on_one_line(error)}"
             ) from error
         except REFUSALS as error:
             raise GraphError(f"onnxruntime failed: {_on_one_line(error)}") from error
-        outputs_by_name = dict(zip(names, values, strict=True))
-        self.last_us = (time.perf_counter_ns() - begun_ns) // 1_000
-        return outputs_by_name
 
     def end_profile(self) -> Path:
-        """Write the profile; return its file, which has one event a line."""
         return Path(self._ort.end_profiling())
 
 

@@ -195,12 +195,13 @@ class Target(abc.ABC):
         name: its name in recipes and on the command line.
         half_since: the first opset in which it supports int8 in a float16 graph, with
             float16 scales; None if it has no such kernels.
-        opens: whether :meth:`read_back` opens the graph, in onnxruntime.
+        runs_in: name of the provider that runs its int8 on this machine, and in which
+            :meth:`read_back` opens graphs; empty if there is none.
     """
 
     name: ClassVar[str]
     half_since: ClassVar[int | None] = None
-    opens: ClassVar[bool] = False
+    runs_in: ClassVar[str] = ""
 
     @abc.abstractmethod
     def tensors(self, plan: QuantPlan, model: ir.Model) -> tuple[str, ...]:
@@ -293,5 +294,6 @@ TARGETS: Registry[Target] = Registry(
     {
         "tensorrt": f"{_HERE}.tensorrt:TensorRT",
         "onnxruntime": f"{_HERE}.onnxruntime:OnnxRuntime",
+        "openvino": f"{_HERE}.openvino:OpenVino",
     },
 )

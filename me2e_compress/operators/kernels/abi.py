@@ -65,3 +65,13 @@ FIELDS = (
 
 # Words of an input: eight dimensions, then address and element type; EACH in all
 ADDRESS, TYPE, EACH = 8, 9, 10
+
+# Words of a tensor in the context of a call inside OpenVINO, whose output comes first
+TYPE_OF, RANK, DIMENSIONS = range(1, 4)
+TENSOR = DIMENSIONS + ADDRESS
+# Names of the first words of a state, which are addresses of functions
+HOST_FUNCTIONS = (
+    "CREATE_STATUS", "GET_INPUT", "GET_OUTPUT", "GET_DATA", "GET_INFO", "GET_TYPE",
+    "GET_RANK", "GET_DIMS", "RELEASE_INFO", "PARALLEL_FOR", "GET_ALLOCATOR", "ALLOCATE",
+    "FREE", "RELEASE_ALLOCATOR",
+)  # fmt: skip

@@ -15,7 +15,7 @@ import hashlib
 import importlib
 import platform
 import threading
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -146,15 +146,15 @@ def _address(callback: Any) -> int:
 # crash a process into which Numba is not loaded.
 _FOREIGN = frozenset({"memset", "memcpy", "memmove", "floorf", "expf", "sqrt"})
 
-# A C function around a Numba function, whose first two arguments are pointers to the
-# result and to its exception; `cfunc`'s own wrapper raises in Python
+# A C function of words around a Numba function, whose first two arguments are pointers
+# to the result and to its exception; `cfunc`'s own wrapper raises in Python
 _WRAPPER = """
-declare i32 @"{inner}"(ptr, ptr, i64, i64)
-define i64 @{name}(i64 %first, i64 %second) {{
+declare i32 @"{inner}"(ptr, ptr, {types})
+define i64 @{name}({arguments}) {{
     %result = alloca i64
     %raised = alloca ptr
     store i64 0, ptr %result
-    call i32 @"{inner}"(ptr %result, ptr %raised, i64 %first, i64 %second)
+    call i32 @"{inner}"(ptr %result, ptr %raised, {arguments})
     %value = load i64, ptr %result
     ret i64 %value
 }}
@@ -166,21 +166,23 @@ _LOCK = threading.Lock()
 _ENGINES: list[Any] = []
 
 
-def load_or_compile(kernel: CompiledKernel, folder: Path) -> Mapping[str, int]:
+def load_or_compile(
+    kernel: CompiledKernel, folder: Path, names: Sequence[str] = ("compute", "block")
+) -> Mapping[str, int]:
     """Return the addresses of a kernel's functions by name, cached in ``folder``.
 
-    The ``functions`` of its module take two words and return one. Code that calls into
+    The ``functions`` of its module take words and return one. Code that calls into
     Python or Numba is a GraphError.
     """
     with _LOCK:
-        place, name = private(folder), kernel.op_type
-        path = None if place is None else place / f"{name}-{_fingerprint()}.o"
+        place, op_type = private(folder), kernel.op_type
+        path = None if place is None else place / f"{op_type}-{_fingerprint()}.o"
         # The file begins with the digest of its code
         content = path.read_bytes() if path is not None and path.is_file() else b""
         digest, code = content[:_DIGEST], content[_DIGEST:]
         if not code or hashlib.sha256(code).digest() != digest:
             module = importlib.import_module(f"{__package__}.{kernel.module}")
-            code = _compiled(module.functions(name))
+            code = _compiled(module.functions(op_type))
             if path is not None:
                 keep(path, hashlib.sha256(code).digest() + code)
         # Load it
@@ -188,7 +190,7 @@ def load_or_compile(kernel: CompiledKernel, folder: Path) -> Mapping[str, int]:
         engine.add_object_file(llvm.ObjectFileRef.from_data(code))
         engine.finalize_object()
         _ENGINES.append(engine)
-        return {n: engine.get_function_address(n) for n in ("compute", "block")}
+        return {name: engine.get_function_address(name) for name in names}
 
 
 @functools.cache
@@ -214,7 +216,7 @@ def _machine() -> Any:
     )
 
 
-def _compiled(functions: Mapping[str, Callable[[int, int], int]]) -> bytes:
+def _compiled(functions: Mapping[str, Callable[..., int]]) -> bytes:
     """Compile Python functions to an object file of C functions of the same names."""
     import numba  # takes 0.25 s, and only here
 
@@ -225,10 +227,16 @@ def _compiled(functions: Mapping[str, Callable[[int, int], int]]) -> bytes:
     whole = llvm.parse_assembly("")
     # Link all functions with C wrappers
     for name, function in functions.items():
-        made = numba.cfunc(word(word, word), **intrinsics.OPTIONS)(function)
-        inner = made.native_name.removeprefix("cfunc.")
+        count = function.__code__.co_argcount
+        made = numba.cfunc(word(*[word] * count), **intrinsics.OPTIONS)(function)
+        wrapper = _WRAPPER.format(
+            inner=made.native_name.removeprefix("cfunc."),
+            name=name,
+            types=", ".join(["i64"] * count),
+            arguments=", ".join(f"i64 %word{index}" for index in range(count)),
+        )
         whole.link_in(llvm.parse_assembly(made.inspect_llvm()))
-        whole.link_in(llvm.parse_assembly(_WRAPPER.format(inner=inner, name=name)))
+        whole.link_in(llvm.parse_assembly(wrapper))
     # Only the wrappers stay visible; remove the rest if unused
     for symbol in (*whole.functions, *whole.global_variables):
         if not symbol.is_declaration and symbol.name not in functions:

@@ -28,7 +28,7 @@ class OnnxRuntime(Target):
     """onnxruntime's CPU kernels: uint8 activations, quantized outputs, 2-D products."""
 
     name: ClassVar[str] = "onnxruntime"
-    opens: ClassVar[bool] = True
+    runs_in: ClassVar[str] = "cpu"
 
     def tensors(self, plan: QuantPlan, model: ir.Model) -> tuple[str, ...]:
         """List the activations whose range is needed: inputs, outputs of layers."""

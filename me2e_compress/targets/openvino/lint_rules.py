@@ -1,0 +1,139 @@
+"""Lint rules: what OpenVINO computes otherwise than a graph says, or in float.
+
+Each was measured on a small valid graph with OpenVINO 2026.4.1, on an AMD EPYC (Zen 4),
+where onnxruntime 1.32 and the nodes agree. Which operators its frontend has, only
+opening a graph tells.
+"""
+
+from collections.abc import Iterator
+
+import numpy as np
+import onnx_ir as ir
+
+from me2e_compress.graph import array_of, input_at, is_standard, nodes_of
+from me2e_compress.graph.nodes import LAYOUT_OPERATORS, maker
+from me2e_compress.graph.shapes import CONVOLUTIONS
+from me2e_compress.targets import (
+    LintFinding,
+    LintRule,
+    divided_grids,
+    of_opset,
+    rule_of_nodes,
+    valid,
+    warning,
+)
+from me2e_compress.targets.quantized import (
+    DEQUANTIZE,
+    QUANTIZE,
+    is_in_a_pair,
+    stored_type,
+)
+
+_SMALL = (ir.DataType.UINT8, ir.DataType.INT8)
+
+
+@rule_of_nodes("zero-point", "wrong")
+def _zero_point(node: ir.Node) -> Iterator[str]:
+    """Find what forgets a zero point, which its low-precision passes move behind it."""
+    reader = maker(node.inputs[0], DEQUANTIZE) if node.inputs else None
+    zero = None if reader is None else array_of(input_at(reader, 2))
+    if zero is None or not zero.any() or not is_standard(node):
+        return
+    read = node.attributes
+    counted = read.get_int("count_include_pad", 0) and any(read.get_ints("pads", ()))
+    if node.op_type == "AveragePool" and counted:
+        yield "its pads count as code 0, not as the number 0: its border is wrong"
+    if node.op_type == "Pad" and read.get_string("mode", "constant") == "constant":
+        yield "it pads with the value plus zero point times scale, along one axis"
+    if node.op_type == "ReduceSum":
+        yield "the zero point is taken off once, not once a summand"
+
+
+@rule_of_nodes("attribute", "wrong")
+def _attribute(node: ir.Node) -> Iterator[str]:
+    """Find attributes that OpenVINO ignores or reads in its own way."""
+    if not is_standard(node):
+        return
+    if node.op_type == "Resize" and node.attributes.get_int("antialias", False):
+        yield "antialias is ignored"
+    if node.op_type == "AveragePool" and node.attributes.get_int("ceil_mode", False):
+        yield "with ceil_mode it divides by cells that are not there"
+
+
+@rule_of_nodes("type", "wrong")
+def _type(node: ir.Node) -> Iterator[str]:
+    """Find types that are computed in others."""
+    if not is_standard(node) or node.op_type == "Constant":
+        return
+    value = node.outputs[0]
+    source = node.inputs[0] if node.inputs else None
+    if value.dtype == ir.DataType.DOUBLE:
+        yield "float64 is computed in float32"
+        return
+    kind = None if source is None else source.dtype
+    from_float = kind is not None and kind.is_floating_point()
+    if node.op_type == "Cast" and value.dtype in _SMALL and from_float:
+        yield "a Cast to 8 bits wraps, where onnxruntime's saturates"
+
+
+@rule_of_nodes("int8-behind-concat", "wrong")
+def _joined(node: ir.Node) -> Iterator[str]:
+    """Find convolutions that read a signed pair behind a Concat: 11 dB on two floats.
+
+    Uint8 with any zero point is right there, and so is a MatMul.
+    """
+    reader = maker(node.inputs[0], DEQUANTIZE) if node.inputs else None
+    if reader is None or node.op_type not in CONVOLUTIONS:
+        return
+    quantizer = maker(reader.inputs[0], QUANTIZE)
+    if quantizer is None or stored_type(quantizer) != ir.DataType.INT8:
+        return
+    joined = quantizer.inputs[0]
+    while (moved := maker(joined, *LAYOUT_OPERATORS)) is not None:
+        joined = moved.inputs[0]
+    if maker(joined, "Concat") is not None:
+        yield "it reads int8 behind a Concat: wrong by more than int8; uint8 is right"
+
+
+@rule_of_nodes("float-behind-concat", "warning")
+def _scales_apart(node: ir.Node) -> Iterator[str]:
+    """Find Concats of pairs on several grids: what reads them runs in float."""
+    if node.op_type != "Concat" or not is_standard(node):
+        return
+    pairs = [maker(value, DEQUANTIZE) for value in node.inputs]
+    if len(pairs) < 2 or None in pairs:
+        return
+    scales = [array_of(input_at(pair, 1)) for pair in pairs if pair is not None]
+    zeros = [array_of(input_at(pair, 2)) for pair in pairs if pair is not None]
+    if any(zero is not None and zero.any() for zero in zeros):
+        yield "a zero point that is not 0 here makes OpenVINO refuse some graphs"
+    elif any(
+        scale is None or scales[0] is None or not np.array_equal(scale, scales[0])
+        for scale in scales
+    ):
+        yield "it joins pairs of several scales: the layers behind it run in float"
+
+
+@rule_of_nodes("float-clip", "warning")
+def _clipped(node: ir.Node) -> Iterator[str]:
+    """Find a Clip between the nodes of a pair (brevitas): its layer runs in float."""
+    if node.op_type == "Clip" and is_standard(node) and is_in_a_pair(node):
+        yield "it stands between the nodes of a pair: the layer behind runs in float"
+
+
+def _functions(model: ir.Model) -> Iterator[LintFinding]:
+    """Find calls of functions in the file, which OpenVINO does not read."""
+    called = [n for n in nodes_of(model) if n.op_identifier() in model.functions]
+    if called:
+        message = (
+            f"{len(called)} nodes call functions of the file, which OpenVINO alone does"
+            " not read: --provider openvino runs them by kernels; without fusions (-r"
+            " full) there are none"
+        )
+        yield warning("function", called[0], message)
+
+
+RULES: tuple[LintRule, ...] = (
+    valid, of_opset, divided_grids, _functions, _zero_point, _attribute, _type,
+    _joined, _scales_apart, _clipped,
+)  # fmt: skip
