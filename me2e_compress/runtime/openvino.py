@@ -25,7 +25,7 @@ from me2e_compress.graph.shapes import static_shape
 from me2e_compress.operators import kernels
 from me2e_compress.runtime.frames import Array
 from me2e_compress.runtime.providers import Chain, Engine, Provider
-from me2e_compress.runtime.runnable import replace_fused, why_endless
+from me2e_compress.runtime.runnable import is_fused, replace_fused, why_endless
 
 if TYPE_CHECKING:
     import openvino as ov
@@ -119,7 +119,8 @@ class OpenVino(Engine):
             raise GraphError(reason)
         self._model, self._threads = model, threads
         weights = model.graph.initializers
-        self.inputs = _ports([e for e in model.graph.inputs if e.name not in weights])
+        self._values = [e for e in model.graph.inputs if e.name not in weights]
+        self.inputs = _ports(self._values)
         self.outputs = _ports(model.graph.outputs)
         self.metadata = dict(model.metadata_props)
         self._config: dict[str, Any] = {
@@ -142,6 +143,7 @@ class OpenVino(Engine):
             raise GraphError(
                 f"OpenVINO cannot run this graph: {_line(error)}"
             ) from error
+        self._request = self._runner.create_infer_request()
         # A port answers by each of its names
         self._in, self._out = (
             {name: index for index, port in enumerate(ports) for name in port.names}
@@ -150,22 +152,27 @@ class OpenVino(Engine):
 
     def run(self, names: Sequence[str], inputs: Mapping[str, Array]) -> list[Array]:
         """Run one inference; arrays that do not fit a port are a FramesError."""
-        for name, port in self.inputs.items():
-            _check_fit(name, port, inputs[name])
+        for value in self._values:
+            _check_fit(str(value.name), value, inputs[str(value.name)])
         # An input that nothing reads has no port
         feeds = {
             self._in[name]: each for name, each in inputs.items() if name in self._in
         }
+        # Not `infer`: on one thread that ends without a word where a node fails, and
+        # answers what the run before did (2026.4.1)
         try:
-            results = self._runner(feeds)
+            self._request.start_async(feeds)
+            self._request.wait()
         except RuntimeError as error:
             if self._compiled and "KernelRefusalError" in str(error):
-                warnings.warn(f"{_line(error)}: bodies run instead", stacklevel=2)
+                told = f"{_line(error)}: bodies run instead"
+                warnings.warn(told, RuntimeWarning, stacklevel=2)
                 self._compiled = False
                 self._open()
                 return self.run(names, inputs)
             raise GraphError(f"OpenVINO failed: {_line(error)}") from error
-        return [np.array(results[self._out[name]]) for name in names]
+        tensors = [self._request.get_output_tensor(self._out[name]) for name in names]
+        return [np.array(tensor.data) for tensor in tensors]
 
     def precisions(self) -> dict[str, str]:
         """Return the type in which each node runs, by its name: ``u8``, ``f32``."""
@@ -180,20 +187,26 @@ class OpenVino(Engine):
 def for_openvino(model: ir.Model, *, compiled: bool) -> onnx.ModelProto:
     """Write a graph as OpenVINO reads it: calls of kernels, and no local functions.
 
-    Nodes whose output has no fixed shape get bodies.
+    All fused nodes get bodies if the output of one has no fixed shape.
     """
-    prepared, _ = replace_fused(model, compiled=compiled)
+    typed = model
+    if compiled and any(map(_is_open, filter(is_fused, graph.nodes_of(model)))):
+        typed = model.clone()
+        graph.infer_shapes(typed)
+    prepared, _ = replace_fused(typed, compiled=compiled)
     calls = [n for n in graph.nodes_of(prepared) if n.domain == kernels.DOMAIN]
-    if any(static_shape(node.outputs[0]) is None for node in calls):
+    if any(map(_is_open, calls)):
         prepared, _ = replace_fused(model, compiled=False)
         calls = []
     for node in calls:
-        shape = static_shape(node.outputs[0])
-        node.attributes["output_shape"] = ir.AttrInt64s(
-            "output_shape", list(shape or ())
-        )
+        shape = static_shape(node.outputs[0]) or ()
+        node.attributes["output_shape"] = ir.AttrInt64s("output_shape", shape)
     proto = ir.to_proto(prepared)
     return inliner.inline_local_functions(proto) if proto.functions else proto
+
+
+def _is_open(node: ir.Node) -> bool:
+    return static_shape(node.outputs[0]) is None
 
 
 def _read(core: "ov.Core", proto: onnx.ModelProto) -> "ov.Model":
@@ -216,29 +229,32 @@ def _ports(values: Sequence[ir.Value]) -> dict[str, SessionPort]:
     return ports
 
 
-def _check_fit(name: str, port: SessionPort, array: Array) -> None:
+def _check_fit(name: str, value: ir.Value, array: Array) -> None:
     """Check type, rank and fixed sizes of an array, which OpenVINO would convert."""
-    wanted = [size for size in port.shape]
-    fits = len(wanted) == array.ndim and all(
-        not isinstance(size, int) or size == given
-        for size, given in zip(wanted, array.shape, strict=True)
-    )
-    if not fits:
+    if value.dtype is not None and array.dtype != value.dtype.numpy():
+        raise FramesError(
+            f"these inputs do not fit: {name} is {array.dtype}, the graph takes"
+            f" {value.dtype.numpy()}"
+        )
+    sizes = list(value.shape or array.shape)
+    if len(sizes) != array.ndim or any(
+        isinstance(size, int) and size != given
+        for size, given in zip(sizes, array.shape, strict=True)
+    ):
         raise FramesError(
             f"these inputs do not fit: {name} has shape {list(array.shape)}, the graph"
-            f" takes {wanted}"
+            f" takes {sizes}"
         )
 
 
 def _line(error: Exception) -> str:
-    """Return what OpenVINO means, without the places in its sources."""
-    text = str(error)
+    """Return what OpenVINO means, without the places in its sources and ours."""
+    text = str(error).partition("\nAt:")[0].rpartition("KernelRefusalError: ")[2]
     if unknown := _UNKNOWN.search(text):
         return f"its version {_version()} has no operator {unknown.group(1)}"
     lines = [line.strip() for line in text.splitlines() if line.strip()]
-    places = ("Exception from", "Check '", "FrontEnd API failed")
-    said = [line for line in lines if not line.startswith(places)]
-    return " ".join(said or lines)
+    places = ("Caught exception", "Exception from", "Check '", "FrontEnd API failed")
+    return " ".join([e for e in lines if not e.startswith(places)] or lines)
 
 
 @functools.cache

@@ -33,6 +33,7 @@ ALL, EVERY_TOOL = "all at once", "+".join(TOOLS)
 ROOMS: Mapping[str, tuple[str, ...]] = {
     "highway": ("evaluators.highway", "simulator", "study"),
     "fast": ("operators.kernels",),
+    "openvino": ("operators.kernels.openvino_ops",),
     "trt-check": ("targets.tensorrt.rtx_main",),
 }
 """Rooms, or modules, in which something cannot be imported without an extra."""

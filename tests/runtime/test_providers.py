@@ -67,7 +67,10 @@ def test_a_provider_that_is_not_installed_says_what_to_install(
 @pytest.mark.parametrize(
     ("text", "reason"),
     [
-        ("npu", "no provider 'npu'; there are cpu, cuda, tensorrt, tensorrt-rtx"),
+        (
+            "npu",
+            "no provider 'npu'; there are cpu, cuda, openvino, tensorrt, tensorrt-rtx",
+        ),
         ("cpu{threads=4}", "cpu has no option 'threads'"),
         ("tensorrt{precision=fp4}", "tensorrt: precision: "),
     ],

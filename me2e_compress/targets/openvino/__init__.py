@@ -21,7 +21,7 @@ from me2e_compress.quantization.plan import tensors_of
 from me2e_compress.runtime.openvino import OpenVino as Engine
 from me2e_compress.runtime.openvino import OpenVinoProvider
 from me2e_compress.runtime.providers import CPU, Provider
-from me2e_compress.targets import LintFinding, LintRule, Target, error, warning
+from me2e_compress.targets import LintFinding, LintRule, Target, error, name_of, warning
 from me2e_compress.targets.explicit_pairs import POSITIVE, SHIFTED, place_pairs
 from me2e_compress.targets.onnxruntime.region import never_negative
 from me2e_compress.targets.openvino.lint_rules import RULES
@@ -106,6 +106,6 @@ def _float_layers(
             maker is not None and maker.op_type == DEQUANTIZE for maker in makers
         ):
             continue
-        runs = precisions.get(str(node.name), "")
+        runs = precisions.get(name_of(node), "")
         if runs in ("f32", "bf16", "f16"):
             yield warning("float-kernel", node, f"reads int8, and runs in {runs}")

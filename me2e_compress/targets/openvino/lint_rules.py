@@ -29,8 +29,6 @@ from me2e_compress.targets.quantized import (
     stored_type,
 )
 
-_SMALL = (ir.DataType.UINT8, ir.DataType.INT8)
-
 
 @rule_of_nodes("zero-point", "wrong")
 def _zero_point(node: ir.Node) -> Iterator[str]:
@@ -43,8 +41,11 @@ def _zero_point(node: ir.Node) -> Iterator[str]:
     counted = read.get_int("count_include_pad", 0) and any(read.get_ints("pads", ()))
     if node.op_type == "AveragePool" and counted:
         yield "its pads count as code 0, not as the number 0: its border is wrong"
+    # Others compute in integers where a pair follows
+    if all(reader.op_type != QUANTIZE for reader in node.outputs[0].consumers()):
+        return
     if node.op_type == "Pad" and read.get_string("mode", "constant") == "constant":
-        yield "it pads with the value plus zero point times scale, along one axis"
+        yield "it pads with the value plus zero point times scale"
     if node.op_type == "ReduceSum":
         yield "the zero point is taken off once, not once a summand"
 
@@ -54,26 +55,19 @@ def _attribute(node: ir.Node) -> Iterator[str]:
     """Find attributes that OpenVINO ignores or reads in its own way."""
     if not is_standard(node):
         return
-    if node.op_type == "Resize" and node.attributes.get_int("antialias", False):
+    if node.op_type == "Resize" and node.attributes.get_int("antialias", 0):
         yield "antialias is ignored"
-    if node.op_type == "AveragePool" and node.attributes.get_int("ceil_mode", False):
+    counted = node.attributes.get_int("count_include_pad", 0)
+    ceil = node.attributes.get_int("ceil_mode", 0)
+    if node.op_type == "AveragePool" and counted and ceil:
         yield "with ceil_mode it divides by cells that are not there"
 
 
 @rule_of_nodes("type", "wrong")
 def _type(node: ir.Node) -> Iterator[str]:
-    """Find types that are computed in others."""
-    if not is_standard(node) or node.op_type == "Constant":
-        return
-    value = node.outputs[0]
-    source = node.inputs[0] if node.inputs else None
-    if value.dtype == ir.DataType.DOUBLE:
+    """Find what is computed in another type."""
+    if node.op_type != "Constant" and node.outputs[0].dtype == ir.DataType.DOUBLE:
         yield "float64 is computed in float32"
-        return
-    kind = None if source is None else source.dtype
-    from_float = kind is not None and kind.is_floating_point()
-    if node.op_type == "Cast" and value.dtype in _SMALL and from_float:
-        yield "a Cast to 8 bits wraps, where onnxruntime's saturates"
 
 
 @rule_of_nodes("int8-behind-concat", "wrong")
