@@ -10,6 +10,7 @@ from matplotlib.ticker import PercentFormatter
 
 from benchmarks.paper.cells import held_at
 from benchmarks.paper.drives import PaperDrives
+from benchmarks.paper.periods import frames_per_decision
 from benchmarks.paper.published import RATES
 from me2e_compress.metrics.route_summary import DC, DE, DS, RouteColumn
 from me2e_compress.study.report.figures import (
@@ -21,7 +22,6 @@ from me2e_compress.study.report.figures import (
     WIDTH_IN,
     styled,
 )
-from me2e_compress.study.workload import frames_per_decision
 
 RATE_TICKS = (1, 2, 3, 5, 10, 20, 30)
 COLOURS = (

@@ -9,6 +9,7 @@ from pathlib import Path
 from benchmarks.paper.accident import FILE as ACCIDENT
 from benchmarks.paper.accident import Accident, accident_of, first_accident
 from benchmarks.paper.drives import FILE, KeptFacts
+from benchmarks.paper.periods import frames_per_decision
 from benchmarks.paper.questions import FILE as QUESTIONS
 from benchmarks.paper.questions import SHIPPED, PaperQuestions
 from benchmarks.paper.result import PaperResult
@@ -22,7 +23,6 @@ from me2e_compress.study import Listener, Study
 from me2e_compress.study.drive_record import DriveRecord
 from me2e_compress.study.prepared import PreparedVariant
 from me2e_compress.study.run import StudyCells, prepare_study
-from me2e_compress.study.workload import frames_per_decision
 from me2e_compress.study.workspace import Workspace
 
 RECORDS = "records"

@@ -24,12 +24,12 @@ from benchmarks.paper.cells import (
 )
 from benchmarks.paper.counts import partners, table_4
 from benchmarks.paper.drives import PaperDrives
+from benchmarks.paper.periods import frames_per_decision
 from benchmarks.paper.published import PublishedDrive
 from me2e_compress.base.display import Cell, Table
 from me2e_compress.metrics.route_summary import PERCENTS
 from me2e_compress.study.cells import MISSING
 from me2e_compress.study.definition import StudyBlock
-from me2e_compress.study.workload import frames_per_decision
 
 OURS = (
     "Means with their 95 % intervals over these scenario types. The paper's figures"

@@ -443,7 +443,6 @@ def study(
     output: Output,
     routes: str | None = None,
     tables: str | None = None,
-    dry_run: bool = False,
     provider: str | None = None,
     trust_code: bool = False,
     running: WorkerOptions = RUNNING,
@@ -456,7 +455,6 @@ def study(
         output: the folder
         routes: routes: all, a number, ID,ID; not the study's
         tables: only these of its blocks: A,B
-        dry_run: count drives and hours, drive nothing
         provider: runs the graph: cpu, cuda, ...; not the study's
         trust_code: run Python and libraries that it names
     """
@@ -466,7 +464,6 @@ def study(
     from me2e_compress.study import load_study
     from me2e_compress.study.report.page import write_study
     from me2e_compress.study.run import run_study
-    from me2e_compress.study.workload import workload
     from me2e_compress.study.workspace import HTML, JSON, MARKDOWN
 
     # read and check everything that the study needs before it starts
@@ -475,10 +472,6 @@ def study(
         asked = asked.of_blocks(tables.split(","))
     inputs = (definition, *asked.inputs())
     check_folder(output, inputs, (JSON, MARKDOWN, HTML))
-    ahead = workload(asked, output, running.workers)
-    if dry_run:
-        show(ahead)
-        return
     # the report quotes the command that repeats the study
     words = ["me2e-compress", "study", str(definition), "-o", str(output)]
     flags = {"--routes": routes, "--tables": tables, "--provider": provider}
@@ -486,7 +479,6 @@ def study(
         words += [] if value is None else [flag, value]
     words += ["--trust-code"] * trust_code
     # drive, or go on, and write the report
-    tell(ahead.headline)
     with listening() as listener:
         engine = engine_named(running.engine, running.workers)
         result = run_study(asked, output, engine, listener, force=writing.force)

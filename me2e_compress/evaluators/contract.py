@@ -209,10 +209,6 @@ class Evaluator(abc.ABC):
         usual, asked = Drive().conditions(), drive.conditions()
         return made | {key: asked[key] for key in asked if asked[key] != usual.get(key)}
 
-    def expected_s(self, route: RouteInfo) -> float:
-        """Return about how many simulated seconds a route takes."""
-        return 30.0
-
     def render(
         self, policy: Driver, drive: Drive, route: RouteInfo, folder: Path
     ) -> tuple[Path, ...]:

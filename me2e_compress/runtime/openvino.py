@@ -1,7 +1,10 @@
 """Run graphs in OpenVINO (2026.4), our kernels inside, through its own Python API."""
 
+import contextlib
 import dataclasses
 import functools
+import hashlib
+import json
 import os
 import re
 import tempfile
@@ -14,15 +17,18 @@ import numpy as np
 import onnx
 import onnx_ir as ir
 import onnxruntime as ort
+import platformdirs
 from onnx import inliner
 
 from me2e_compress import graph
+from me2e_compress.base.atomic import write_bytes
 from me2e_compress.base.errors import FramesError, GraphError, ProviderError
 from me2e_compress.base.extras import missing_module, require_extra
 from me2e_compress.graph.files import INLINE_LIMIT_BYTES
 from me2e_compress.graph.recurrence import SessionPort
 from me2e_compress.graph.shapes import static_shape
 from me2e_compress.operators import kernels
+from me2e_compress.runtime.children import run_script
 from me2e_compress.runtime.frames import Array
 from me2e_compress.runtime.providers import Chain, Engine, Provider
 from me2e_compress.runtime.runnable import is_fused, replace_fused, why_endless
@@ -33,6 +39,7 @@ if TYPE_CHECKING:
 # OpenVINO's property that keeps pairs of quantization as they are, in float; it is not
 # among those that it lists
 _INT8_OFF = {"LP_TRANSFORMS_MODE": "NO"}
+_SCRIPT = Path(__file__).with_name("openvino_opening_main.py")
 _UNKNOWN = re.compile(r"No conversion rule found for operations: (.*)")
 
 
@@ -137,8 +144,10 @@ class OpenVino(Engine):
         threads = self._threads or os.cpu_count() or 1
         core = _core(threads if self._compiled else None)
         try:
-            network = _read(core, for_openvino(self._model, compiled=self._compiled))
-            self._runner = core.compile_model(network, "CPU", self._config)
+            proto = for_openvino(self._model, compiled=self._compiled)
+            if self._threads == 1 and self._compiled and _dies(proto, self._config):
+                self._config["SNIPPETS_MODE"] = "DISABLE"
+            self._runner = core.compile_model(_read(core, proto), "CPU", self._config)
         except RuntimeError as error:
             raise GraphError(
                 f"OpenVINO cannot run this graph: {_line(error)}"
@@ -174,15 +183,6 @@ class OpenVino(Engine):
         tensors = [self._request.get_output_tensor(self._out[name]) for name in names]
         return [np.array(tensor.data) for tensor in tensors]
 
-    def precisions(self) -> dict[str, str]:
-        """Return the type in which each node runs, by its name: ``u8``, ``f32``."""
-        # A node that runs has absorbed others, whose names it lists
-        return {
-            name: str(node.rt_info["runtimePrecision"].astype(str))
-            for node in self._runner.get_runtime_model().get_ordered_ops()
-            for name in str(node.rt_info["originalLayersNames"].astype(str)).split(",")
-        }
-
 
 def for_openvino(model: ir.Model, *, compiled: bool) -> onnx.ModelProto:
     """Write a graph as OpenVINO reads it: calls of kernels, and no local functions.
@@ -207,6 +207,28 @@ def for_openvino(model: ir.Model, *, compiled: bool) -> onnx.ModelProto:
 
 def _is_open(node: ir.Node) -> bool:
     return static_shape(node.outputs[0]) is None
+
+
+def _dies(proto: onnx.ModelProto, config: Mapping[str, Any]) -> bool:
+    """Return whether OpenVINO dies of compiling a graph for one thread.
+
+    2026.4.1 does where it fuses TCP's decoder (``SNIPPETS_MODE``). It is tried in a
+    process of its own, once on this machine.
+    """
+    content, asked = proto.SerializeToString(deterministic=True), json.dumps(config)
+    key = hashlib.sha256(content + f"{asked} {_version()}".encode()).hexdigest()
+    folder = platformdirs.user_cache_path("me2e-compress") / "opened"
+    verdict = folder / f"openvino-{key}"
+    with contextlib.suppress(OSError):
+        return verdict.read_bytes() == b"died"
+    with tempfile.TemporaryDirectory(prefix="me2e-openvino-") as scratch:
+        path = Path(scratch) / "model.onnx"
+        path.write_bytes(content)
+        died = run_script(_SCRIPT, [str(path), asked]).returncode < 0
+    with contextlib.suppress(OSError):  # a home that cannot be written to
+        folder.mkdir(parents=True, exist_ok=True)
+        write_bytes(verdict, b"died" if died else b"opened")
+    return died
 
 
 def _read(core: "ov.Core", proto: onnx.ModelProto) -> "ov.Model":

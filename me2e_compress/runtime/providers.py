@@ -2,7 +2,6 @@
 
 import abc
 import dataclasses
-import importlib.util
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import ClassVar, Literal, TypeAlias
@@ -239,45 +238,6 @@ class TensorRtProvider(Provider):
         return library.is_file() and not file_contains(library, _ENTRY_POINT)
 
 
-@dataclasses.dataclass(frozen=True)
-class TensorRtRtxProvider(Provider):
-    """TensorRT for RTX GPUs, in the precision in which the graph is written.
-
-    Attributes:
-        cache: folder of compiled kernels; without it they are compiled every time.
-    """
-
-    name: ClassVar[str] = "tensorrt-rtx"
-    native: ClassVar[str] = "NvTensorRTRTXExecutionProvider"
-    advice: ClassVar[str] = "pip install onnxruntime-ep-nv-tensorrt-rtx"
-    target: ClassVar[str] = "tensorrt"
-    package: ClassVar[str] = "onnxruntime_ep_nv_tensorrt_rtx"
-    cache: Path | None = None
-
-    def is_installed(self) -> bool:
-        """Return whether the package that provides it is installed."""
-        return super().is_installed() or bool(importlib.util.find_spec(self.package))
-
-    def attach(self, options: ort.SessionOptions) -> None:
-        """Register the provider's own library, then those of operators."""
-        super().attach(options)
-        # The provider comes in a package of its own.
-        if not super().is_installed():
-            module = importlib.import_module(self.package)
-            ort.register_execution_provider_library(
-                self.native, module.get_library_path()
-            )
-        known = ort.get_ep_devices()
-        devices = [device for device in known if device.ep_name == self.native]
-        if not devices:
-            raise ProviderError(f"provider {self.name}: there is no RTX GPU here")
-        cache = {} if self.cache is None else {"nv_runtime_cache_path": str(self.cache)}
-        options.add_provider_for_devices(devices[:1], cache)
-
-    def chain(self) -> None:
-        """Return None: the options of the session name its device."""
-
-
 CPU = CpuProvider()
 
 _HERE = "me2e_compress.runtime.providers"
@@ -290,7 +250,6 @@ PROVIDERS: Registry[Provider] = Registry(
         "cuda": f"{_HERE}:CudaProvider",
         "openvino": "me2e_compress.runtime.openvino:OpenVinoProvider",
         "tensorrt": f"{_HERE}:TensorRtProvider",
-        "tensorrt-rtx": f"{_HERE}:TensorRtRtxProvider",
     },
 )
 

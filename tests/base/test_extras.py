@@ -155,7 +155,7 @@ def commands() -> Mapping[str, tuple[str, ...]]:
     return {
         "highway_env": ("evaluate", "highway", "--routes", "1", "-o", "out"),
         "cv2": ("evaluate", "highway", "--routes", "1", "-o", "out"),
-        "jinja2": ("study", "smoke", "-o", "out", "--dry-run"),
+        "jinja2": ("study", "smoke", "-o", "out"),
         "ray": (
             *("evaluate", "highway", "--routes", "1", "--engine", "ray"),
             "-o",

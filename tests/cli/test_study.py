@@ -11,7 +11,6 @@ from me2e_compress.simulator.routes import save_routes
 from me2e_compress.study import load_study
 from tests.evaluators.highway.drivers import CROSSING, straight_on
 from tests.support.command import Cli, write_frames
-from tests.support.in_process import Here
 
 pytestmark = pytest.mark.usefixtures("here")
 
@@ -93,15 +92,6 @@ def test_an_engine_nobody_knows(cli: Cli) -> None:
     said = cli("study study.toml -o out --engine cloud")
     assert said.code == 1
     assert "engine 'cloud'" in said.err
-
-
-@pytest.mark.usefixtures("toml")
-def test_a_dry_run_drives_nothing(cli: Cli, tmp_path: Path, here: Here) -> None:
-    shown = cli.document("study study.toml -o out --dry-run")
-
-    assert len(shown["drives"]) == 2
-    assert here.driven == []
-    assert not (tmp_path / "out").exists()
 
 
 THEIRS = """

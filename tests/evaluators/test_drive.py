@@ -1,6 +1,6 @@
 """A drive of words, and evaluators that declare what they take of it."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from importlib.metadata import EntryPoint
 from pathlib import Path
@@ -13,14 +13,12 @@ from me2e_compress.base import registry
 from me2e_compress.base.errors import EvaluationError
 from me2e_compress.base.listener import Listener
 from me2e_compress.commands.evaluate import drive_of
-from me2e_compress.driving.contract import RouteInfo
 from me2e_compress.driving.latency import FrameRate
 from me2e_compress.driving.policies import Driver
 from me2e_compress.evaluators import EVALUATORS, Drive, Evaluator
 from me2e_compress.evaluators.contract import evaluator_named
 from me2e_compress.evaluators.highway.evaluator import Highway
 from me2e_compress.metrics.episode import Episode
-from tests.evaluators.lanes import Lane
 
 
 def test_words_reach_the_drive() -> None:
@@ -113,9 +111,3 @@ def test_a_word_that_an_evaluator_cannot_read_is_one_line(
     monkeypatch.setattr(Highway, "routes", lambda self, words: int(words))
     with pytest.raises(EvaluationError, match=r"^--routes two: invalid literal"):
         drive_of(EvaluateOptions(routes="two"), Highway())
-
-
-def test_routes_of_another_kind_are_not_highways() -> None:
-    lanes: Sequence[RouteInfo] = [Lane("lane", 0)]
-    with pytest.raises(EvaluationError, match="highway drives routes of its own kind"):
-        Highway().expected_s(lanes[0])

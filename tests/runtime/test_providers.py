@@ -1,13 +1,9 @@
 """Who runs a session: what is there, what is not, and what is said of it."""
 
 import dataclasses
-import importlib.util
 import shutil
 import subprocess
-import sys
-from importlib.machinery import ModuleSpec
 from pathlib import Path
-from types import ModuleType, SimpleNamespace
 from typing import ClassVar
 
 import numpy as np
@@ -23,24 +19,18 @@ from me2e_compress.runtime.providers import (
     CpuProvider,
     CudaProvider,
     TensorRtProvider,
-    TensorRtRtxProvider,
     provider_named,
 )
 from me2e_compress.runtime.session import Session
 from tests.support.nets import parsed, save_text
 
 NEGATE = "m (float[2] x) => (float[2] y) { y = Neg(x) }"
-RTX = TensorRtRtxProvider.package
 
 
 @pytest.fixture
 def bare(monkeypatch: pytest.MonkeyPatch) -> None:
     """An onnxruntime with nothing but the CPU, whatever is installed here."""
     monkeypatch.setattr(ort, "get_available_providers", lambda: [CPU.native])
-    found = importlib.util.find_spec
-    monkeypatch.setattr(
-        importlib.util, "find_spec", lambda name: None if name == RTX else found(name)
-    )
 
 
 @pytest.mark.usefixtures("bare")
@@ -49,7 +39,6 @@ def bare(monkeypatch: pytest.MonkeyPatch) -> None:
     [
         ("cuda", "pip install onnxruntime-gpu"),
         ("tensorrt", "pip install onnxruntime-gpu, and TensorRT 10"),
-        ("tensorrt-rtx", "pip install onnxruntime-ep-nv-tensorrt-rtx"),
     ],
 )
 def test_a_provider_that_is_not_installed_says_what_to_install(
@@ -69,7 +58,7 @@ def test_a_provider_that_is_not_installed_says_what_to_install(
     [
         (
             "npu",
-            "no provider 'npu'; there are cpu, cuda, openvino, tensorrt, tensorrt-rtx",
+            "no provider 'npu'; there are cpu, cuda, openvino, tensorrt",
         ),
         ("cpu{threads=4}", "cpu has no option 'threads'"),
         ("tensorrt{precision=fp4}", "tensorrt: precision: "),
@@ -137,28 +126,6 @@ def test_options_of_tensorrt_in_onnxruntimes_words(tmp_path: Path) -> None:
 def test_a_provider_that_onnxruntime_went_on_without() -> None:
     with pytest.raises(ProviderError, match="tensorrt cannot start here"):
         TensorRtProvider().confirm([CPU.native])
-
-
-def test_tensorrt_rtx_is_registered_from_its_package(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    module = ModuleType(RTX)
-    module.__spec__ = ModuleSpec(RTX, None)
-    vars(module)["get_library_path"] = lambda: "/the/provider.so"
-    monkeypatch.setitem(sys.modules, RTX, module)
-    registered: list[tuple[str, str]] = []
-    monkeypatch.setattr(
-        ort,
-        "register_execution_provider_library",
-        lambda name, path: registered.append((name, path)),
-    )
-    other = SimpleNamespace(ep_name=CPU.native)
-    monkeypatch.setattr(ort, "get_ep_devices", lambda: [other])
-
-    with pytest.raises(ProviderError, match="there is no RTX GPU here"):
-        TensorRtRtxProvider().attach(ort.SessionOptions())
-
-    assert registered == [(TensorRtRtxProvider.native, "/the/provider.so")]
 
 
 @pytest.mark.usefixtures("bare")

@@ -11,7 +11,6 @@ from me2e_compress.runtime.profile import in_turn_text
 from me2e_compress.runtime.providers import CpuProvider
 from me2e_compress.study import Study, StudyResult, Timing, load_study, run_study
 from me2e_compress.study.report.page import write_study
-from me2e_compress.study.workload import PlannedDrive, Workload
 from tests.evaluators.lanes import install_lanes
 from tests.study.conftest import IDEAL, ROUTES, Make
 from tests.support.in_process import Here
@@ -95,15 +94,6 @@ def test_what_an_evaluator_does_not_take(
 def test_where_it_drives_is_its_own_affair(asked: Path, tmp_path: Path) -> None:
     with pytest.raises(EvaluationError, match="workers and engine: lanes takes no eng"):
         run_study(asked, tmp_path / "out", LocalEngine(2))
-
-
-def test_a_short_study_takes_seconds_not_0_0_hours() -> None:
-    drive = PlannedDrive("float", "ideal", 0, 1, 20 / 3600)
-    ahead = Workload("Short", (drive,), 220, 1)
-
-    words = "1 drive, 1 route, 0 of them driven; about 20 s on 1 worker"
-    assert words in ahead.headline
-    assert ahead.tables()[0].rows[0][-1].text == "20 s"
 
 
 # Whatever a study runs, it runs on its provider.

@@ -26,10 +26,8 @@ from me2e_compress.simulator.routes import (
 )
 from me2e_compress.version import __version__
 
-EVERY_US = 200_000  # simulated time between two frames of an animation
 STRIP = 4  # moments of the strip
-# Frames of a route, by those of its type in `EXPERT_S`, which knows no traffic
-LONGER = 1.5
+EVERY_US = 200_000  # simulated time between two frames of an animation
 
 
 @dataclass(frozen=True)
@@ -99,11 +97,6 @@ class Highway(Evaluator):
         for driven in engine.drive(policy, replace(drive, routes=()), ordered):
             log_cost(folder, driven)
             yield driven.episode
-
-    def expected_s(self, route: RouteInfo) -> float:
-        """Return what the expert takes for its type, and half as much for traffic."""
-        (ours,) = _highway_routes([route])
-        return EXPERT_S[ours.scenario] * LONGER
 
     def render(
         self, policy: Driver, drive: Drive, route: RouteInfo, folder: Path

@@ -72,6 +72,5 @@ TENSOR = DIMENSIONS + ADDRESS
 # Names of the first words of a state, which are addresses of functions
 HOST_FUNCTIONS = (
     "CREATE_STATUS", "GET_INPUT", "GET_OUTPUT", "GET_DATA", "GET_INFO", "GET_TYPE",
-    "GET_RANK", "GET_DIMS", "RELEASE_INFO", "PARALLEL_FOR", "GET_ALLOCATOR", "ALLOCATE",
-    "FREE", "RELEASE_ALLOCATOR",
+    "GET_RANK", "GET_DIMS", "RELEASE_INFO", "PARALLEL_FOR",
 )  # fmt: skip

@@ -28,9 +28,14 @@ def _get_output(context: int, index: int, dims: int, rank: int, to: int) -> Word
     return 0
 
 
-def _get_data(tensor: int, to: int, c: int, d: int, e: int) -> Word:
-    words(to)[0] = words(tensor)[0]
-    return 0
+def _word(place: int) -> Callable[..., Word]:
+    """Return the function that reads a word of a tensor."""
+
+    def read(tensor: int, to: int, c: int, d: int, e: int) -> Word:
+        words(to)[0] = words(tensor)[place]
+        return 0
+
+    return read
 
 
 def _get_info(tensor: int, to: int, c: int, d: int, e: int) -> Word:
@@ -43,11 +48,6 @@ def _get_type(tensor: int, to: int, c: int, d: int, e: int) -> Word:
     return 0
 
 
-def _get_rank(tensor: int, to: int, c: int, d: int, e: int) -> Word:
-    words(to)[0] = words(tensor)[RANK]
-    return 0
-
-
 def _get_dims(tensor: int, to: int, count: int, d: int, e: int) -> Word:
     for axis in range(count):
         words(to)[axis] = words(tensor)[DIMENSIONS + axis]
@@ -56,21 +56,6 @@ def _get_dims(tensor: int, to: int, count: int, d: int, e: int) -> Word:
 
 def _create_status(code: int, text: int, c: int, d: int, e: int) -> Word:
     return text
-
-
-def _get_allocator(context: int, memory: int, to: int, d: int, e: int) -> Word:
-    words(to)[0] = memory  # addresses of `malloc` and `free`
-    return 0
-
-
-def _allocate(allocator: int, size: int, to: int, d: int, e: int) -> Word:
-    words(to)[0] = call(words(allocator)[0], size, 0, 0, 0, 0)
-    return 0 if words(to)[0] != 0 else 1
-
-
-def _free(allocator: int, memory: int, c: int, d: int, e: int) -> Word:
-    call(words(allocator)[1], memory, 0, 0, 0, 0)
-    return 0
 
 
 def _nothing(a: int, b: int, c: int, d: int, e: int) -> Word:
@@ -88,9 +73,7 @@ def functions(op_type: str) -> Mapping[str, Callable[..., Word]]:
     """Return the functions to compile, by their names in :mod:`abi`."""
     return {
         "CREATE_STATUS": _create_status, "GET_INPUT": _get_input,
-        "GET_OUTPUT": _get_output, "GET_DATA": _get_data, "GET_INFO": _get_info,
-        "GET_TYPE": _get_type, "GET_RANK": _get_rank, "GET_DIMS": _get_dims,
+        "GET_OUTPUT": _get_output, "GET_DATA": _word(0), "GET_INFO": _get_info,
+        "GET_TYPE": _get_type, "GET_RANK": _word(RANK), "GET_DIMS": _get_dims,
         "RELEASE_INFO": _nothing, "PARALLEL_FOR": _one_by_one,
-        "GET_ALLOCATOR": _get_allocator, "ALLOCATE": _allocate, "FREE": _free,
-        "RELEASE_ALLOCATOR": _nothing,
     }  # fmt: skip

@@ -103,7 +103,7 @@ def _compute_of(kernel: CompiledKernel, threads: int) -> Any:
     messages = [ctypes.create_string_buffer(each.encode()) for each in kernel.messages]
     texts = [ctypes.addressof(message) for message in messages]
     addresses = [functions[name] for name in abi.HOST_FUNCTIONS]
-    words = (*addresses, code["block"], ctypes.addressof(_memory()), *texts)
+    words = (*addresses, code["block"], *texts)
     state = (ctypes.c_int64 * abi.STATE_WORDS)(*words)
     run = _FUNCTION(code["compute"])
 
@@ -127,13 +127,6 @@ def _compute_of(kernel: CompiledKernel, threads: int) -> Any:
 def _host_functions() -> Mapping[str, int]:
     """Return the addresses of the functions that stand for onnxruntime's."""
     return load_or_compile(_CONTEXT, default_folder(), abi.HOST_FUNCTIONS)
-
-
-@functools.cache
-def _memory() -> Any:
-    """Return the addresses of the C library's ``malloc`` and ``free``."""
-    library = ctypes.CDLL(None)
-    return (ctypes.c_int64 * 2)(_address(library.malloc), _address(library.free))
 
 
 def _address(function: Any) -> int:

@@ -24,7 +24,7 @@ from me2e_compress.runtime.providers import CPU, Provider
 from me2e_compress.targets import LintFinding, LintRule, Target, error, name_of, warning
 from me2e_compress.targets.explicit_pairs import POSITIVE, SHIFTED, place_pairs
 from me2e_compress.targets.onnxruntime.region import never_negative
-from me2e_compress.targets.openvino.lint_rules import RULES
+from me2e_compress.targets.openvino.lint_rules import RULES, is_joined
 from me2e_compress.targets.quantized import DEQUANTIZE
 
 
@@ -71,41 +71,21 @@ class OpenVino(Target):
     def read_back(
         self, model: ir.Model, provider: Provider = CPU
     ) -> tuple[LintFinding, ...]:
-        """Open a graph where OpenVINO is installed, and list int8 layers in float."""
+        """Open a graph where OpenVINO is installed, and say why it is refused."""
         runner = (
             provider if isinstance(provider, OpenVinoProvider) else OpenVinoProvider()
         )
         if not runner.is_installed():
             return ()
         try:
-            engine = Engine(model, runner, 1, int8_kernels=True)
+            runner.open(model, 1, int8_kernels=True)
         except GraphError as refusal:
             return (error("refused", None, str(refusal)),)
-        return tuple(_float_layers(model, engine.precisions()))
+        return ()
 
 
 def _convolved(value: ir.Value) -> bool:
     """Return whether convolutions alone read what a Concat made."""
     # There int8 is wrong by 11 dB; in front of a MatMul a zero point is refused
     readers = {reader.op_type for reader in value.consumers()}
-    joined = value
-    while (moved := maker(joined, *LAYOUT_OPERATORS)) is not None:
-        if moved.inputs[0] is None:
-            return False
-        joined = moved.inputs[0]
-    return maker(joined, "Concat") is not None and readers <= set(CONVOLUTIONS)
-
-
-def _float_layers(
-    model: ir.Model, precisions: Mapping[str, str]
-) -> Iterator[LintFinding]:
-    """Find layers of which both operands come through pairs and that run in float."""
-    for node in nodes_of(model):
-        makers = [None if e is None else e.producer() for e in node.inputs[:2]]
-        if node.op_type not in WEIGHTED or not all(
-            maker is not None and maker.op_type == DEQUANTIZE for maker in makers
-        ):
-            continue
-        runs = precisions.get(name_of(node), "")
-        if runs in ("f32", "bf16", "f16"):
-            yield warning("float-kernel", node, f"reads int8, and runs in {runs}")
+    return is_joined(value) and readers <= set(CONVOLUTIONS)

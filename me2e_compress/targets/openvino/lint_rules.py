@@ -7,7 +7,6 @@ opening a graph tells.
 
 from collections.abc import Iterator
 
-import numpy as np
 import onnx_ir as ir
 
 from me2e_compress.graph import array_of, input_at, is_standard, nodes_of
@@ -25,9 +24,15 @@ from me2e_compress.targets import (
 from me2e_compress.targets.quantized import (
     DEQUANTIZE,
     QUANTIZE,
-    is_in_a_pair,
     stored_type,
 )
+
+
+def is_joined(value: ir.Value | None) -> bool:
+    """Return whether a Concat made a value, but for its layout."""
+    while (moved := maker(value, *LAYOUT_OPERATORS)) is not None:
+        value = moved.inputs[0]
+    return maker(value, "Concat") is not None
 
 
 @rule_of_nodes("zero-point", "wrong")
@@ -82,37 +87,8 @@ def _joined(node: ir.Node) -> Iterator[str]:
     quantizer = maker(reader.inputs[0], QUANTIZE)
     if quantizer is None or stored_type(quantizer) != ir.DataType.INT8:
         return
-    joined = quantizer.inputs[0]
-    while (moved := maker(joined, *LAYOUT_OPERATORS)) is not None:
-        joined = moved.inputs[0]
-    if maker(joined, "Concat") is not None:
+    if is_joined(quantizer.inputs[0]):
         yield "it reads int8 behind a Concat: wrong by more than int8; uint8 is right"
-
-
-@rule_of_nodes("float-behind-concat", "warning")
-def _scales_apart(node: ir.Node) -> Iterator[str]:
-    """Find Concats of pairs on several grids: what reads them runs in float."""
-    if node.op_type != "Concat" or not is_standard(node):
-        return
-    pairs = [maker(value, DEQUANTIZE) for value in node.inputs]
-    if len(pairs) < 2 or None in pairs:
-        return
-    scales = [array_of(input_at(pair, 1)) for pair in pairs if pair is not None]
-    zeros = [array_of(input_at(pair, 2)) for pair in pairs if pair is not None]
-    if any(zero is not None and zero.any() for zero in zeros):
-        yield "a zero point that is not 0 here makes OpenVINO refuse some graphs"
-    elif any(
-        scale is None or scales[0] is None or not np.array_equal(scale, scales[0])
-        for scale in scales
-    ):
-        yield "it joins pairs of several scales: the layers behind it run in float"
-
-
-@rule_of_nodes("float-clip", "warning")
-def _clipped(node: ir.Node) -> Iterator[str]:
-    """Find a Clip between the nodes of a pair (brevitas): its layer runs in float."""
-    if node.op_type == "Clip" and is_standard(node) and is_in_a_pair(node):
-        yield "it stands between the nodes of a pair: the layer behind runs in float"
 
 
 def _functions(model: ir.Model) -> Iterator[LintFinding]:
@@ -129,5 +105,5 @@ def _functions(model: ir.Model) -> Iterator[LintFinding]:
 
 RULES: tuple[LintRule, ...] = (
     valid, of_opset, divided_grids, _functions, _zero_point, _attribute, _type,
-    _joined, _scales_apart, _clipped,
+    _joined,
 )  # fmt: skip

@@ -11,7 +11,6 @@ from me2e_compress.runtime.providers import (
     CpuProvider,
     CudaProvider,
     TensorRtProvider,
-    TensorRtRtxProvider,
 )
 from me2e_compress.targets.onnxruntime import OnnxRuntime
 from me2e_compress.targets.onnxruntime.convert import slow_here
@@ -263,7 +262,7 @@ def test_another_provider_runs_that_form_well() -> None:
     model = chain("modelopt")
 
     assert slow_here(model, CpuProvider(plugins=(Path("library.so"),))) is not None
-    for provider in (CudaProvider(), TensorRtProvider(), TensorRtRtxProvider()):
+    for provider in (CudaProvider(), TensorRtProvider()):
         assert slow_here(model, provider) is None
 
 

@@ -29,7 +29,7 @@ def answers(model: ir.Model) -> float:
     frame = {n: random.normal(size=shape).astype(np.float32) for n in ("x", "z")}
     nodes = Session(model, threads=1).run(frame)["y"].astype(np.float64)
     session = Session(model, threads=1, int8_kernels=True, provider=OpenVinoProvider())
-    gap = session.run(frame)["y"] - nodes
+    gap = session.run(frame)["y"].astype(np.float64) - nodes
     return float(10 * np.log10((nodes**2).sum() / max((gap**2).sum(), 1e-30)))
 
 
