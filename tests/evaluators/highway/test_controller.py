@@ -7,14 +7,12 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.interpolate import CubicSpline
 
 from me2e_compress.driving.contract import PedalsAndWheel, Trajectory
 from me2e_compress.evaluators.highway.controller import (
     AnchoredPlan,
     control_of,
     curvature_by,
-    spline_through,
 )
 from me2e_compress.simulator.bicycle import (
     MAX_STEERING_RAD,
@@ -113,18 +111,6 @@ def test_the_curve_leaves_on_the_course_not_on_the_heading() -> None:
     plan = AnchoredPlan.of(waypoints, ego_at(0.0, 0.0, 0.0, 8.0, steering), 0)
     first = plan.curve[1] - plan.curve[0]
     assert math.atan2(first[1], first[0]) == pytest.approx(slip_of(steering), abs=0.05)
-
-
-@pytest.mark.parametrize("count", [2, 3, 7])
-def test_the_curve_is_that_of_scipys_spline(count: int) -> None:
-    tangent, random = np.array([0.8, 0.6]), np.random.default_rng(count)
-    knots = random.uniform(0.5, 9.0, (count, 2)).cumsum(axis=0)
-    arc = np.append(0.0, np.hypot(*np.diff(knots, axis=0).T).cumsum())
-    theirs = CubicSpline(arc, knots, bc_type=((1, tangent), (2, np.zeros(2))))
-    fine = np.linspace(0.0, arc[-1], 11)
-    curve, end = spline_through(arc, knots, tangent, fine)
-    assert curve == pytest.approx(theirs(fine), abs=1e-12)
-    assert end == pytest.approx(theirs(arc[-1], 1), abs=1e-12)
 
 
 def test_a_heap_of_waypoints_is_a_stop() -> None:

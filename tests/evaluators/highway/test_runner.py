@@ -139,7 +139,7 @@ def test_a_policy_that_breaks_its_contract_has_failed(way: str, reason: str) -> 
 def test_a_policy_sees_what_it_may() -> None:
     plain, seeing = Standing(plans=8.0), Standing(needs_images=True, plans=8.0)
     seeing.image_size = (32, 48)
-    drive(PARKED, plain, IDEAL, Listeners(on_moment=lambda moment: None))
+    drive(PARKED, plain, IDEAL)
     drive(PARKED, seeing, IDEAL)
 
     first = plain.seen[0]
@@ -205,7 +205,9 @@ def test_watching_changes_nothing() -> None:
     assert watched == drive(PARKED, Blind(), IDEAL)
     assert len(moments) == len(watched.frames)
     assert moments[-1].events
-    assert moments[0].images.shape == (6, 96, 160, 3)
+    images = moments[0].images
+    assert images is not None
+    assert images.shape == (6, 96, 160, 3)
 
 
 def test_a_held_plan_stays_where_it_was_made() -> None:

@@ -24,7 +24,8 @@ from me2e_compress.simulator.scene import (
 )
 
 DT_US = 50_000
-LAG_S = (0.2, 0.1)  # of acceleration and steering, as in the real world's ego
+LAG_S = (0.2, 0.1)
+"""Of acceleration and steering, as in the real world's ego."""
 
 
 def path_through(
@@ -36,11 +37,17 @@ def path_through(
 ) -> RoutePath:
     line = resample(points, 1.0)
     n = len(line)
-    edges = left_m, right_m, left_m if oncoming_m is None else oncoming_m
-    room = (np.full(n, metres) for metres in edges)
-    way = line, polyline_headings(line), np.full(n, 3.5), np.full(n, limit_mps)
-    follow = np.full(n, int(Command.FOLLOW), np.int64)
-    return RoutePath(*way, follow, n - 61.0, *room)
+    return RoutePath(
+        line,
+        polyline_headings(line),
+        np.full(n, 3.5),
+        np.full(n, limit_mps),
+        np.full(n, int(Command.FOLLOW), np.int64),
+        n - 61.0,
+        np.full(n, left_m),
+        np.full(n, right_m),
+        np.full(n, left_m if oncoming_m is None else oncoming_m),
+    )
 
 
 def straight(**edges: float) -> RoutePath:
@@ -97,10 +104,17 @@ class TinyWorld:
         speed = max(0.0, ego.speed_mps + pushed * dt)
         travel = (ego.speed_mps + speed) / 2 * dt
         x, y, heading = advance(ego.x, ego.y, ego.heading, wheel, travel, ego.length)
-        motion = x, y, heading, speed, pushed, 0.0, 0.0, wheel
-        self.ego = Ego(*motion, ego.length, ego.width)
+        self.ego = Ego(
+            *(x, y, heading, speed, pushed, 0.0, 0.0, wheel),
+            length=ego.length,
+            width=ego.width,
+        )
         self.actors = tuple(
-            replace(a, x=a.x + m * math.cos(a.heading), y=a.y + m * math.sin(a.heading))
-            for a, m in ((a, a.speed_mps * dt) for a in self.actors)
+            replace(
+                a,
+                x=a.x + a.speed_mps * dt * math.cos(a.heading),
+                y=a.y + a.speed_mps * dt * math.sin(a.heading),
+            )
+            for a in self.actors
         )
         self.time_us += DT_US
