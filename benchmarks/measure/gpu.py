@@ -1,6 +1,6 @@
 """The driver and VAD-tiny on every provider of onnxruntime that is installed here.
 
-    python -m benchmarks.measure.gpu OUT [--providers cpu,cuda,tensorrt,tensorrt-rtx]
+    python -m benchmarks.measure.gpu OUT [--providers cpu,cuda,tensorrt]
         [--subjects highway,vad-tiny] [--plugins LIB --dialect tensorrt] [--frames N]
         [--runs 200] [--seconds 60] [--warm-up 20] [--threads 0] [--no-energy]
 

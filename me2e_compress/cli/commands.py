@@ -442,7 +442,6 @@ def study(
     *,
     output: Output,
     routes: str | None = None,
-    tables: str | None = None,
     provider: str | None = None,
     trust_code: bool = False,
     running: WorkerOptions = RUNNING,
@@ -454,7 +453,6 @@ def study(
         definition: STUDY.toml
         output: the folder
         routes: routes: all, a number, ID,ID; not the study's
-        tables: only these of its blocks: A,B
         provider: runs the graph: cpu, cuda, ...; not the study's
         trust_code: run Python and libraries that it names
     """
@@ -468,13 +466,11 @@ def study(
 
     # read and check everything that the study needs before it starts
     asked = load_study(definition, routes, provider, trust_code=trust_code)
-    if tables is not None:
-        asked = asked.of_blocks(tables.split(","))
     inputs = (definition, *asked.inputs())
     check_folder(output, inputs, (JSON, MARKDOWN, HTML))
     # the report quotes the command that repeats the study
     words = ["me2e-compress", "study", str(definition), "-o", str(output)]
-    flags = {"--routes": routes, "--tables": tables, "--provider": provider}
+    flags = {"--routes": routes, "--provider": provider}
     for flag, value in flags.items():
         words += [] if value is None else [flag, value]
     words += ["--trust-code"] * trust_code

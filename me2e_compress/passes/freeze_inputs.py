@@ -7,7 +7,7 @@ import math
 import numpy as np
 import onnx_ir as ir
 
-from me2e_compress.base.errors import FramesError, PreconditionError, RecipeError
+from me2e_compress.base.errors import FramesError, PreconditionError
 from me2e_compress.calibration import dataset
 from me2e_compress.graph.nodes import nodes_of, producer_of
 from me2e_compress.graph.recurrence import recurrent_inputs
@@ -39,11 +39,6 @@ class FreezeInputs(Pass):
     exact = False
     changes_interface = True
     inputs: tuple[str, ...] = ("lidar2img",)
-
-    def __post_init__(self) -> None:
-        """Check that inputs are given."""
-        if not self.inputs:
-            raise RecipeError(f"{self.name} needs inputs: inputs=[lidar2img]")
 
     @property
     def needs_frames(self) -> bool:

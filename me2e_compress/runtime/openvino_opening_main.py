@@ -7,12 +7,9 @@ one that it dies of.
 import json
 import sys
 
-import openvino as ov
-
-from me2e_compress.operators.kernels.openvino_ops import extensions
+from me2e_compress.operators.kernels import why_not
+from me2e_compress.runtime.openvino import new_core
 
 if __name__ == "__main__":
-    core = ov.Core()
-    for extension in extensions(1):
-        core.add_extension(extension)
+    core = new_core(1 if why_not() is None else None)
     core.compile_model(core.read_model(sys.argv[1]), "CPU", json.loads(sys.argv[2]))

@@ -51,9 +51,6 @@ class Engine(abc.ABC):
         An input that does not fit is a FramesError, a node that fails a GraphError.
         """
 
-    def free_after_runs(self) -> None:  # noqa: B027
-        """Free working memory after every run from now on, where it can be."""
-
     def end_profile(self) -> Path:
         """Write the profile of its nodes; return the file."""
         raise ProviderError("times of nodes are measured in onnxruntime alone")
@@ -123,9 +120,9 @@ class Provider(abc.ABC):
         """Open a graph in an engine of its own; None where onnxruntime runs it."""
         return None
 
-    @abc.abstractmethod
     def chain(self) -> Chain | None:
-        """Return the providers of a session; None where its options name them."""
+        """Return the providers of a session; None where it needs none."""
+        return None
 
     def confirm(self, running: Sequence[str]) -> None:
         """Check that it is among the ``running`` providers; else a ProviderError."""

@@ -313,9 +313,9 @@ class Session:
         self.last_us = 0
         engine = provider.open(model, threads, int8_kernels=stock or int8_kernels)
         without = () if stock else None
-        self._engine = engine or _OnnxRuntime(model, options, provider, without)
-        if release:
-            self._engine.free_after_runs()
+        if engine is None:
+            engine = _OnnxRuntime(model, options, provider, without, release=release)
+        self._engine = engine
         self.inputs, self.outputs = self._engine.inputs, self._engine.outputs
         stored = self._engine.metadata
         self.metadata = {**stored, **(metadata or {})}
@@ -377,8 +377,12 @@ class _OnnxRuntime(Engine):
         options: ort.SessionOptions,
         provider: Provider,
         without: Sequence[str] | None,
+        *,
+        release: bool,
     ) -> None:
         self._each_run, self._lent = ort.RunOptions(), dict[str, ort.OrtValue]()
+        if release:
+            self._each_run.add_run_config_entry(_SHRINK, "cpu:0")
         if isinstance(model, ir.Model):
             self._ort, lent = open_graph(model, options, provider, without)
         else:
@@ -390,9 +394,6 @@ class _OnnxRuntime(Engine):
             self.metadata = self._ort.get_modelmeta().custom_metadata_map
         except UnicodeDecodeError as error:
             raise GraphError(f"a name in the graph is not UTF-8: {error}") from error
-
-    def free_after_runs(self) -> None:
-        self._each_run.add_run_config_entry(_SHRINK, "cpu:0")
 
     def run(self, names: Sequence[str], inputs: Mapping[str, Array]) -> list[Array]:
         # Inputs that do not fit are the caller's fault, others the graph's.

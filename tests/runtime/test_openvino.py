@@ -58,7 +58,6 @@ def test_kernels_run_inside(threads: int) -> None:
     model, arrays = call()
     wanted = Session(model, threads=1).run(arrays)["result"]
     session = Session(model, threads=threads, provider=OPENVINO)
-    # no body would give the same numbers
     assert np.array_equal(session.run(arrays)["result"], wanted)
 
 
@@ -70,7 +69,6 @@ def test_where_a_kernel_refuses_its_inputs_the_body_runs_told_once() -> None:
 
     with pytest.warns(RuntimeWarning, match="a number is negative: bodies run"):
         first = session.run(arrays)
-    # a second warning would be an error
     assert np.array_equal(session.run(arrays)["result"], first["result"])
 
 
@@ -106,7 +104,7 @@ def test_bfloat16_is_refused_where_the_cpu_has_none(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     old = SimpleNamespace(get_property=lambda device, name: ["FP32", "INT8"])
-    monkeypatch.setattr(openvino, "_core", lambda: old)
+    monkeypatch.setattr(openvino, "new_core", lambda: old)
     with pytest.raises(ProviderError, match="this CPU has no bf16, only FP32, INT8"):
         provider_named("openvino{precision=bf16}")
 

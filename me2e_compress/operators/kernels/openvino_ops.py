@@ -7,7 +7,7 @@ session has: OpenVINO's pool cannot be used from there, and is idle meanwhile.
 
 import ctypes
 import functools
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from itertools import count
 from typing import Any
@@ -32,10 +32,6 @@ _TYPES = {
     np.dtype(np.int8): abi.INT8, np.dtype(np.int32): abi.INT32,
     np.dtype(np.int64): abi.INT64,
 }  # fmt: skip
-
-
-class KernelRefusalError(RuntimeError):
-    """A kernel does not take the inputs of a node."""
 
 
 def extensions(threads: int) -> list[ConversionExtension]:
@@ -97,12 +93,14 @@ def _operator_of(kernel: CompiledKernel, threads: int) -> Any:
 def _compute_of(kernel: CompiledKernel, threads: int) -> Any:
     """Return the function that runs a kernel on arrays, its output the first."""
     code = load_or_compile(kernel, default_folder())
-    functions = dict(_host_functions())
+    names = abi.HOST_FUNCTIONS
+    functions = dict(load_or_compile(_CONTEXT, default_folder(), names))
     if threads > 1:
-        functions["PARALLEL_FOR"] = _address(_parallel_for(threads))
+        callback = ctypes.cast(_parallel_for(threads), ctypes.c_void_p)
+        functions["PARALLEL_FOR"] = callback.value or 0
     messages = [ctypes.create_string_buffer(each.encode()) for each in kernel.messages]
     texts = [ctypes.addressof(message) for message in messages]
-    addresses = [functions[name] for name in abi.HOST_FUNCTIONS]
+    addresses = [functions[name] for name in names]
     words = (*addresses, code["block"], *texts)
     state = (ctypes.c_int64 * abi.STATE_WORDS)(*words)
     run = _FUNCTION(code["compute"])
@@ -115,24 +113,12 @@ def _compute_of(kernel: CompiledKernel, threads: int) -> Any:
             tensor = [array.ctypes.data, kind, len(dims), *dims]
             context[place : place + len(tensor)] = tensor
         status = run(ctypes.addressof(state), ctypes.addressof(context))
-        if status in texts:
-            reason = messages[texts.index(status)].value.decode()
-            raise KernelRefusalError(f"{kernel.op_type}: {reason}")
         if status:
-            raise KernelRefusalError(f"{kernel.op_type}: output or memory do not fit")
+            known = dict(zip(texts, kernel.messages, strict=True))
+            reason = known.get(status, "its output does not fit")
+            raise RuntimeError(f"kernel: {kernel.op_type}: {reason}")
 
     return compute
-
-
-def _host_functions() -> Mapping[str, int]:
-    """Return the addresses of the functions that stand for onnxruntime's."""
-    return load_or_compile(_CONTEXT, default_folder(), abi.HOST_FUNCTIONS)
-
-
-def _address(function: Any) -> int:
-    address = ctypes.cast(function, ctypes.c_void_p).value
-    assert address is not None
-    return address
 
 
 BLOCKS_PER_THREAD = 8

@@ -201,10 +201,17 @@ class FoldConstants(Pass):
             tally["changes"] += remove_dead(model.graph)
             tally["kept"] = 0  # the last round's counts
             self._fold(model.graph, opset, tally, refusals, fresh, trust=True)
-            taken = _inline_branches(model.graph, opset, self.name)
+            # Every If of known condition, in bodies too, is its branch from now on
+            taken = [
+                branch
+                for body in list(graphs_of(model.graph))
+                for node in list(body)
+                if node.op_type == "If" and node.graph is body
+                if (branch := _inline_branch(node, opset, self.name)) is not None
+            ]
             # The Ifs had hidden the shapes of what their branches read
-            nodes = (node for branch in taken for node in branch)
-            fresh = {value for node in nodes for value in node.inputs if value}
+            moved = (node for nodes in taken for node in nodes)
+            fresh = {value for node in moved for value in node.inputs if value}
             if taken:
                 tally.update(changes=1, inlined=1)
                 continue
@@ -370,17 +377,6 @@ def _reshape_bounds(graph: ir.Graph, opset: int, by: str) -> int:
 
 
 # Replace an If whose condition is known by the branch that it takes.
-
-
-def _inline_branches(graph: ir.Graph, opset: int, by: str) -> list[list[ir.Node]]:
-    """Replace every If of known condition, in bodies too; list the branches' nodes."""
-    return [
-        nodes
-        for body in list(graphs_of(graph))
-        for node in list(body)
-        if node.op_type == "If" and node.graph is body
-        if (nodes := _inline_branch(node, opset, by)) is not None
-    ]
 
 
 def _inline_branch(node: ir.Node, opset: int, by: str) -> list[ir.Node] | None:

@@ -6,26 +6,21 @@ convolutions in float, and refuses a Concat of pairs of which one has a zero poi
 """
 
 import dataclasses
-from collections.abc import Iterator, Mapping
 from typing import ClassVar
 
 import onnx_ir as ir
 
 from me2e_compress.base.errors import GraphError
 from me2e_compress.calibration.ranges import Ranges
-from me2e_compress.graph import WEIGHTED, nodes_of
-from me2e_compress.graph.nodes import LAYOUT_OPERATORS, maker
 from me2e_compress.graph.shapes import CONVOLUTIONS
 from me2e_compress.quantization.decision import QuantPlan
 from me2e_compress.quantization.plan import tensors_of
-from me2e_compress.runtime.openvino import OpenVino as Engine
 from me2e_compress.runtime.openvino import OpenVinoProvider
 from me2e_compress.runtime.providers import CPU, Provider
-from me2e_compress.targets import LintFinding, LintRule, Target, error, name_of, warning
+from me2e_compress.targets import LintFinding, LintRule, Target, error
 from me2e_compress.targets.explicit_pairs import POSITIVE, SHIFTED, place_pairs
 from me2e_compress.targets.onnxruntime.region import never_negative
 from me2e_compress.targets.openvino.lint_rules import RULES, is_joined
-from me2e_compress.targets.quantized import DEQUANTIZE
 
 
 @dataclasses.dataclass(frozen=True)

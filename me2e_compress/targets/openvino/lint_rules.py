@@ -60,11 +60,11 @@ def _attribute(node: ir.Node) -> Iterator[str]:
     """Find attributes that OpenVINO ignores or reads in its own way."""
     if not is_standard(node):
         return
-    if node.op_type == "Resize" and node.attributes.get_int("antialias", 0):
+    read = node.attributes
+    if node.op_type == "Resize" and read.get_int("antialias", 0) > 0:
         yield "antialias is ignored"
-    counted = node.attributes.get_int("count_include_pad", 0)
-    ceil = node.attributes.get_int("ceil_mode", 0)
-    if node.op_type == "AveragePool" and counted and ceil:
+    counted = read.get_int("count_include_pad", 0) * read.get_int("ceil_mode", 0)
+    if node.op_type == "AveragePool" and counted:
         yield "with ceil_mode it divides by cells that are not there"
 
 

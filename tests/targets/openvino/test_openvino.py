@@ -25,8 +25,7 @@ SHAPES = {"w": (16, 8, 1, 1), "v": (8, 16, 1, 1)}
 def answers(model: ir.Model) -> float:
     """The dB from what OpenVINO's int8 answers to what the nodes say."""
     random = np.random.default_rng(0)
-    shape = (1, 4, 8, 8)
-    frame = {n: random.normal(size=shape).astype(np.float32) for n in ("x", "z")}
+    frame = {n: random.normal(size=(1, 4, 8, 8)).astype("f") for n in ("x", "z")}
     nodes = Session(model, threads=1).run(frame)["y"].astype(np.float64)
     session = Session(model, threads=1, int8_kernels=True, provider=OpenVinoProvider())
     gap = session.run(frame)["y"].astype(np.float64) - nodes
@@ -40,7 +39,6 @@ def test_what_it_answers_is_the_file_s_where_tensorrt_s_form_is_not() -> None:
     )
 
     assert answers(ours) > 60 > 30 > answers(theirs)
-    # uint8 behind the Concat, with the scale of int8; behind the Relu twice the steps
     grids = {
         str(node.inputs[0].name): [array_of(value) for value in node.inputs[1:]]
         for node in ours.graph
@@ -51,13 +49,6 @@ def test_what_it_answers_is_the_file_s_where_tensorrt_s_form_is_not() -> None:
     assert not [e for e in OpenVino().lint(ours) if e.severity != "warning"]
     (finding,) = [e for e in OpenVino().lint(theirs) if e.severity == "wrong"]
     assert finding.rule == "int8-behind-concat"
-
-
-def test_read_back_finds_no_layer_in_float() -> None:
-    assert (
-        OpenVino().read_back(placed(drawn(JOINED, SHAPES), "openvino", ends=(-3, 3)))
-        == ()
-    )
 
 
 PAIR = (
@@ -86,9 +77,7 @@ DOUBLE = (
         (PAIR.format(0) + "y = " + POOL.format(1, "", "d"), ""),
         (PAIR.format(5) + "y = " + POOL.format(0, "", "d"), ""),
         (PAIR.format(5) + SUM, "zero-point"),
-        (PAIR.format(0) + SUM, ""),
         (PAIR.format(5) + PAD, "zero-point"),
-        (PAIR.format(0) + PAD, ""),
         ("y = " + POOL.format(1, CEIL, "x"), "attribute"),
         ("y = " + POOL.format(0, CEIL, "x"), ""),
         (RESIZE.format(1), "attribute"),
