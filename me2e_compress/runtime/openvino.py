@@ -206,11 +206,8 @@ def _is_open(node: ir.Node) -> bool:
 
 
 def _dies(proto: onnx.ModelProto, config: Mapping[str, Any]) -> bool:
-    """Return whether OpenVINO dies of compiling a graph for one thread.
-
-    2026.4.1 does where it fuses TCP's decoder (``SNIPPETS_MODE``). It is tried in a
-    process of its own, once on this machine.
-    """
+    """Return whether OpenVINO dies of compiling a graph for one thread."""
+    # 2026.4.1 does as it fuses TCP's decoder: each graph is tried apart, once
     content, asked = proto.SerializeToString(deterministic=True), json.dumps(config)
     key = hashlib.sha256(
         content + f"{asked} {metadata.version('openvino')}".encode()
