@@ -208,8 +208,8 @@ class Timed:
     """Sees the cameras of every frame, and counts the CPU time of who drives."""
 
     policy: Policy
-    needs_images: ClassVar[bool] = True
-    privileged: ClassVar[bool] = True
+    needs_images: bool = True
+    privileged: bool = True
     seconds: float = 0.0
 
     def reset(self, route: RouteInfo) -> None:

@@ -20,7 +20,7 @@ import onnxruntime as ort
 import platformdirs
 from onnx import inliner
 
-from me2e_compress import graph
+from me2e_compress import graph, operators
 from me2e_compress.base.atomic import write_bytes
 from me2e_compress.base.errors import FramesError, GraphError, ProviderError
 from me2e_compress.base.extras import missing_module, require_extra
@@ -170,8 +170,8 @@ class OpenVino(Engine):
             self._request.wait()
         except RuntimeError as error:
             if self._compiled and "RuntimeError: kernel: " in str(error):
-                told = f"{_line(error)}: bodies run instead"
-                warnings.warn(told, RuntimeWarning, stacklevel=2)
+                message = f"{_line(error)}: bodies run instead"
+                warnings.warn(message, RuntimeWarning, stacklevel=2)
                 self._compiled = False
                 self._open()
                 return self.run(names, inputs)
@@ -189,6 +189,9 @@ def for_openvino(model: ir.Model, *, compiled: bool) -> onnx.ModelProto:
     if compiled and any(map(_is_open, filter(is_fused, graph.nodes_of(model)))):
         typed = model.clone()
         graph.infer_shapes(typed)
+        for node in graph.nodes_of(typed):  # probes too, of which no size is known
+            if (call := operators.find(node)) is not None:
+                operators.set_output(node, *call)
     prepared, _ = replace_fused(typed, compiled=compiled)
     calls = [n for n in graph.nodes_of(prepared) if n.domain == kernels.DOMAIN]
     if any(map(_is_open, calls)):

@@ -311,14 +311,11 @@ class Session:
             options.profile_file_prefix = str(profiled / "nodes")
         # Open the graph, and read its ports and metadata
         self.last_us = 0
-        engine = provider.open(model, threads, int8_kernels=stock or int8_kernels)
-        without = () if stock else None
-        if engine is None:
-            engine = _OnnxRuntime(model, options, provider, without, release=release)
-        self._engine = engine
-        self.inputs, self.outputs = self._engine.inputs, self._engine.outputs
-        stored = self._engine.metadata
-        self.metadata = {**stored, **(metadata or {})}
+        own = provider.open(model, threads, int8_kernels=stock or int8_kernels)
+        left = () if stock else None
+        engine = own or _OnnxRuntime(model, options, provider, left, release=release)
+        self._engine, self.inputs, self.outputs = engine, engine.inputs, engine.outputs
+        self.metadata = {**engine.metadata, **(metadata or {})}
         self.recurrent = recurrence(self.metadata, self.inputs, self.outputs)
 
     def first_state(self, arrays: Mapping[str, Array]) -> dict[str, Array]:

@@ -44,7 +44,7 @@ def test_compare_says_what_the_runtime_answers_otherwise(cli: Cli) -> None:
     assert found["runtime"] is None  # it is what is compared
     assert found["outputs"][0]["sqnr_db"] < 20
     found = cli.document("compare clean.onnx clean.onnx frames")
-    assert found["runtime"] == {"sqnr_db": {}, "nodes_db": {}, "causes": []}
+    assert found["runtime"]["sqnr_db"] == found["runtime"]["nodes_db"] == {}
     said = cli.done("compare clean.onnx clean.onnx frames").words
     assert "answers otherwise" not in said
 

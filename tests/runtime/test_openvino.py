@@ -1,5 +1,6 @@
 """Graphs in OpenVINO: the same answers, kernels inside, and refusals in a line."""
 
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -13,43 +14,49 @@ from me2e_compress.base.errors import (
     MissingExtraError,
     ProviderError,
 )
+from me2e_compress.calibration.calibrator import Calibrator
+from me2e_compress.calibration.dataset import CalibrationSet
 from me2e_compress.runtime import openvino
 from me2e_compress.runtime.openvino import OpenVinoProvider
 from me2e_compress.runtime.profile import machine_text
-from me2e_compress.runtime.providers import provider_named
+from me2e_compress.runtime.providers import CPU, provider_named
 from me2e_compress.runtime.session import Session
 from tests.operators.kernels import needs_kernels
 from tests.operators.kernels.test_session import call
+from tests.support.frames import record
 from tests.support.nets import conv_attention, image, parsed
 
 OPENVINO = OpenVinoProvider()
-ADDED = "m (float[2] x, float[2] prev_s) => (float[2] s, float[2] next_s) {{ {} }}"
-SUM = ADDED.format("next_s = Add(x, prev_s) s = Identity(next_s)")
+SUM = """m (float[2] x, float[2] prev_s) => (float[2] s, float[2] next_s)
+    { next_s = Add(x, prev_s) s = Identity(next_s) }"""
 
 
-def test_it_answers_as_onnxruntime_does() -> None:
+def test_it_answers_as_onnxruntime_does(tmp_path: Path) -> None:
     model, frame = conv_attention(), image(0)
     reference = Session(model, threads=1)
     feeds = {**frame, **reference.first_state({})}
     wanted = reference.run(feeds)
 
-    for threads in (1, 2):
-        values = Session(model, threads=threads, provider=OPENVINO).run(feeds)
-        for name, value in wanted.items():
-            gap = values[name].astype(np.float64) - value.astype(np.float64)
-            assert abs(gap).max() < 1e-3
+    values = Session(model, threads=2, provider=OPENVINO).run(feeds)
+    for name, value in wanted.items():
+        gap = values[name].astype(np.float64) - value.astype(np.float64)
+        assert abs(gap).max() < 1e-3
+    frames, names = CalibrationSet(record(tmp_path, [image(0)])), ("a",)
+    ours, its = (Calibrator("mse", provider=by) for by in (CPU, OPENVINO))
+    counts = its.collect(model, names, frames).histograms()
+    apart = counts - ours.collect(model, names, frames).histograms()
+    assert abs(apart).sum() < 0.01 * counts.sum()
 
 
 def test_two_names_of_one_port_and_state_are_known() -> None:
     session = Session(parsed(SUM), threads=1, provider=OPENVINO)
+    text = machine_text(2, OpenVinoProvider(precision="bf16"))
+    assert text.endswith('OpenVINO on 2 threads, openvino{precision="bf16"}')
 
     values = session.run({"x": np.ones(2, "f"), "prev_s": np.full(2, 3, "f")})
 
     assert session.recurrent == {"prev_s": "next_s"}
-    assert {name: value.tolist() for name, value in values.items()} == {
-        "s": [4, 4],
-        "next_s": [4, 4],
-    }
+    assert [values[name].tolist() for name in ("s", "next_s")] == [[4, 4]] * 2
 
 
 @needs_kernels
@@ -77,15 +84,13 @@ def test_where_a_kernel_refuses_its_inputs_the_body_runs_told_once() -> None:
     [
         ({"x": np.ones(3, "f")}, r"do not fit: x has shape \[3\], the graph takes \[2"),
         ({"x": np.ones(2)}, "do not fit: x is float64, the graph takes float32"),
-        ({}, "input x is missing"),
     ],
 )
 def test_inputs_that_do_not_fit_are_named(
     frame: dict[str, npt.NDArray[Any]], reason: str
 ) -> None:
-    session = Session(
-        parsed("m (float[2] x) => (float[2] y) { y = Neg(x) }"), provider=OPENVINO
-    )
+    model = parsed("m (float[2] x) => (float[2] y) { y = Neg(x) }")
+    session = Session(model, provider=OPENVINO)
     with pytest.raises(FramesError, match=reason):
         session.run(frame)
 
@@ -115,8 +120,3 @@ def test_without_the_package_a_line_says_what_to_install(
     monkeypatch.setattr("me2e_compress.base.extras.MODULES", {"openvino": ("no_ov",)})
     with pytest.raises(MissingExtraError, match=r"provider openvino .*\[openvino\]"):
         provider_named("openvino")
-
-
-def test_traces_name_engine_threads_and_precision() -> None:
-    text = machine_text(2, OpenVinoProvider(precision="bf16"))
-    assert text.endswith('OpenVINO on 2 threads, openvino{precision="bf16"}')

@@ -72,10 +72,10 @@ def fuse_attention(node: ir.Node, call: FusedCall) -> ir.Value | None:
         raise PreconditionError(f"fused nodes need opset {OLDEST_OPSET} or later")
     shape = _checked(attention, softmax)
     reads = _rows_behind(attention, len(shape))
-    (*_, queries, channels), keys = shape, static_shape(attention.turned_key) or ()
-    heads = math.prod(shape[:-2])
-    if not pays(queries, keys[-1], heads, channels, rows=bool(reads)):
-        sizes = f"{queries} queries, {keys[-1]} keys, {heads} heads of {channels}"
+    *_, keys = static_shape(attention.turned_key) or (0,)
+    queries, channels, heads = *shape[-2:], math.prod(shape[:-2])
+    if not pays(queries, keys, heads, channels, rows=bool(reads)):
+        sizes = f"{queries} queries, {keys} keys, {heads} heads of {channels}"
         raise PreconditionError(f"its nodes are as fast: {sizes}")
     return _fused(call, attention, shape, reads)
 

@@ -12,15 +12,15 @@ import onnx_ir as ir
 
 from me2e_compress.base.errors import GraphError
 from me2e_compress.calibration.ranges import Ranges
-from me2e_compress.graph.shapes import CONVOLUTIONS
+from me2e_compress.graph.shapes import CONVOLUTIONS, PRODUCTS
 from me2e_compress.quantization.decision import QuantPlan
 from me2e_compress.quantization.plan import tensors_of
 from me2e_compress.runtime.openvino import OpenVinoProvider
 from me2e_compress.runtime.providers import CPU, Provider
 from me2e_compress.targets import LintFinding, LintRule, Target, error
-from me2e_compress.targets.explicit_pairs import POSITIVE, SHIFTED, place_pairs
 from me2e_compress.targets.onnxruntime.region import never_negative
 from me2e_compress.targets.openvino.lint_rules import RULES, is_joined
+from me2e_compress.targets.quantized import POSITIVE, SHIFTED, place_pairs
 
 
 @dataclasses.dataclass(frozen=True)
@@ -80,7 +80,8 @@ class OpenVino(Target):
 
 
 def _convolved(value: ir.Value) -> bool:
-    """Return whether convolutions alone read what a Concat made."""
+    """Return whether convolutions, and no products, read what a Concat made."""
     # There int8 is wrong by 11 dB; in front of a MatMul a zero point is refused
     readers = {reader.op_type for reader in value.consumers()}
-    return is_joined(value) and readers <= set(CONVOLUTIONS)
+    convolved = not readers.isdisjoint(CONVOLUTIONS) and readers.isdisjoint(PRODUCTS)
+    return convolved and is_joined(value)

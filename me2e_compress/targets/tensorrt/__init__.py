@@ -18,8 +18,7 @@ from me2e_compress.operators import find
 from me2e_compress.quantization.decision import QuantPlan
 from me2e_compress.quantization.plan import tensors_of
 from me2e_compress.targets import LintFinding, LintRule, Target
-from me2e_compress.targets.explicit_pairs import place_pairs
-from me2e_compress.targets.quantized import is_in_a_pair
+from me2e_compress.targets.quantized import is_in_a_pair, place_pairs
 from me2e_compress.targets.tensorrt.lint.support import rules, version_of
 
 
