@@ -368,7 +368,7 @@ def runner_of(passes: Iterable[Pass], provider: Provider) -> Provider | None:
         for each in passes
         if isinstance(each, LowerInt8 | QuantizeInt8)
     ]
-    if not any(names):
+    if not names or not names[-1]:
         return None
     runner = PROVIDERS.parse(names[-1])
     if runner.native == CPU.native:

@@ -161,7 +161,7 @@ class OpenVino(Engine):
             _check_fit(str(value.name), value, inputs[str(value.name)])
         # An input that nothing reads has no port
         feeds = {
-            self._in[name]: each for name, each in inputs.items() if name in self._in
+            self._in[name]: array for name, array in inputs.items() if name in self._in
         }
         # Not `infer`: on one thread that ends without a word where a node fails, and
         # answers what the run before did (2026.4.1)
